@@ -1,0 +1,173 @@
+"""Fit the library's materials to Neural-BRDF networks and write them as YAML.
+
+python -m render.materials.fitting --networks FILE.npz --out assets/materials [--only NAME ...]
+python -m render.materials.fitting --networks FILE.npz --compare TABLE.md --published FILE.json
+"""
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from render.errors import InputError, unknown
+from render.files import write_text
+from render.materials import candidates, model, solver, spheres
+from render.materials.categories import category
+from render.materials.model import Material
+from render.materials.network import Brdf, NetworkFile
+from render.seeds import generator
+
+SOURCE = (
+    "fit to the Neural-BRDF network (Sztrajman et al. 2021, MIT licence) of the MERL BRDF database "
+    "(Matusik et al. 2003)"
+)
+TERMS = "MERL BRDF database: research use; cite Matusik et al., A Data-Driven Reflectance Model, SIGGRAPH 2003"
+_IMAGE_SIZE, _LIGHTS = 128, 20
+
+
+class Fitter:
+    """Fits any number of BRDFs to the same pairs of directions, and measures each on a sphere they do not contain."""
+
+    def __init__(self, samples: int = 60_000, seed: int = 0) -> None:
+        """Draw `samples` fitting pairs, and separately 20 lights for the sphere of the metric."""
+        self.samples = spheres.fitting_samples(samples, generator(seed, "materials", "fit"))
+        self._basis = solver.basis(self.samples.wi, self.samples.wo)
+        lights = spheres.hemisphere_lights(_LIGHTS, generator(seed, "materials", "test"))
+        self.test = spheres.sphere_image(_IMAGE_SIZE, lights)
+
+    def fit(self, name: str, brdf: Brdf) -> Material:
+        """Fit one material.
+
+        A sample brighter than the metric's clipping level counts by its relative error, as bright as the level, so that
+        a mirror peak neither dominates nor is ignored.
+
+        Args:
+            name: Its library name, which gives the category.
+            brdf: Function of (N, 3) `wi`, `wo` giving the (N, 3) BRDF in 1/sr; reciprocal.
+
+        Returns:
+            The material with tables as written to YAML (rounded), albedo at most 1, and its error on the test sphere.
+        """
+        wi, wo = self.samples.wi, self.samples.wo
+        target = brdf(wi, wo)
+        limit = max(spheres.radiance_limit(target, self.samples), 1e-6)
+        channels = []
+        for channel in target.T:
+            radiance = channel * wi[:, 2]
+            weight = self.samples.weight * (wi[:, 2] * np.minimum(1, limit / np.maximum(radiance, 1e-12))) ** 2
+            channels.append(solver.tables(solver.Channel(self._basis, channel, weight, 1e-4 * limit).solve()))
+        bivariate, shadowing, azimuth = (np.stack(tables) for tables in zip(*channels, strict=True))
+        fitted = Material(
+            name=name,
+            category=category(name),
+            source=SOURCE,
+            terms=TERMS,
+            bivariate=bivariate,
+            shadowing=shadowing,
+            azimuth=azimuth,
+        )
+        fitted = rounded(conserve_energy(fitted))
+        return dataclasses.replace(fitted, fit_error=round(self.error(fitted, brdf), 4))
+
+    def error(self, material: Material, brdf: Brdf) -> float:
+        """Return the relative RMS error of the sphere, `spheres.sphere_error`."""
+        fit = model.evaluate(material, self.test.wi, self.test.wo)
+        return spheres.sphere_error(fit, brdf(self.test.wi, self.test.wo), self.test)
+
+
+def conserve_energy(material: Material, limit: float = 0.999) -> Material:
+    """Lower S where the directional albedo exceeds `limit`, until it does nowhere.
+
+    Multiplying S at one incident angle lowers the albedo there and, by reciprocity, never raises it elsewhere.
+    """
+    fine = np.linspace(0, 1, 2 * model.SHADOWING_KNOTS - 1)  # the knots and the middles of the cells
+    cosine = np.clip(1 - fine, 0.005, 1)
+    for _ in range(30):
+        albedo = model.directional_albedo(material, cosine)  # (17, 3)
+        if albedo.max() <= limit:
+            return material
+        excess = np.maximum(albedo / limit, 1) ** 1.02
+        padded = np.pad(excess, ((1, 1), (0, 0)), mode="edge")
+        excess = np.maximum(excess, np.maximum(padded[:-2], padded[2:]))[::2]  # (9, 3)
+        shadowing = material.shadowing / excess.T
+        material = dataclasses.replace(
+            material,
+            shadowing=shadowing / shadowing[:, :1],
+            bivariate=material.bivariate * shadowing[:, :1, None] ** 2,
+        )
+    return material
+
+
+def rounded(material: Material) -> Material:
+    """Round the tables to the digits that `to_yaml` writes."""
+    digits = np.vectorize(lambda value: float(f"{value:.4g}"))
+    return dataclasses.replace(
+        material,
+        bivariate=digits(material.bivariate),
+        shadowing=digits(material.shadowing),
+        azimuth=np.round(material.azimuth, 2),
+    )
+
+
+def to_yaml(material: Material) -> str:
+    """Write a material as YAML: one row of a table a line, a block of rows per colour channel."""
+    lines = [f"{key}: {getattr(material, key)}" for key in ("name", "category", "fit_error", "model")]
+    lines += [f'{key}: "{getattr(material, key)}"' for key in ("source", "terms")]
+    lines.append("# (rgb, theta_h, theta_d) in 1/sr; render/materials/model.py explains the tables")
+    for field, digits in (("bivariate", ".4g"), ("azimuth", ".2f")):
+        lines.append(f"{field}:")
+        for channel in getattr(material, field):
+            rows = [", ".join(f"{value + 0.0:{digits}}" for value in row) for row in channel]
+            lines += [f"{'- ' if number == 0 else '  '}- [{row}]" for number, row in enumerate(rows)]
+    lines.append("shadowing:")
+    lines += [f"- [{', '.join(f'{value:.4g}' for value in channel)}]" for channel in material.shadowing]
+    return "\n".join(lines) + "\n"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line of the fitter; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m render.materials.fitting", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--networks", type=Path, required=True, help="npz of weights, keys merl__<name>__<layer>")
+    parser.add_argument("--out", type=Path, help="folder for <name>.yaml")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="fit these materials only")
+    parser.add_argument("--compare", type=Path, metavar="FILE.md", help="fit other models too, write the table")
+    parser.add_argument("--published", type=Path, metavar="FILE.json", help="published ABC and SGD constants")
+    arguments = parser.parse_args(argv)
+    try:
+        _run(arguments)
+    except InputError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    return 0
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    networks = NetworkFile(arguments.networks)
+    names = arguments.only or networks.names
+    for name in names:
+        if name not in networks.names:
+            raise unknown("material", name, networks.names)
+    if not (arguments.out or arguments.compare):
+        raise InputError("nothing to write: give --out, --compare or both")
+    if arguments.compare and not arguments.published:
+        raise InputError("--compare needs --published FILE.json with the ABC and SGD constants")
+    published = candidates.read_published(arguments.published, names) if arguments.compare else {}
+    fitter, errors = Fitter(), []
+    for name in tqdm(names, desc="fit", disable=None):
+        material = fitter.fit(name, networks.brdf(name))
+        errors.append(material.fit_error)
+        if arguments.out:
+            write_text(arguments.out / f"{name}.yaml", to_yaml(material))
+    sys.stdout.write(f"{len(names)} materials, median sphere error {np.median(errors):.2%}, worst {max(errors):.2%}\n")
+    if arguments.compare:
+        table = candidates.compare(fitter.samples, fitter.test, networks, names, errors, published)
+        write_text(arguments.compare, table)
+        sys.stdout.write(table)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

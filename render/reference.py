@@ -1,0 +1,80 @@
+"""The slow, obvious renderer: Mitsuba's own `path` integrator, one light at a time.
+
+`render.many_lights` is compared with it, statistically in the tests and in time by `make bench`.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from render import variant
+from render.manifest import View
+from render.materials import bsdf as material_bsdf
+from render.scene import build_mesh
+from render.shapes.mesh import TriangleMesh
+
+mi = variant.load()
+
+
+def posed(mesh: TriangleMesh, view: View) -> TriangleMesh:
+    """Return `mesh` rotated, scaled and moved into the camera frame (units: half image widths)."""
+    rotation = view.matrix()
+    vertices = mesh.vertices @ rotation.T * view.scale + np.array([*view.offset, 0.0])
+    normals = (mesh.normals @ rotation.T).astype(np.float32)
+    return TriangleMesh(vertices=vertices.astype(np.float32), faces=mesh.faces, normals=normals)
+
+
+def scene_dict(mesh: TriangleMesh, view: View, material: str, size: int, spp: int, bounces: int) -> dict:
+    """Describe the scene for `mi.load_dict`: orthographic camera, box filter, one directional emitter.
+
+    The camera stands at +z and looks along -z, which makes image-right +x (see the frame tests).
+    """
+    depth = 4.0 * view.scale
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": bounces + 2, "rr_depth": 1000},
+        "sensor": {
+            "type": "orthographic",
+            "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, depth], target=[0, 0, 0], up=[0, 1, 0]),
+            "near_clip": 1e-3,
+            "far_clip": 2 * depth,
+            "film": {
+                "type": "hdrfilm",
+                "width": size,
+                "height": size,
+                "rfilter": {"type": "box"},
+                "pixel_format": "rgb",
+                "component_format": "float32",
+            },
+            "sampler": {"type": "independent", "sample_count": spp},
+        },
+        "object": build_mesh(posed(mesh, view), {"type": "ps_material", "material": material}),
+        "light": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": np.pi}},
+    }
+
+
+def render_each_light(
+    mesh: TriangleMesh, view: View, material: str, lights: np.ndarray, *, size: int, spp: int, bounces: int, seed: int
+) -> Iterator[np.ndarray]:
+    """Yield one image (size, size, 3) float32 per light, updating the emitter of a scene loaded once.
+
+    Args:
+        mesh: Object in the unit sphere.
+        view: Pose.
+        material: Library name or YAML path.
+        lights: (L, 3) unit vectors to the lights, camera frame.
+        size: Image side in pixels.
+        spp: Samples per pixel.
+        bounces: Interreflection bounces; Mitsuba's `max_depth` is this plus two.
+        seed: Seed of the first light's image; the next ones follow.
+    """
+    material_bsdf.register()
+    scene = mi.load_dict(scene_dict(mesh, view, material, size, spp, bounces))
+    parameters = mi.traverse(scene)
+    key = next(name for name in parameters.keys() if name.endswith("light.to_world"))  # noqa: SIM118
+    for number, light in enumerate(np.asarray(lights, np.float64)):
+        up = [0.0, 1.0, 0.0] if abs(light[1]) < 0.9 else [1.0, 0.0, 0.0]
+        # An emitter shines along its local +z: from the light towards the surface, so minus the light vector.
+        parameters[key] = mi.Transform4f().look_at(origin=[0, 0, 0], target=(-light).tolist(), up=up)
+        parameters.update()
+        yield np.array(mi.render(scene, seed=seed + number))

@@ -1,0 +1,27 @@
+"""One random generator per (root seed, scene, stage), so that adding a stage never shifts another."""
+
+import hashlib
+
+import numpy as np
+
+
+def _word(key: int | str) -> int:
+    if isinstance(key, int):
+        return key
+    return int.from_bytes(hashlib.sha256(key.encode()).digest()[:8], "little")
+
+
+def generator(root: int, *keys: int | str) -> np.random.Generator:
+    """Return the generator of the stage named by `keys` under the root seed `root` (0 is a seed like any other).
+
+    Args:
+        root: Non-negative root seed.
+        keys: What the stream is for, e.g. `("blobby", 17, "lights")`; strings are hashed with SHA-256,
+            so the stream is the same on every machine and in every process.
+    """
+    return np.random.default_rng(np.random.SeedSequence([root, *(_word(key) for key in keys)]))
+
+
+def derived_seed(root: int, *keys: int | str) -> int:
+    """Return a 31-bit seed of its own for the stage named by `keys`."""
+    return int(generator(root, *keys).integers(2**31))

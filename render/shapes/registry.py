@@ -1,0 +1,58 @@
+"""Shapes by name: `sphere`, `bunny`, `blobby:17`, `sculpture:42`, or the path of a mesh file."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import trimesh
+
+from render.errors import InputError, unknown
+from render.shapes import blobby, primitives, sculpture
+from render.shapes.mesh import TriangleMesh, load_mesh
+
+
+@dataclass(frozen=True)
+class Family:
+    """A way to make shapes: `build()` for a single shape, `build(seed)` for a seeded family."""
+
+    build: Callable[..., TriangleMesh]
+    seeded: bool
+    about: str
+
+
+FAMILIES = {
+    "sphere": Family(primitives.sphere, False, "unit sphere with exact normals"),
+    "bunny": Family(primitives.bunny, False, "Stanford bunny, fetched once"),
+    "blobby": Family(blobby.blobby, True, "smooth lumpy blobs, one per seed"),
+    "sculpture": Family(sculpture.sculpture, True, "figures, drapery, busts, animals, vessels, rocks and knots"),
+}
+
+
+def families() -> dict[str, str]:
+    """Return the known families with one line about each; seeded ones are spelled `name:<seed>`."""
+    return {f"{name}:<seed>" if family.seeded else name: family.about for name, family in FAMILIES.items()}
+
+
+def load(name: str) -> TriangleMesh:
+    """Build or read the shape `name`, centred and scaled so that its farthest vertex is at radius 1.
+
+    Args:
+        name: `sphere`, `bunny`, `blobby:<seed>`, `sculpture:<seed>`, or the path of a mesh file.
+
+    Raises:
+        InputError: unknown name (with the nearest), bad seed, or a file that cannot be used.
+    """
+    base, colon, text = name.partition(":")
+    family = FAMILIES.get(base)
+    if family is None:
+        if Path(name).suffix[1:].lower() in trimesh.available_formats() or Path(name).is_file():
+            return load_mesh(name).normalised()
+        raise unknown("shape", name, FAMILIES, "or give the path of a mesh file")
+    if not family.seeded:
+        if colon:
+            raise InputError(f"shape {name!r}: {base!r} takes no seed; write {base!r}")
+        return family.build()
+    # isdecimal alone also accepts the digits of other scripts, which would give one shape two names.
+    if not (text.isascii() and text.isdecimal()):
+        raise InputError(f"shape {name!r}: the seed must be a whole number from 0 up, as in '{base}:17'")
+    return family.build(int(text))

@@ -1,0 +1,216 @@
+"""The EXR shard: the one file format both rooms share, and its only writer and reader.
+
+A shard is one multi-part OpenEXR file (ZIP, lossless) per scene. Part `gt` (float32) holds
+`normal.X/Y/Z` (camera frame, zero outside the mask), `Z` (depth), `mask` (0 or 1) and `coverage`
+(share of a pixel's samples that hit the object); parts `L000`, `L001`, ... (float16) hold the linear
+RGB radiance under one light of irradiance pi, with its direction in the part's header.
+
+OpenEXR's binding silently corrupts non-contiguous arrays and arrays of unusual channel counts, and
+opens truncated files with fewer parts (openexr #1929); hence one checked writer and a reader that
+refuses whatever differs from the manifest.
+"""
+
+import hashlib
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+from render.errors import InputError
+from render.files import atomic_path
+from render.manifest import SceneSpec
+
+SCHEMA = 1
+HALF_LIMIT = 65504.0
+_OWN_ATTRIBUTES = ("ps:schema", "ps:scene_id", "ps:light_count", "ps:digest")
+_DTYPES = (np.dtype(np.float16), np.dtype(np.float32), np.dtype(np.uint32))
+
+
+@dataclass(frozen=True, eq=False)
+class Shard:
+    """One rendered scene.
+
+    Attributes:
+        scene_id: Id of its manifest line.
+        images: (L, H, W, 3) float16, linear radiance per light of irradiance pi.
+        normals: (H, W, 3) float32, unit shading normals in the camera frame, zero outside the mask.
+        depth: (H, W) float32, z of the surface in half image widths (towards the camera), zero outside.
+        mask: (H, W) bool, pixels of which at least half the samples hit the object.
+        coverage: (H, W) float32 in [0, 1], share of samples that hit the object.
+        light_directions: (L, 3) float32, unit, from the surface to the light.
+        provenance: File-level header attributes (schema, seed, versions, names), all text or numbers.
+    """
+
+    scene_id: str
+    images: np.ndarray
+    normals: np.ndarray
+    depth: np.ndarray
+    mask: np.ndarray
+    coverage: np.ndarray
+    light_directions: np.ndarray
+    provenance: dict[str, str | int | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count, height, width = self.images.shape[:3]
+        expected = {
+            "images": ((count, height, width, 3), np.float16),
+            "normals": ((height, width, 3), np.float32),
+            "depth": ((height, width), np.float32),
+            "mask": ((height, width), np.bool_),
+            "coverage": ((height, width), np.float32),
+            "light_directions": ((count, 3), np.float32),
+        }
+        for name, (shape, dtype) in expected.items():
+            array = getattr(self, name)
+            if array.shape != shape or array.dtype != dtype:
+                raise InputError(
+                    f"shard {self.scene_id}: {name} must be {np.dtype(dtype)} of shape {shape}, "
+                    f"got {array.dtype} of shape {array.shape}"
+                )
+
+
+def write_exr(path: str | Path, parts: list[tuple[str, dict, dict[str, np.ndarray]]]) -> None:
+    """Write a multi-part OpenEXR file; the only place in the project that does.
+
+    Args:
+        path: Destination; written to a temporary name, checked, then renamed.
+        parts: (name, header attributes, channels) per part. Channels are float16, float32 or uint32,
+            (H, W) or (H, W, 3), finite.
+
+    Raises:
+        InputError: a non-finite value, or the disk refuses the file. Nothing is left behind.
+    """
+    checked = []
+    for name, attributes, channels in parts:
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
+        checked.append(OpenEXR.Part(header, {key: _checked(value, f"{name}.{key}") for key, value in channels.items()},
+                                    name))  # fmt: skip
+    with atomic_path(path) as temporary:
+        try:
+            OpenEXR.File(checked).write(str(temporary))
+        except (RuntimeError, ValueError) as error:
+            # The binding reports a full disk as RuntimeError; atomic_path turns OSError into one clear line.
+            raise OSError(f"OpenEXR could not write it: {error}") from error
+
+
+def _checked(array: np.ndarray, name: str) -> np.ndarray:
+    """Return a contiguous copy of an array OpenEXR writes correctly, or refuse it."""
+    assert array.dtype in _DTYPES, f"{name}: {array.dtype}"
+    assert array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3), f"{name}: {array.shape}"
+    if array.dtype != np.uint32 and not np.isfinite(array).all():
+        raise InputError(f"{name}: the image has infinite or NaN values; refusing to write it")
+    return np.ascontiguousarray(array)
+
+
+def write_shard(path: str | Path, shard: Shard) -> None:
+    """Write `shard` atomically; radiance was already rounded to half precision by the caller.
+
+    Raises:
+        InputError: non-finite values or an unwritable disk.
+    """
+    attributes = {"ps:schema": SCHEMA, "ps:scene_id": shard.scene_id, "ps:light_count": len(shard.images)}
+    attributes["ps:digest"] = _digest(shard)
+    attributes |= {f"ps:{key}": value for key, value in shard.provenance.items()}
+    ground_truth = {
+        "normal.X": shard.normals[..., 0],
+        "normal.Y": shard.normals[..., 1],
+        "normal.Z": shard.normals[..., 2],
+        "Z": shard.depth,
+        "mask": shard.mask.astype(np.float32),
+        "coverage": shard.coverage,
+    }
+    parts = [("gt", attributes, ground_truth)]
+    for index, (image, direction) in enumerate(zip(shard.images, shard.light_directions, strict=True)):
+        header = {"ps:light_dir": direction.astype(np.float32)}
+        parts.append((f"L{index:03d}", header, {"RGB": image}))
+    write_exr(path, parts)
+
+
+def _digest(shard: Shard) -> str:
+    """Return the SHA-256 of all pixels and lights, since ZIP alone does not notice every altered byte."""
+    digest = hashlib.sha256()
+    for array in (shard.images, shard.normals, shard.depth, shard.mask, shard.coverage, shard.light_directions):
+        digest.update(np.ascontiguousarray(array))
+    return digest.hexdigest()
+
+
+def to_half(images: np.ndarray) -> np.ndarray:
+    """Round radiance to float16, saturating at the largest half instead of overflowing to infinity."""
+    return np.minimum(images, HALF_LIMIT).astype(np.float16)
+
+
+def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
+    """Read a shard and refuse anything damaged or different from its manifest line.
+
+    Args:
+        path: The EXR file.
+        scene: The manifest line; when given, its id, lights and size are compared with the file.
+
+    Raises:
+        InputError: missing, truncated, altered or foreign file.
+    """
+    parts = _read_parts(path)
+    header = parts[0].header
+    if parts[0].name() != "gt" or header.get("ps:schema") != SCHEMA:
+        raise InputError(f"{path}: not a shard of schema {SCHEMA} (first part {parts[0].name()!r}); render it again")
+    names = [f"L{index:03d}" for index in range(len(parts) - 1)]
+    if [part.name() for part in parts[1:]] != names:
+        raise InputError(f"{path}: light parts are missing or out of order; delete the file and render it again")
+    truth = {name: channel.pixels for name, channel in parts[0].channels.items()}
+    try:
+        normals = truth["normal"] if "normal" in truth else np.stack([truth[f"normal.{c}"] for c in "XYZ"], axis=-1)
+        shard = Shard(
+            scene_id=str(header["ps:scene_id"]),
+            images=np.stack([part.channels["RGB"].pixels for part in parts[1:]]),
+            normals=normals,
+            depth=truth["Z"],
+            mask=truth["mask"] > 0.5,
+            coverage=truth["coverage"],
+            light_directions=np.stack([np.asarray(part.header["ps:light_dir"], np.float32) for part in parts[1:]]),
+            provenance={
+                key[3:]: value for key, value in header.items() if key.startswith("ps:") and key not in _OWN_ATTRIBUTES
+            },
+        )
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: incomplete shard ({error}); delete the file and render it again") from error
+    if len(shard.images) != header.get("ps:light_count") or _digest(shard) != header.get("ps:digest"):
+        raise InputError(f"{path}: truncated or altered since it was written; delete the file and render it again")
+    if scene is not None:
+        _compare(path, shard, scene)
+    return shard
+
+
+def _read_parts(path: str | Path) -> list:
+    """Open an EXR file and return its parts, which a truncated file has fewer of (or none)."""
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such shard; run `sdps render-data` to finish the folder")
+    try:
+        parts = OpenEXR.File(os.fspath(path)).parts
+    except (RuntimeError, ValueError, OSError) as error:
+        raise InputError(f"{path}: damaged EXR ({error}); delete the file and render it again") from error
+    if len(parts) < 2:
+        raise InputError(f"{path}: truncated EXR ({len(parts)} parts); delete the file and render it again")
+    return parts
+
+
+def _compare(path: str | Path, shard: Shard, scene: SceneSpec) -> None:
+    """Refuse a shard whose id, number of lights, directions or size is not what the manifest says."""
+    directions = scene.light_directions()
+    if shard.scene_id != scene.id:
+        raise InputError(f"{path}: holds scene {shard.scene_id!r}, the manifest says {scene.id!r}; render it again")
+    if len(shard.images) != len(directions):
+        raise InputError(f"{path}: {len(shard.images)} lights, the manifest says {len(directions)}; render it again")
+    if not np.allclose(shard.light_directions, directions, atol=1e-5):
+        raise InputError(f"{path}: light directions differ from the manifest; render it again")
+    if shard.images.shape[1:3] != (scene.size, scene.size):
+        raise InputError(f"{path}: images are {shard.images.shape[1:3]}, the manifest says {scene.size}; render again")
+    if int(shard.provenance.get("seed", scene.seed)) != scene.seed:
+        raise InputError(f"{path}: rendered with another seed than the manifest's; render it again")
+
+
+def file_hash(path: str | Path) -> str:
+    """Return the SHA-256 of a file as hex."""
+    with open(path, "rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()

@@ -1,0 +1,125 @@
+"""Weights as safetensors with what is needed to use them, and trainer state to go on from.
+
+Neither file can execute code when loaded, and neither is ever half-written.
+"""
+
+import hashlib
+import json
+import pickle
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import nn
+
+from render.config import build
+from render.errors import InputError
+from render.files import atomic_path
+from sdps.augment import Augmentation
+from sdps.models import registry
+
+FORMAT = "sdps-weights-1"
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedModel:
+    """A network with its weights and where they come from.
+
+    Attributes:
+        name: Name in `sdps.models.registry`.
+        network: The network, in eval mode, weights float32.
+        options: Options it was built with.
+        metadata: `config` (the training section as plain values), `data` (SHA-256 of the manifest),
+            `code` (hash of this package), `step`, and the final validation `metrics`.
+    """
+
+    name: str
+    network: nn.Module
+    options: dict[str, Any]
+    metadata: dict[str, Any]
+
+    def augmentation(self) -> Augmentation:
+        """Return the augmentation of training, whose exposure test images must be brought to."""
+        return build(Augmentation, self.metadata["config"]["augmentation"], "augmentation")
+
+
+@cache
+def code_version() -> str:
+    """Return a short hash of this package's source files."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def save_weights(path: str | Path, model: TrainedModel, *, half: bool = False) -> None:
+    """Write the network's weights and metadata atomically.
+
+    Args:
+        path: Destination, by convention `.safetensors`.
+        model: What to save.
+        half: Store float16, half the size, to be read back as float32.
+    """
+    dtype = torch.float16 if half else torch.float32
+    tensors = {
+        name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in model.network.state_dict().items()
+    }
+    header = {"format": FORMAT, "model": model.name, "options": json.dumps(model.options)}
+    header["metadata"] = json.dumps(model.metadata)
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata=header)
+
+
+def load_weights(path: str | Path, expected: str) -> TrainedModel:
+    """Read weights written by `save_weights` and build their network.
+
+    Args:
+        path: The file.
+        expected: Name of the model the caller needs, e.g. `lcnet`.
+
+    Raises:
+        InputError: missing, truncated or foreign file, another model, or weights that do not fit it.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such weights file; train one or give another path")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path}: truncated or not a safetensors file ({error}); copy or train it again") from error
+    if header.get("format") != FORMAT:
+        raise InputError(f"{path}: not written by this project (no {FORMAT!r} header); train the network again")
+    if header["model"] != expected:
+        raise InputError(f"{path}: holds {header['model']!r} weights, {expected!r} is needed here; swap the files")
+    options, metadata = json.loads(header["options"]), json.loads(header["metadata"])
+    network = registry.create(expected, **options)
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:
+        detail = " ".join(str(error).split())[:160]
+        raise InputError(f"{path}: weights do not fit {expected!r} ({detail}); train it again") from error
+    return TrainedModel(expected, network.eval(), options, metadata)
+
+
+def save_state(path: str | Path, state: dict[str, Any]) -> None:
+    """Write trainer state (tensors, numbers, text, and containers of these) atomically."""
+    with atomic_path(path) as temporary:
+        torch.save(state, temporary)
+
+
+def load_state(path: str | Path) -> dict[str, Any]:
+    """Read trainer state without executing anything in it.
+
+    Raises:
+        InputError: truncated or foreign file.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError) as error:
+        raise InputError(f"{path}: truncated or not a checkpoint; delete it to start this run afresh") from error

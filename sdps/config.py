@@ -1,0 +1,163 @@
+"""What a training run is told: one frozen dataclass per stage, defaults as in the paper (A.8 of its code).
+
+A run ends after `epochs`, or after `steps` or `minutes` when one of these is given; the learning rate
+follows the share of that budget already spent, so a shorter budget anneals fully all the same.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+from render.errors import InputError
+from sdps.augment import Augmentation
+from sdps.lighting import LightClasses, ReadOut
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig:
+    """What both stages share.
+
+    Attributes:
+        seed: Root seed of weights, order, image subsets and augmentation.
+        epochs: Passes over the training scenes, unless `steps` or `minutes` is set.
+        steps: Optimiser steps to take instead.
+        minutes: Minutes of training to spend instead, counted across resumed runs.
+        batch_scenes: Scenes per optimiser step.
+        accumulate: Parts a step's scenes are processed in, to save memory; must divide `batch_scenes`.
+        images: Images drawn per scene and step.
+        size: Side in pixels to which scenes of another size are resized.
+        learning_rate: Peak learning rate.
+        schedule: `halving` (halve after each of `halve_after`), `cosine` (to zero) or `constant`.
+        halve_after: Epochs after which `halving` halves; scaled with the budget when it is not `epochs`.
+        warmup: Share of the budget over which the learning rate rises linearly from zero.
+        optimiser: `adam` or `adamw`; betas 0.9 and 0.999.
+        weight_decay: Weight decay (0 in the paper: its 4e-4 is parsed but never used).
+        clip_gradient: Largest gradient norm; 0 leaves gradients alone.
+        precision: `bfloat16` runs the networks under autocast; weights and loss stay float32.
+        channels_last: Keep feature maps channels-last, faster for NENet on CPUs.
+        workers: Loader processes; 0 loads in the trainer's own.
+        cache: Keep decoded scenes as memory-mapped arrays in `<data>/cache`.
+        skip_missing: Train on the scenes that are there instead of refusing an incomplete folder.
+        log_every: Steps between lines of metrics.
+        validate_every: Steps between validations; 0 validates at the end only.
+        validation_scenes: Scenes of split `val` to validate on (0: none).
+        checkpoint_minutes: Minutes between checkpoints.
+        augmentation: How images are altered.
+    """
+
+    seed: int = 0
+    epochs: float = 20.0
+    steps: int | None = None
+    minutes: float | None = None
+    batch_scenes: int = 32
+    accumulate: int = 1
+    images: int = 32
+    size: int = 128
+    learning_rate: float = 5e-4
+    schedule: Literal["halving", "cosine", "constant"] = "halving"
+    halve_after: tuple[float, ...] = (5.0, 10.0, 15.0)
+    warmup: float = 0.0
+    optimiser: Literal["adam", "adamw"] = "adam"
+    weight_decay: float = 0.0
+    clip_gradient: float = 0.0
+    precision: Literal["float32", "bfloat16"] = "float32"
+    channels_last: bool = False
+    workers: int = 2
+    cache: bool = True
+    skip_missing: bool = False
+    log_every: int = 20
+    validate_every: int = 0
+    validation_scenes: int = 16
+    checkpoint_minutes: float = 5.0
+    augmentation: Augmentation = field(default_factory=Augmentation)
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "steps", "minutes", "batch_scenes", "accumulate", "images", "learning_rate",
+                     "log_every", "checkpoint_minutes"):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and not (value > 0 and math.isfinite(value)):
+                raise InputError(f"{name} must be positive, got {value}")
+        for name in ("seed", "weight_decay", "clip_gradient", "workers", "validate_every", "validation_scenes"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.steps is not None and self.minutes is not None:
+            raise InputError("steps and minutes are both set; keep one of them")
+        if self.batch_scenes % self.accumulate:
+            raise InputError(f"accumulate {self.accumulate} must divide batch_scenes {self.batch_scenes}")
+        if self.size < 16 or self.size % 4:
+            raise InputError(f"size must be a multiple of 4 and at least 16, got {self.size}")
+        if not 0.0 <= self.warmup < 1.0:
+            raise InputError(f"warmup must be in [0, 1), got {self.warmup}")
+        if self.schedule == "halving" and any(not 0.0 < epoch < self.epochs for epoch in self.halve_after):
+            raise InputError(f"halve_after must lie between 0 and epochs ({self.epochs:g}), got {self.halve_after}")
+
+    def learning_rate_at(self, progress: float) -> float:
+        """Return the learning rate when the share `progress` in [0, 1] of the budget is spent."""
+        rate = self.learning_rate
+        if progress < self.warmup:
+            return rate * max(progress / self.warmup, 0.01)
+        if self.schedule == "halving":
+            return rate * 0.5 ** sum(progress * self.epochs >= epoch - 1e-9 for epoch in self.halve_after)
+        if self.schedule == "cosine":
+            annealed = (min(progress, 1.0) - self.warmup) / (1.0 - self.warmup)
+            return rate * 0.5 * (1.0 + math.cos(math.pi * annealed))
+        return rate
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightingTraining(TrainingConfig):
+    """Stage 1, LCNet.
+
+    Attributes:
+        direction_classes: K_d, classes of azimuth and of elevation.
+        use_mask: Give LCNet the object mask.
+        use_global: Give LCNet the feature shared by all images.
+        intensity_classes: K_e.
+    """
+
+    direction_classes: int = 36
+    intensity_classes: int = 20
+    use_mask: bool = True
+    use_global: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.size != 128:
+            raise InputError(f"size must be 128 for LCNet, whose last layers need it, got {self.size}")
+        self.classes()
+
+    def classes(self) -> LightClasses:
+        """Return the discretised lighting space; intensities span the range they are drawn from."""
+        low, high = self.augmentation.intensity_range
+        return LightClasses(
+            directions=self.direction_classes, intensities=self.intensity_classes, low=low, high=max(high, low + 1e-3)
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormalTraining(TrainingConfig):
+    """Stage 2, NENet, on the lights of a frozen LCNet.
+
+    Attributes:
+        loss: `masked` averages over the object, `faithful` over all pixels as the authors' code does.
+        lights: `estimated` by the frozen LCNet, or the `true` ones (PS-FCN's training).
+        read_out: How LCNet's classes become lights: `centre` (the paper's) or `expectation`.
+        crop: Side of the random crop NENet sees (0: the whole image); LCNet always sees the whole.
+        min_object: Least share of object pixels a crop should have; the best of a few draws is taken.
+    """
+
+    epochs: float = 10.0
+    batch_scenes: int = 16
+    halve_after: tuple[float, ...] = (2.0, 4.0, 6.0, 8.0)
+    loss: Literal["masked", "faithful"] = "masked"
+    lights: Literal["estimated", "true"] = "estimated"
+    read_out: ReadOut = "centre"
+    crop: int = 0
+    min_object: float = 0.3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.crop and (self.crop % 4 or not 16 <= self.crop <= self.size):
+            raise InputError(f"crop must be 0 or a multiple of 4 from 16 to size ({self.size}), got {self.crop}")
+        if not 0.0 <= self.min_object < 1.0:
+            raise InputError(f"min_object must be in [0, 1), got {self.min_object}")

@@ -1,0 +1,222 @@
+"""From a rendered data folder to training batches, the same ones however many workers load them.
+
+The position in an endless stream of samples determines everything about a sample: scene, images,
+augmentation, crop. So a run is resumed exactly by one integer, and no two workers share a random stream.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+from torch.utils.data import Dataset
+
+from render.errors import InputError
+from render.manifest import SceneSpec, read_manifest
+from render.seeds import generator
+from sdps.augment import Augmentation, apply_symmetry, augment
+from sdps.scene_store import SceneStore
+
+_CROP_DRAWS = 8
+
+
+class Batch(NamedTuple):
+    """Tensors of B scenes with Q images each; a single sample has the same fields without B."""
+
+    images: Tensor  # (B, Q, 3, S, S) float32, augmented
+    mask: Tensor  # (B, 1, S, S) float32, 0 or 1
+    normals: Tensor  # (B, 3, S, S) float32, unit, zero outside the mask
+    directions: Tensor  # (B, Q, 3) float32, unit
+    intensities: Tensor  # (B, Q) float32
+    corner: Tensor  # (B, 2) int64, row and column of the crop's upper left corner
+
+    def to(self, device: torch.device) -> "Batch":
+        """Copy every tensor to `device`."""
+        return Batch(*(tensor.to(device, non_blocking=True) for tensor in self))
+
+
+class SampleKey(NamedTuple):
+    """Which sample: the index of its scene, and its place in the stream."""
+
+    scene: int
+    epoch: int
+    position: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleOptions:
+    """How a sample is made from a scene.
+
+    Attributes:
+        seed: Root seed.
+        images: Images drawn per scene (all, in random order, where a scene has fewer).
+        size: Side in pixels.
+        crop: Side of the random crop, 0 for none.
+        min_object: Least share of object pixels wanted in a crop.
+        augmentation: How images are altered.
+    """
+
+    seed: int
+    images: int
+    size: int = 128
+    crop: int = 0
+    min_object: float = 0.3
+    augmentation: Augmentation
+
+
+class SceneDataset(Dataset):
+    """Samples of the scenes of one split of a data folder, indexed by `SampleKey`.
+
+    Args:
+        folder: Data folder with a manifest and shards.
+        split: `train`, `val` or `test`; the split also names the random stream.
+        options: How samples are made.
+        cache: Keep decoded scenes in `<folder>/cache`.
+        skip_missing: Leave out planned scenes that have no shard instead of refusing.
+
+    Raises:
+        InputError: no manifest, no scene of the split, or missing shards.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        split: str,
+        options: SampleOptions,
+        *,
+        cache: bool = True,
+        skip_missing: bool = False,
+    ) -> None:
+        self.split = split
+        self.options = options
+        self.store = SceneStore(Path(folder), cache=cache)
+        planned = read_manifest(folder, split)
+        self.scenes = [scene for scene in planned if (Path(folder) / scene.file).is_file()]
+        missing = len(planned) - len(self.scenes)
+        if not self.scenes or (missing and not skip_missing):
+            raise InputError(
+                f"{folder}: {missing} of {len(planned)} shards of split {split!r} are missing; finish it with "
+                "`sdps render-data` or set skip_missing"
+            )
+        _check_counts(folder, self.scenes, options.images)
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, key: SampleKey) -> Batch | InputError:
+        # An InputError is returned, not raised: torch would wrap one raised in a worker into a multi-line text.
+        try:
+            return self.sample(key)
+        except InputError as error:
+            return error
+
+    def sample(self, key: SampleKey) -> Batch:
+        """Make the sample `key` names.
+
+        Raises:
+            InputError: the shard is damaged or differs from the manifest.
+        """
+        options = self.options
+        rng = generator(options.seed, "sample", self.split, key.epoch, key.position)
+        scene = self.scenes[key.scene]
+        stored = self.store.load(scene)
+        count = len(stored.images)
+        chosen = rng.permutation(count)[: options.images]
+        images = stored.images[chosen].astype(np.float32)  # (Q, H, W, 3)
+        normals, mask = stored.normals, stored.mask
+        directions = scene.light_directions()[chosen]
+        if options.augmentation.symmetries:
+            turns, mirror = int(rng.integers(4)), bool(rng.integers(2))
+            images, normals, mask, directions = apply_symmetry(images, normals, mask, directions, turns, mirror)
+        images, normals, mask = _resize(images, normals, mask, options.size)
+        images, intensities = augment(images, mask, options.augmentation, rng)
+        corner = _crop_corner(mask, options.crop, options.min_object, rng) if options.crop else (0, 0)
+        return Batch(
+            images=torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))),
+            mask=torch.from_numpy(mask[None].astype(np.float32)),
+            normals=torch.from_numpy(np.ascontiguousarray(normals.transpose(2, 0, 1), dtype=np.float32)),
+            directions=torch.from_numpy(np.ascontiguousarray(directions, dtype=np.float32)),
+            intensities=torch.from_numpy(intensities),
+            corner=torch.tensor(corner),
+        )
+
+
+def collate(samples: list[Batch | InputError]) -> Batch | InputError:
+    """Stack samples into a batch, or pass on the first error a worker met."""
+    for sample in samples:
+        if isinstance(sample, InputError):
+            return sample
+    return Batch(*(torch.stack(tensors) for tensors in zip(*samples, strict=True)))
+
+
+class SampleStream:
+    """Batches of sample keys, endlessly: every epoch a new permutation of the scenes, joined end to end.
+
+    Batches run across epoch borders, so the state of the stream is the number of samples already taken.
+
+    Args:
+        scenes: Number of scenes.
+        batch: Samples per batch.
+        seed: Root seed.
+        taken: Samples taken before this run.
+    """
+
+    def __init__(self, scenes: int, batch: int, seed: int, taken: int = 0) -> None:
+        self.scenes, self.batch, self.seed, self.taken = scenes, batch, seed, taken
+
+    def __iter__(self) -> Iterator[list[SampleKey]]:
+        epoch, position = divmod(self.taken, self.scenes)
+        keys = []
+        while True:
+            order = generator(self.seed, "order", epoch).permutation(self.scenes)
+            for place in range(position, self.scenes):
+                keys.append(SampleKey(int(order[place]), epoch, place))
+                if len(keys) == self.batch:
+                    yield keys
+                    keys = []
+            epoch, position = epoch + 1, 0
+
+
+def _check_counts(folder: str | Path, scenes: list[SceneSpec], images: int) -> None:
+    """Refuse a split whose scenes cannot give equally many images, since they would not stack."""
+    counts = {min(len(scene.lights), images) for scene in scenes}
+    if len(counts) > 1:
+        raise InputError(
+            f"{folder}: scenes have from {min(counts)} lights up, so {images} images cannot be drawn from each; "
+            f"set images to {min(counts)} or less"
+        )
+
+
+def _resize(
+    images: np.ndarray, normals: np.ndarray, mask: np.ndarray, size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bring a scene of another size to (size, size), normals to unit length, the mask to its majority."""
+    if images.shape[1:3] == (size, size):
+        return images, normals, mask
+    stack = np.concatenate([images, normals[None], np.repeat(mask[None, ..., None], 3, -1)]).astype(np.float32)
+    tensor = torch.from_numpy(np.ascontiguousarray(stack.transpose(0, 3, 1, 2)))
+    resized = functional.interpolate(tensor, (size, size), mode="bilinear", antialias=True)
+    resized = resized.numpy().transpose(0, 2, 3, 1)
+    images, normals, mask = resized[:-2], resized[-2], resized[-1, ..., 0] > 0.5
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    return images, np.where(mask[..., None], normals / np.maximum(length, 1e-6), 0.0), mask
+
+
+def _crop_corner(mask: np.ndarray, side: int, min_object: float, rng: np.random.Generator) -> tuple[int, int]:
+    """Draw a crop's corner around a random object pixel; the first with enough object, else the best."""
+    rows, columns = np.nonzero(mask)
+    limit = mask.shape[0] - side
+    best, best_share = (limit // 2, limit // 2), -1.0
+    for _ in range(_CROP_DRAWS if len(rows) else 0):
+        pixel = rng.integers(len(rows))
+        row, column = (int(np.clip(place - side // 2, 0, limit)) for place in (rows[pixel], columns[pixel]))
+        share = float(mask[row : row + side, column : column + side].mean())
+        if share >= min_object:
+            return row, column
+        if share > best_share:
+            best, best_share = (row, column), share
+    return best

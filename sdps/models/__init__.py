@@ -1,0 +1,1 @@
+"""Networks, one file each; `registry.create` builds them by name."""

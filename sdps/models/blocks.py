@@ -1,0 +1,31 @@
+"""The layers both networks are made of (SDPS-Net, supplement; no normalisation layer anywhere)."""
+
+from torch import nn
+
+SLOPE = 0.1
+
+
+def conv(inputs: int, outputs: int, *, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    """Convolution with bias that keeps the size at stride 1 (halves it at 2), then leaky ReLU."""
+    return nn.Sequential(nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2), nn.LeakyReLU(SLOPE, inplace=True))
+
+
+def deconv(inputs: int, outputs: int) -> nn.Sequential:
+    """Transposed convolution without bias that doubles the size, then leaky ReLU."""
+    return nn.Sequential(
+        nn.ConvTranspose2d(inputs, outputs, 4, stride=2, padding=1, bias=False), nn.LeakyReLU(SLOPE, inplace=True)
+    )
+
+
+def initialise(network: nn.Module) -> None:
+    """Draw every weight with `kaiming_normal_` (its defaults, as the authors' code does) and zero the biases."""
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+            nn.init.kaiming_normal_(module.weight)
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+
+
+def parameter_count(network: nn.Module) -> int:
+    """Return the number of trainable scalars."""
+    return sum(parameter.numel() for parameter in network.parameters())

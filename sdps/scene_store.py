@@ -1,0 +1,83 @@
+"""Reading scenes from shards, with an optional cache of decoded arrays that several processes may share."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from render.config import to_plain
+from render.errors import InputError
+from render.files import atomic_path
+from render.manifest import SceneSpec
+from render.shards import read_shard
+
+CACHE_FOLDER = "cache"
+
+
+class StoredScene(NamedTuple):
+    """What training needs of a shard; with a cache the images are a read-only memory map."""
+
+    images: np.ndarray  # (L, H, W, 3) float16
+    normals: np.ndarray  # (H, W, 3) float32
+    mask: np.ndarray  # (H, W) bool
+
+
+class SceneStore:
+    """Loads scenes of a data folder.
+
+    Decoding an EXR shard always costs all of its lights; a memory-mapped array costs only those drawn.
+
+    Args:
+        folder: Data folder.
+        cache: Keep decoded arrays in `<folder>/cache`. An entry is named by the manifest line and the
+            shard's size and time of change, so a shard rendered again is decoded again.
+    """
+
+    def __init__(self, folder: Path, *, cache: bool) -> None:
+        self.folder = folder
+        self.cache = cache
+
+    def load(self, scene: SceneSpec) -> StoredScene:
+        """Return one scene.
+
+        Raises:
+            InputError: the shard is missing, damaged or differs from the manifest.
+        """
+        path = self.folder / scene.file
+        if not self.cache:
+            return _decode(path, scene)
+        entry = f"{scene.id}-{_identity(path, scene)}"
+        images, truth = (self.folder / CACHE_FOLDER / f"{entry}.{kind}.npy" for kind in ("images", "truth"))
+        if not images.is_file():
+            stored = _decode(path, scene)
+            # The images come last: where they are, the ground truth is.
+            _save(truth, np.concatenate([stored.normals, stored.mask[..., None]], axis=-1, dtype=np.float32))
+            _save(images, stored.images)
+            return stored
+        try:
+            ground = np.load(truth)  # (H, W, 4)
+            return StoredScene(np.load(images, mmap_mode="r"), ground[..., :3], ground[..., 3] > 0.5)
+        except (OSError, ValueError) as error:
+            raise InputError(f"{images}: damaged cache entry ({error}); delete {images.parent}") from error
+
+
+def _identity(path: Path, scene: SceneSpec) -> str:
+    """Return a short hash of the manifest line and the file's size and time."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise InputError(f"{path}: no such shard; run `sdps render-data` to finish the folder") from error
+    text = json.dumps([to_plain(scene), status.st_size, status.st_mtime_ns])
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _decode(path: Path, scene: SceneSpec) -> StoredScene:
+    shard = read_shard(path, scene)
+    return StoredScene(shard.images, shard.normals, shard.mask)
+
+
+def _save(path: Path, array: np.ndarray) -> None:
+    with atomic_path(path) as temporary:
+        np.save(temporary, array)

@@ -1,0 +1,312 @@
+"""The trainer of both stages: load, step, log, validate, checkpoint, resume.
+
+A run's folder holds `metrics.jsonl`, `checkpoint.pt` (everything needed to go on) and, once finished,
+`<network>.safetensors`. Running the same command again resumes; a run that was stopped and resumed
+takes the same steps on the same batches as one that was not.
+"""
+
+import logging
+import math
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from render.config import to_plain
+from render.errors import InputError
+from render.manifest import MANIFEST, read_manifest
+from render.shards import file_hash
+from sdps.checkpoint import TrainedModel, code_version, load_state, save_state, save_weights
+from sdps.dataset import Batch, SampleKey, SampleStream, SceneDataset, collate
+from sdps.interrupts import StopRequest, leave_signals_to_parent, stop_on_signal
+from sdps.loggers import JsonlLogger, Logger, Meter, TensorBoardLogger
+from sdps.stages import Stage
+
+CHECKPOINT = "checkpoint.pt"
+METRICS = "metrics.jsonl"
+# What may differ between the parts of one run: how long, and how it is carried out, but not what is computed.
+_MAY_CHANGE = {
+    "epochs", "steps", "minutes", "workers", "cache",
+    "log_every", "validate_every", "validation_scenes", "checkpoint_minutes",
+}  # fmt: skip
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """How a run ended.
+
+    Attributes:
+        weights: The safetensors file, or None when the run was stopped before its budget was spent.
+        steps: Optimiser steps taken in all.
+        seconds: Seconds of training in all.
+        metrics: Final validation metrics, `val_...`; empty without validation scenes.
+        waiting_share: Share of this call's training time spent waiting for data.
+        interrupted: Stopped by a signal; the same call resumes.
+    """
+
+    weights: Path | None
+    steps: int
+    seconds: float
+    metrics: dict[str, float]
+    waiting_share: float
+    interrupted: bool
+
+
+def train(
+    stage: Stage,
+    data_folder: str | Path,
+    out_folder: str | Path,
+    *,
+    device: str | torch.device | None = None,
+    loggers: Sequence[Logger] = (),
+    tensorboard: bool = False,
+) -> TrainingResult:
+    """Train a stage until its budget is spent, resuming whatever `out_folder` holds.
+
+    Args:
+        stage: `LightingStage` or `NormalStage`, which carries the configuration.
+        data_folder: Rendered data with splits `train` and, for validation, `val`.
+        out_folder: Folder of the run.
+        device: Torch device; CUDA when there is one, else CPU.
+        loggers: Receivers of metrics beside `metrics.jsonl`.
+        tensorboard: Also log to `<out_folder>/tensorboard`.
+
+    Raises:
+        InputError: unusable data, a checkpoint of another configuration or data set, or a loss that is
+            no longer finite.
+    """
+    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    trainer = Trainer(stage, Path(data_folder), Path(out_folder), device)
+    trainer.resume()
+    if trainer.finished_metrics is not None and trainer.progress() >= 1.0:
+        return trainer.result(trainer.finished_metrics, 0.0, interrupted=False)
+    trainer.finished_metrics = None
+    loggers = [JsonlLogger(trainer.folder / METRICS, trainer.step), *loggers]
+    if tensorboard:
+        loggers.append(TensorBoardLogger(trainer.folder / "tensorboard"))
+    try:
+        with stop_on_signal() as stop:
+            waiting_share = _run(trainer, loggers, stop)
+        metrics = {}
+        if not stop.requested:
+            metrics = trainer.finished_metrics = trainer.validate()
+            _report(loggers, trainer.step, metrics)
+            trainer.save_weights(metrics)
+        trainer.save()
+    finally:
+        for logger in loggers:
+            logger.close()
+    if stop.requested:
+        _log.warning("stopped after step %d; run the same command again to resume", trainer.step)
+    return trainer.result(metrics, waiting_share, interrupted=stop.requested)
+
+
+def _run(trainer: "Trainer", loggers: Iterable[Logger], stop: StopRequest) -> float:
+    """Take steps until the budget is spent or a stop is requested; return the share of time spent waiting."""
+    config = trainer.config
+    batches = iter(trainer.loader())
+    meter = Meter()
+    saved = time.perf_counter()
+    bar = tqdm(total=100.0, initial=100.0 * trainer.progress(), desc=trainer.stage.name, disable=None,
+               bar_format="{l_bar}{bar}| {elapsed}<{remaining} {postfix}")  # fmt: skip
+    with bar:
+        while trainer.progress() < 1.0 and not stop.requested:
+            with meter.waiting():
+                batch = next(batches)
+            if isinstance(batch, InputError):
+                raise batch
+            meter.add(trainer.take_step(batch), batch.images.shape[0] * batch.images.shape[1])
+            if trainer.step % config.log_every == 0:
+                values = meter.summary() | {"learning_rate": trainer.learning_rate, "seconds": trainer.seconds()}
+                _report(loggers, trainer.step, values)
+                bar.set_postfix_str(f"loss {values['loss']:.3f}, {values['images_per_second']:.0f} images/s")
+            if config.validate_every and trainer.step % config.validate_every == 0:
+                _report(loggers, trainer.step, trainer.validate())
+            if time.perf_counter() - saved > 60.0 * config.checkpoint_minutes:
+                trainer.save()
+                saved = time.perf_counter()
+            bar.update(100.0 * min(trainer.progress(), 1.0) - bar.n)
+    return meter.total_waiting_share()
+
+
+def _report(loggers: Iterable[Logger], step: int, values: dict[str, float]) -> None:
+    for logger in loggers:
+        if values:
+            logger.log(step, values)
+
+
+class Trainer:
+    """The state of a run and what can be done to it."""
+
+    def __init__(self, stage: Stage, data: Path, folder: Path, device: torch.device) -> None:
+        self.stage, self.config, self.data, self.folder, self.device = stage, stage.config, data, folder, device
+        config = self.config
+        stage.to(device)
+        options = {"cache": config.cache, "skip_missing": config.skip_missing}
+        self.dataset = SceneDataset(data, "train", stage.sample_options(), **options)
+        self.validation = None
+        if config.validation_scenes and any(scene.split == "val" for scene in read_manifest(data)):
+            self.validation = SceneDataset(data, "val", stage.validation_options(), **options)
+        kind = torch.optim.Adam if config.optimiser == "adam" else torch.optim.AdamW
+        self.optimiser = kind(
+            stage.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
+        )
+        self.step = self.samples = 0
+        self.learning_rate = config.learning_rate
+        self.finished_metrics: dict[str, float] | None = None
+        self._earlier_seconds, self._started = 0.0, time.perf_counter()
+
+    def seconds(self) -> float:
+        """Return the seconds of training so far, those before a resume included."""
+        return self._earlier_seconds + time.perf_counter() - self._started
+
+    def progress(self) -> float:
+        """Return the share of the budget spent; 1 or more means done."""
+        config = self.config
+        if config.steps is not None:
+            return self.step / config.steps
+        if config.minutes is not None:
+            return self.seconds() / (60.0 * config.minutes)
+        return self.samples / (config.epochs * len(self.dataset))
+
+    def loader(self) -> DataLoader:
+        """Return an endless loader that starts at the sample after the last one taken."""
+        config = self.config
+        return DataLoader(
+            self.dataset,
+            batch_sampler=SampleStream(len(self.dataset), config.batch_scenes, config.seed, self.samples),
+            num_workers=config.workers,
+            collate_fn=collate,
+            pin_memory=self.device.type == "cuda",
+            persistent_workers=config.workers > 0,
+            worker_init_fn=leave_signals_to_parent,
+        )
+
+    def take_step(self, batch: Batch) -> dict[str, float]:
+        """Take one optimiser step on `batch` and return its losses.
+
+        Raises:
+            InputError: the loss is not finite.
+        """
+        config = self.config
+        self.stage.network.train()
+        self.learning_rate = config.learning_rate_at(self.progress())
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.learning_rate
+        totals: dict[str, float] = {}
+        for part in _parts(batch, config.accumulate):
+            with self._autocast():
+                loss, terms = self.stage.loss(part.to(self.device))
+            (loss / config.accumulate).backward()
+            for name, value in {"loss": loss, **terms}.items():
+                totals[name] = totals.get(name, 0.0) + float(value.detach()) / config.accumulate
+        if not math.isfinite(totals["loss"]):
+            raise InputError(f"the loss became {totals['loss']} at step {self.step + 1}; lower learning_rate")
+        if config.clip_gradient:
+            norm = torch.nn.utils.clip_grad_norm_(self.stage.network.parameters(), config.clip_gradient)
+            totals["gradient_norm"] = float(norm)
+        self.optimiser.step()
+        self.optimiser.zero_grad(set_to_none=True)
+        self.step += 1
+        self.samples += config.batch_scenes
+        return totals
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Return the stage's metrics, prefixed `val_`, averaged over fixed samples of the `val` split."""
+        if self.validation is None:
+            return {}
+        self.stage.network.eval()
+        count = min(self.config.validation_scenes, len(self.validation))
+        rows = []
+        for index in np.linspace(0, len(self.validation) - 1, count).round().astype(int):
+            batch = collate([self.validation.sample(SampleKey(int(index), 0, int(index)))])
+            with self._autocast():
+                rows.append(self.stage.metrics(batch.to(self.device)))
+        return {f"val_{name}": float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16")
+
+    def save(self) -> None:
+        """Write the checkpoint: weights, optimiser, random state, and place in the data."""
+        cuda = torch.cuda.get_rng_state_all() if self.device.type == "cuda" else []
+        state = {
+            "identity": self._identity(),
+            "network": self.stage.network.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "random": {"cpu": torch.get_rng_state(), "cuda": cuda},
+            "step": self.step,
+            "samples": self.samples,
+            "seconds": self.seconds(),
+            "finished_metrics": self.finished_metrics,
+        }
+        save_state(self.folder / CHECKPOINT, state)
+
+    def resume(self) -> None:
+        """Go on from the folder's checkpoint, if there is one.
+
+        Raises:
+            InputError: the checkpoint is damaged, or of another configuration or data set.
+        """
+        path = self.folder / CHECKPOINT
+        if not path.is_file():
+            return
+        state = load_state(path)
+        self._compare(path, state.get("identity", {}))
+        self.stage.network.load_state_dict(state["network"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        torch.set_rng_state(state["random"]["cpu"])
+        if self.device.type == "cuda" and state["random"]["cuda"]:
+            torch.cuda.set_rng_state_all(state["random"]["cuda"])
+        self.step, self.samples = state["step"], state["samples"]
+        self.finished_metrics = state["finished_metrics"]
+        self._earlier_seconds, self._started = state["seconds"], time.perf_counter()
+
+    def _identity(self) -> dict[str, Any]:
+        """Return what a checkpoint must share with the run that resumes it."""
+        fixed = {key: value for key, value in to_plain(self.config).items() if key not in _MAY_CHANGE}
+        data = {"data": file_hash(self.data / MANIFEST), "scenes": len(self.dataset)}
+        return {"stage": self.stage.name, **data, **self.stage.origin(), **fixed}
+
+    def _compare(self, path: Path, saved: dict[str, Any]) -> None:
+        for key, value in self._identity().items():
+            if saved.get(key) != value:
+                raise InputError(
+                    f"{path}: of another run ({key} was {saved.get(key)!r}, now {value!r}); choose another --out"
+                )
+
+    def save_weights(self, metrics: dict[str, float]) -> None:
+        """Write the network with everything needed to use and to trace it."""
+        metadata = {
+            "config": to_plain(self.config),
+            "data": file_hash(self.data / MANIFEST),
+            "code": code_version(),
+            "step": self.step,
+            "seconds": round(self.seconds(), 1),
+            "metrics": metrics,
+            **self.stage.origin(),
+        }
+        model = TrainedModel(self.stage.name, self.stage.network, self.stage.options, metadata)
+        save_weights(self._weights(), model)
+
+    def _weights(self) -> Path:
+        return self.folder / f"{self.stage.name}.safetensors"
+
+    def result(self, metrics: dict[str, float], waiting_share: float, *, interrupted: bool) -> TrainingResult:
+        """Describe how the run ended."""
+        weights = None if interrupted else self._weights()
+        return TrainingResult(weights, self.step, self.seconds(), metrics, waiting_share, interrupted)
+
+
+def _parts(batch: Batch, count: int) -> list[Batch]:
+    """Split a batch into `count` equal parts."""
+    return [Batch(*tensors) for tensors in zip(*(tensor.chunk(count) for tensor in batch), strict=True)]

@@ -1,0 +1,274 @@
+"""The trainer: exact resume, refusals, signals, metrics on disk, and both networks learning for real."""
+
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from sdps_scenes import write_data
+
+from render.config import build
+from render.errors import InputError
+from sdps.augment import Augmentation
+from sdps.checkpoint import TrainedModel, load_state, load_weights, save_weights
+from sdps.config import LightingTraining, NormalTraining
+from sdps.dataset import SampleKey, SceneDataset, collate
+from sdps.models.registry import create
+from sdps.stages import LightingStage, NormalStage, Stage
+from sdps.training import CHECKPOINT, METRICS, TrainingResult, train
+
+TIMES = {"seconds", "images_per_second", "waiting_share"}
+QUICK = NormalTraining(
+    steps=8, batch_scenes=2, images=2, size=32, crop=16, lights="true", log_every=1, workers=0, validation_scenes=2,
+    schedule="cosine",
+)  # fmt: skip
+
+
+class StopAt:
+    """A logger that ends the run at a step: politely by a signal, or as a crash."""
+
+    def __init__(self, step: int, crash: bool = False) -> None:
+        self.step, self.crash = step, crash
+
+    def log(self, step: int, values: dict[str, float]) -> None:
+        if step != self.step:
+            return
+        if self.crash:
+            raise RuntimeError("killed")
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data")
+    write_data(path, ("train",) * 5 + ("val", "val"), lights=4, size=32)
+    return path
+
+
+def rows(out: Path) -> list[dict]:
+    """Return the metrics of a run without what measures time."""
+    lines = [json.loads(line) for line in (out / METRICS).read_text().splitlines()]
+    return [{key: value for key, value in line.items() if key not in TIMES} for line in lines]
+
+
+def assert_same_run(first: Path, second: Path) -> None:
+    assert rows(first) == rows(second)
+    weights = [load_file(out / "nenet.safetensors") for out in (first, second)]
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainingResult]:
+    out = tmp_path_factory.mktemp("whole")
+    return out, train(NormalStage(QUICK), folder, out)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_interrupted_and_resumed_run_is_the_uninterrupted_one(
+    folder: Path, uninterrupted: tuple, tmp_path: Path, workers: int
+) -> None:
+    config = replace(QUICK, workers=workers)
+    stopped = train(NormalStage(config), folder, tmp_path, loggers=[StopAt(3)])
+    assert stopped.interrupted
+    assert stopped.steps == 3
+    assert stopped.weights is None
+    resumed = train(NormalStage(config), folder, tmp_path)
+    assert resumed.steps == 8
+    assert not resumed.interrupted
+    assert_same_run(uninterrupted[0], tmp_path)
+
+
+def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, uninterrupted: tuple, tmp_path: Path) -> None:
+    config = replace(QUICK, checkpoint_minutes=1e-9)  # one every step
+    with pytest.raises(RuntimeError, match="killed"):
+        train(NormalStage(config), folder, tmp_path, loggers=[StopAt(5, crash=True)])
+    assert load_state(tmp_path / CHECKPOINT)["step"] == 4
+    assert rows(tmp_path)[-1]["step"] == 5  # written, but not saved: dropped and taken again
+    (tmp_path / METRICS).open("a").write('{"step": 6, "lo')  # half a line, as a kill leaves it
+    train(NormalStage(QUICK), folder, tmp_path)
+    assert_same_run(uninterrupted[0], tmp_path)
+
+
+def test_finished_run_is_left_alone_and_a_longer_budget_goes_on(folder: Path, tmp_path: Path) -> None:
+    config = replace(QUICK, steps=2, schedule="constant")
+    first = train(NormalStage(config), folder, tmp_path)
+    time_of_change = first.weights.stat().st_mtime_ns
+    again = train(NormalStage(config), folder, tmp_path)
+    assert (again.steps, again.metrics) == (2, first.metrics)
+    assert again.weights.stat().st_mtime_ns == time_of_change
+    longer = train(NormalStage(replace(config, steps=4)), folder, tmp_path)
+    whole = train(NormalStage(replace(config, steps=4)), folder, tmp_path / "whole")
+    assert longer.metrics == whole.metrics
+
+
+def test_checkpoint_of_another_run_is_refused(folder: Path, uninterrupted: tuple, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"learning_rate was 0\.0005, now 0\.1"):
+        train(NormalStage(replace(QUICK, learning_rate=0.1)), folder, uninterrupted[0])
+    (tmp_path / CHECKPOINT).write_bytes((uninterrupted[0] / CHECKPOINT).read_bytes()[:5000])
+    with pytest.raises(InputError, match="not a checkpoint; delete it"):
+        train(NormalStage(QUICK), folder, tmp_path)
+
+
+def test_minutes_are_counted_across_resumed_runs(folder: Path, tmp_path: Path) -> None:
+    config = replace(QUICK, steps=None, minutes=0.05, schedule="cosine")
+    stopped = train(NormalStage(config), folder, tmp_path, loggers=[StopAt(2)])
+    finished = train(NormalStage(config), folder, tmp_path)
+    assert 3.0 <= finished.seconds < 6.0
+    assert finished.seconds > stopped.seconds
+    lines = [json.loads(line) for line in (tmp_path / METRICS).read_text().splitlines()]
+    rates = [line["learning_rate"] for line in lines if "learning_rate" in line]
+    assert rates == sorted(rates, reverse=True)
+    assert rates[-1] < 0.1 * rates[0]
+
+
+def test_metrics_name_speed_waiting_and_validation(uninterrupted: tuple) -> None:
+    out, result = uninterrupted
+    lines = [json.loads(line) for line in (out / METRICS).read_text().splitlines()]
+    assert [line["step"] for line in lines] == [*range(1, 9), 8]
+    assert TIMES | {"loss", "masked_loss", "learning_rate"} <= lines[0].keys()
+    assert 0.0 <= lines[0]["waiting_share"] <= 1.0
+    assert lines[-1]["val_normal_mae"] == result.metrics["val_normal_mae"] > 0.0
+
+
+def test_accumulated_gradients_are_those_of_the_whole_batch(folder: Path, tmp_path: Path) -> None:
+    outs = []
+    for accumulate in (1, 2):
+        config = LightingTraining(
+            steps=1, batch_scenes=2, images=2, accumulate=accumulate, workers=0, log_every=1, validation_scenes=0
+        )
+        train(LightingStage(config), folder, tmp_path / str(accumulate))
+        outs.append(rows(tmp_path / str(accumulate))[0]["loss"])
+    assert outs[0] == pytest.approx(outs[1], rel=1e-5)
+
+
+def test_stage_two_leaves_the_lighting_network_as_it_is(folder: Path, tmp_path: Path) -> None:
+    lighting = TrainedModel("lcnet", create("lcnet").eval(), {"direction_classes": 36, "intensity_classes": 20},
+                            {"config": {"augmentation": {}}, "data": "d", "step": 1})  # fmt: skip
+    before = {name: tensor.clone() for name, tensor in lighting.network.state_dict().items()}
+    stage = NormalStage(replace(QUICK, steps=2, lights="estimated"), lighting)
+    result = train(stage, folder, tmp_path)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in lighting.network.state_dict().items())
+    assert load_weights(result.weights, "nenet").metadata["lcnet"]["data"] == "d"
+    # NENet is given class centres, not the true lights.
+    dataset = SceneDataset(folder, "train", stage.sample_options())
+    directions, intensities = stage.lights(collate([dataset.sample(SampleKey(0, 0, 0))]))
+    labels = stage.classes.encode(directions, intensities)
+    torch.testing.assert_close(stage.classes.decode(*labels)[0], directions)
+
+
+def test_weights_carry_their_origin(uninterrupted: tuple) -> None:
+    model = load_weights(uninterrupted[1].weights, "nenet")
+    assert model.metadata["step"] == 8
+    assert len(model.metadata["data"]) == 64
+    assert build(NormalTraining, model.metadata["config"]) == QUICK
+    assert model.augmentation() == QUICK.augmentation
+
+
+def test_half_precision_weights_load_as_float32(tmp_path: Path) -> None:
+    model = TrainedModel("nenet", create("nenet"), {}, {"config": {}})
+    save_weights(tmp_path / "whole.safetensors", model)
+    save_weights(tmp_path / "half.safetensors", model, half=True)
+    assert (tmp_path / "half.safetensors").stat().st_size < 0.51 * (tmp_path / "whole.safetensors").stat().st_size
+    loaded = load_weights(tmp_path / "half.safetensors", "nenet").network
+    for name, tensor in loaded.state_dict().items():
+        assert tensor.dtype == torch.float32
+        torch.testing.assert_close(tensor, model.network.state_dict()[name], atol=1e-3, rtol=1e-3)
+
+
+def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path: Path) -> None:
+    weights = uninterrupted[1].weights
+    cut, text = tmp_path / "cut.safetensors", tmp_path / "text.safetensors"
+    cut.write_bytes(weights.read_bytes()[:-1000])
+    text.write_text("not weights")
+    misfit = tmp_path / "misfit.safetensors"
+    save_weights(misfit, TrainedModel("lcnet", create("lcnet"), {"intensity_classes": 10}, {}))
+    cases = [
+        (weights, "lcnet", "holds 'nenet' weights"),
+        (cut, "nenet", "truncated"),
+        (text, "nenet", "truncated or not a safetensors"),
+        (tmp_path / "none.safetensors", "nenet", "no such weights"),
+        (misfit, "lcnet", "do not fit"),
+    ]
+    for path, name, message in cases:
+        with pytest.raises(InputError, match=message) as error:
+            load_weights(path, name)
+        assert "\n" not in str(error.value)
+
+
+def test_schedules_of_the_paper() -> None:
+    lighting = LightingTraining()
+    assert (lighting.epochs, lighting.batch_scenes, lighting.images, lighting.learning_rate) == (20, 32, 32, 5e-4)
+    rates = [lighting.learning_rate_at(epoch / 20) for epoch in (0, 4.9, 5, 10, 15, 19.9)]
+    np.testing.assert_allclose(rates, [5e-4, 5e-4, 2.5e-4, 1.25e-4, 6.25e-5, 6.25e-5])
+    normal = NormalTraining()
+    assert (normal.epochs, normal.batch_scenes, normal.learning_rate_at(0.79)) == (10, 16, 5e-4 / 8)
+    warm = LightingTraining(schedule="cosine", warmup=0.1)
+    assert warm.learning_rate_at(0.05) == pytest.approx(2.5e-4)
+    assert warm.learning_rate_at(0.55) == pytest.approx(2.5e-4)
+    assert warm.learning_rate_at(1.2) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"steps": 0}, "steps must be positive"),
+        ({"steps": 5, "minutes": 1.0}, "both set"),
+        ({"accumulate": 3}, "must divide"),
+        ({"epochs": 12.0}, "halve_after"),
+        ({"size": 64}, "must be 128 for LCNet"),
+        ({"learnin_rate": 1.0}, "did you mean 'training.learning_rate'"),
+        ({"augmentation": {"noise": 2.0}}, "noise"),
+    ],
+)
+def test_configuration_is_checked(values: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        build(LightingTraining, values, "training")
+
+
+def evaluate(stage: Stage, folder: Path) -> dict[str, float]:
+    """Return the stage's metrics on its own training scenes under augmentation it has not seen."""
+    dataset = SceneDataset(folder, "train", stage.validation_options())
+    stage.network.eval()
+    with torch.no_grad():
+        return stage.metrics(collate([dataset.sample(SampleKey(index, 999, index)) for index in range(len(dataset))]))
+
+
+OVERFIT = {
+    "schedule": "cosine",
+    "warmup": 0.05,
+    "workers": 0,
+    "validation_scenes": 0,
+    "augmentation": Augmentation(noise=0.02),
+}
+
+
+def test_lcnet_learns_the_lights_of_a_few_scenes(tmp_path: Path) -> None:
+    write_data(tmp_path, ("train",) * 3, lights=6, size=128)
+    config = LightingTraining(
+        steps=100, batch_scenes=3, images=6, learning_rate=1e-3, optimiser="adamw", clip_gradient=5.0, **OVERFIT
+    )
+    stage = LightingStage(config)
+    before = evaluate(stage, tmp_path)["direction_mae"]
+    train(stage, tmp_path, tmp_path / "run")
+    assert before > 20.0
+    assert evaluate(stage, tmp_path)["direction_mae"] < 4.0
+
+
+def test_nenet_learns_the_normals_of_a_few_scenes(tmp_path: Path) -> None:
+    write_data(tmp_path, ("train",) * 3, lights=6, size=32)
+    config = NormalTraining(
+        steps=300, batch_scenes=2, images=4, size=32, learning_rate=2e-3, clip_gradient=1.0, lights="true", **OVERFIT
+    )
+    stage = NormalStage(config)
+    before = evaluate(stage, tmp_path)["normal_mae"]
+    train(stage, tmp_path, tmp_path / "run")
+    assert before > 30.0
+    assert evaluate(stage, tmp_path)["normal_mae"] < 5.0
