@@ -41,10 +41,10 @@ class Vertices:
     count: int
     position: Any  # Point3f (N)
     normal: Any  # Vector3f (N), shading normal
-    wi: Any  # Vector3f (N), to the previous vertex
+    wi: Any  # Vector3f (N, or 1 at the camera hits), to the previous vertex
     sample: Any  # UInt32 (N), number of the camera sample
     words: Any  # UInt32 (ceil(L / 32) * N)
-    throughput: tuple  # K Color3f (N): f cos / density along the path so far
+    throughput: tuple  # K Color3f (N, or 1 at the camera hits): f cos / density along the path so far
     pixels: Any  # UInt32 (Q), pixels with at least one vertex
     start: Any  # UInt32 (Q), first vertex of the pixel
     length: Any  # UInt32 (Q), number of vertices of the pixel
@@ -141,21 +141,21 @@ def trace(
     directions = _opaque(mi.Vector3f(rotation.T @ mi.Vector3f(np.ascontiguousarray(lights.T, dtype=np.float32))))
     ray, sample = _camera_rays(view, rotation, size, spp, seed, first, total or spp)
     depths: list[Vertices] = []
-    pixel_count, throughput = size * size, None
+    pixel_count, throughput = size * size, (mi.Color3f(1),) * len(materials)
     for depth in range(bounces + 1):
         found = scene.ray_intersect(ray, +mi.RayFlags.ShadingFrame, depth == 0)
         wi = -ray.d
         # A one-sided BSDF is black from behind, so such paths end here, as they do in Mitsuba's `path`.
         alive = found.is_valid() & ((depth == 0) | (dr.dot(found.sh_frame.n, wi) > 0))
+        # Together, or each gather below would trace the rays again.
+        dr.eval(alive, found.p, found.n, found.sh_frame.n, wi, sample, throughput)
         kept = dr.compress(alive)
         if len(kept) == 0:
             break
-        if throughput is None:
-            throughput = tuple(dr.full(mi.Color3f, 1, len(kept)) for _ in range(len(materials)))
-        else:
-            throughput = tuple(_take(mi.Color3f, value, kept) for value in throughput)
+        throughput = tuple(_take(mi.Color3f, value, kept) for value in throughput)
         position, normal = _take(mi.Point3f, found.p, kept), _take(mi.Vector3f, found.sh_frame.n, kept)
-        facet, wi, sample = _take(mi.Vector3f, found.n, kept), _take(mi.Vector3f, wi, kept), _take(mi.UInt32, sample, kept)
+        facet, wi = _take(mi.Vector3f, found.n, kept), _take(mi.Vector3f, wi, kept)
+        sample = _take(mi.UInt32, sample, kept)
         dr.eval(position, normal, facet, wi, sample, throughput)
         words = _visibility(scene, position, normal, facet, directions, len(lights))
         pixels, start, length = _segments(sample, spp, pixel_count)
@@ -176,48 +176,40 @@ def shade(paths: Paths, materials: PackedMaterials, index: int) -> np.ndarray:
     image = dr.zeros(mi.Float, paths.lights * pixel_count * 3)
     dr.eval(image)
     material = _opaque(mi.UInt32(index))
-    lights, stride = _opaque(mi.UInt32(paths.lights)), _opaque(mi.UInt32(pixel_count))
     for vertices in paths.depths:
-        _add_depth(image, vertices, paths.directions, materials, material, lights, stride)
-    return np.array(image).reshape(paths.lights, paths.size, paths.size, 3) * np.float32(math.pi)
+        _add_depth(image, paths, vertices, vertices.throughput[index], materials, material)
+    return np.array(image).reshape(paths.lights, paths.size, paths.size, 3)
 
 
 def _add_depth(
-    image: Any, vertices: Vertices, directions: Any, materials: PackedMaterials, material: Any, lights: Any, stride: Any
+    image: Any, paths: Paths, vertices: Vertices, throughput: Any, materials: PackedMaterials, material: Any
 ) -> None:
-    """Add the light reflected at one depth; a lane owns a pixel, so plain sums suffice and have one order."""
-    count = _opaque(mi.UInt32(vertices.count))
-    throughput = vertices.throughput[int(material[0])]
+    """Add the light reflected at one depth; a lane owns a (light, pixel), so plain sums suffice and have one order."""
+    pixels, count = _opaque(mi.UInt32(dr.width(vertices.pixels))), _opaque(mi.UInt32(vertices.count))
+    stride = _opaque(mi.UInt32(paths.size**2))
+    lane = dr.arange(mi.UInt32, paths.lights * dr.width(vertices.pixels))
+    light = lane // pixels
+    pixel = lane - light * pixels
+    start, length = dr.gather(mi.UInt32, vertices.start, pixel), dr.gather(mi.UInt32, vertices.length, pixel)
+    direction = dr.gather(mi.Vector3f, paths.directions, light)
+    words, bit = (light // _WORD) * count, light % _WORD
 
-    def per_vertex(i: Any) -> tuple:
-        at = vertices.start + i
-        active = i < vertices.length
-        frame = mi.Frame3f(dr.gather(mi.Vector3f, vertices.normal, at, active))
-        wi = frame.to_local(dr.gather(mi.Vector3f, vertices.wi, at, active))
-        weight = dr.gather(mi.Color3f, throughput, at, active)
+    def reflect(at: Any) -> Any:
+        frame = mi.Frame3f(dr.gather(mi.Vector3f, vertices.normal, at))
+        wi = frame.to_local(_take(mi.Vector3f, vertices.wi, at))
+        return _take(mi.Color3f, throughput, at) * materials.eval(material, wi, frame.to_local(direction))
 
-        def per_word(w: Any) -> tuple:
-            word = dr.gather(mi.UInt32, vertices.words, w * count + at, active)
+    def per_vertex(i: Any, total: Any) -> tuple:
+        at = start + i
+        lit = ((dr.gather(mi.UInt32, vertices.words, words + at) >> bit) & 1) != 0
+        return i + 1, total + dr.if_stmt((at,), lit, reflect, lambda at: mi.Color3f(0))
 
-            def per_light(b: Any) -> tuple:
-                light = w * _WORD + b
-                lit = active & (((word >> b) & 1) != 0)
-                wo = frame.to_local(dr.gather(mi.Vector3f, directions, light, light < lights))
-                value = weight * materials.eval(material, wi, wo, lit)
-                target = 3 * (light * stride + vertices.pixels)
-                for channel in range(3):
-                    dr.scatter_reduce(
-                        dr.ReduceOp.Add, image, value[channel], target + channel, lit, mode=dr.ReduceMode.NoConflicts
-                    )
-                return (b + 1,)
-
-            dr.while_loop((mi.UInt32(0),), lambda b: (b < _WORD) & (w * _WORD + b < lights), per_light)
-            return (w + 1,)
-
-        dr.while_loop((mi.UInt32(0),), lambda w: w * _WORD < lights, per_word)
-        return (i + 1,)
-
-    dr.while_loop((mi.UInt32(0),), lambda i: i < vertices.length, per_vertex)
+    _, total = dr.while_loop((mi.UInt32(0), mi.Color3f(0)), lambda i, total: i < length, per_vertex)
+    target = 3 * (light * stride + dr.gather(mi.UInt32, vertices.pixels, pixel))
+    for channel in range(3):
+        dr.scatter_reduce(
+            dr.ReduceOp.Add, image, math.pi * total[channel], target + channel, mode=dr.ReduceMode.NoConflicts
+        )
     dr.eval(image)
 
 
@@ -249,27 +241,24 @@ def _visibility(
     scene: "mi.Scene", position: Any, normal: Any, facet: Any, directions: Any, lights: int
 ) -> "mi.UInt32":
     """Cast one shadow ray per vertex and light; return the packed bits (see `Vertices.words`)."""
-    count = dr.width(position)
-    words = dr.zeros(mi.UInt32, count * -(-lights // _WORD))
-    dr.eval(words)
-    lane, width, total = dr.arange(mi.UInt32, count), _opaque(mi.UInt32(count)), _opaque(mi.UInt32(lights))
-    start = dr.zeros(mi.SurfaceInteraction3f, count)
-    start.p, start.n = position, facet
+    count, groups = dr.width(position), -(-lights // _WORD)
+    width, total = _opaque(mi.UInt32(count)), _opaque(mi.UInt32(lights))
+    lane = dr.arange(mi.UInt32, count * groups)
+    first = lane // width * _WORD
+    vertex = lane - first // _WORD * width
+    start = dr.zeros(mi.SurfaceInteraction3f, count * groups)
+    start.p, start.n = _take(mi.Point3f, position, vertex), _take(mi.Normal3f, facet, vertex)
+    shading = _take(mi.Vector3f, normal, vertex)
 
-    def per_word(w: Any) -> tuple:
-        def per_light(b: Any, bits: Any) -> tuple:
-            light = w * _WORD + b
-            direction = dr.gather(mi.Vector3f, directions, light, light < total)
-            facing = dr.dot(normal, direction) > 0
-            lit = facing & ~scene.ray_test(start.spawn_ray(direction), True, facing)
-            return b + 1, bits | (mi.UInt32(lit) << b)
+    def per_light(b: Any, bits: Any) -> tuple:
+        light = first + b
+        direction = dr.gather(mi.Vector3f, directions, light)
+        facing = dr.dot(shading, direction) > 0
+        lit = facing & ~scene.ray_test(start.spawn_ray(direction), True, facing)
+        return b + 1, bits | (mi.UInt32(lit) << b)
 
-        state = (mi.UInt32(0), mi.UInt32(0))
-        _, bits = dr.while_loop(state, lambda b, _: (b < _WORD) & (w * _WORD + b < total), per_light)
-        dr.scatter(words, bits, w * width + lane)
-        return (w + 1,)
-
-    dr.while_loop((mi.UInt32(0),), lambda w: w * _WORD < total, per_word)
+    state = (mi.UInt32(0), mi.UInt32(0))
+    _, words = dr.while_loop(state, lambda b, _: (b < _WORD) & (first + b < total), per_light)
     dr.eval(words)
     return words
 
@@ -353,9 +342,9 @@ def _stream(seed: int, stage: int) -> "mi.UInt64":
 
 
 def _take(kind: type, source: Any, index: Any) -> Any:
-    """Gather the lanes `index` of an array that may be uniform (width 1)."""
+    """Gather the lanes `index` of an array; one that is uniform (width 1) stays so."""
     source = kind(source)
-    return dr.gather(kind, source, index) if dr.width(source) > 1 else source + dr.zeros(kind, dr.width(index))
+    return dr.gather(kind, source, index) if dr.width(source) > 1 else source
 
 
 def _opaque(value: Any) -> Any:

@@ -82,7 +82,7 @@ def plan(config: DataConfig) -> list[SceneSpec]:
     """
     pool = material_pool(config.materials)
     if config.materials_per_view > len(pool):
-        raise InputError(f"materials_per_view is {config.materials_per_view}, but only {len(pool)} materials are chosen")
+        raise InputError(f"materials_per_view is {config.materials_per_view}, but there are {len(pool)} materials")
     scenes = []
     for family, count in config.families.items():
         held_out = int(np.ceil(config.validation * count))
@@ -142,8 +142,9 @@ def _plan_view(
 def random_view(config: DataConfig, family: str, rng: np.random.Generator) -> View:
     """Draw a pose: any rotation for blobs; any yaw, but limited pitch and roll, for shapes that stand."""
     if family in UPRIGHT:
-        yaw, pitch, roll = rng.uniform(-180, 180), rng.uniform(-50, 50), rng.uniform(-15, 15)
-        rotation = Rotation.from_euler("zxy", [roll, pitch, yaw], degrees=True)
+        # Turned about its own axis first, then tipped towards the camera (positive: seen from above), then rolled.
+        yaw, pitch, roll = rng.uniform(-180, 180), rng.uniform(-30, 55), rng.uniform(-15, 15)
+        rotation = Rotation.from_euler("yxz", [yaw, pitch, roll], degrees=True)
         scale = float(np.exp(rng.uniform(*np.log(config.upright_scale))))
     else:
         rotation = Rotation.random(rng=rng)

@@ -12,6 +12,7 @@ refuses whatever differs from the manifest.
 
 import hashlib
 import os
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,9 +23,11 @@ from render.errors import InputError
 from render.files import atomic_path
 from render.manifest import SceneSpec
 
-SCHEMA = 1
+SCHEMA = 2
 HALF_LIMIT = 65504.0
 _OWN_ATTRIBUTES = ("ps:schema", "ps:scene_id", "ps:light_count", "ps:digest")
+_DIGEST = re.compile(rb"ps:digest\0string\0\x40\0\0\0([0-9a-f]{64})")  # as OpenEXR lays an attribute out
+_SCHEMA_1 = b"ps:schema\0int\0\4\0\0\0\1\0\0\0"  # its digest covers pixels and lights only
 _DTYPES = (np.dtype(np.float16), np.dtype(np.float32), np.dtype(np.uint32))
 
 
@@ -90,6 +93,7 @@ def write_exr(path: str | Path, parts: list[tuple[str, dict, dict[str, np.ndarra
     with atomic_path(path) as temporary:
         try:
             OpenEXR.File(checked).write(str(temporary))
+            _seal(temporary)
         except (RuntimeError, ValueError) as error:
             # The binding reports a full disk as RuntimeError; atomic_path turns OSError into one clear line.
             raise OSError(f"OpenEXR could not write it: {error}") from error
@@ -111,7 +115,7 @@ def write_shard(path: str | Path, shard: Shard) -> None:
         InputError: non-finite values or an unwritable disk.
     """
     attributes = {"ps:schema": SCHEMA, "ps:scene_id": shard.scene_id, "ps:light_count": len(shard.images)}
-    attributes["ps:digest"] = _digest(shard)
+    attributes["ps:digest"] = "0" * 64  # filled in by `_seal`
     attributes |= {f"ps:{key}": value for key, value in shard.provenance.items()}
     ground_truth = {
         "normal.X": shard.normals[..., 0],
@@ -128,8 +132,25 @@ def write_shard(path: str | Path, shard: Shard) -> None:
     write_exr(path, parts)
 
 
-def _digest(shard: Shard) -> str:
-    """Return the SHA-256 of all pixels and lights, since ZIP alone does not notice every altered byte."""
+def _seal(path: Path) -> None:
+    """Put the digest of the file into its `ps:digest` attribute, if it has one."""
+    data = path.read_bytes()
+    match = _DIGEST.search(data)
+    if match:
+        with open(path, "r+b") as handle:
+            handle.seek(match.start(1))
+            handle.write(_digest(data, match).encode())
+
+
+def _digest(data: bytes, match: re.Match) -> str:
+    """Return the SHA-256 of the whole file but for the digest itself, since OpenEXR alone overlooks altered bytes."""
+    digest = hashlib.sha256(memoryview(data)[: match.start(1)])
+    digest.update(memoryview(data)[match.end(1) :])
+    return digest.hexdigest()
+
+
+def _pixel_digest(shard: Shard) -> str:
+    """Return the digest of schema 1."""
     digest = hashlib.sha256()
     for array in (shard.images, shard.normals, shard.depth, shard.mask, shard.coverage, shard.light_directions):
         digest.update(np.ascontiguousarray(array))
@@ -153,7 +174,7 @@ def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
     """
     parts = _read_parts(path)
     header = parts[0].header
-    if parts[0].name() != "gt" or header.get("ps:schema") != SCHEMA:
+    if parts[0].name() != "gt" or header.get("ps:schema") not in (1, SCHEMA):
         raise InputError(f"{path}: not a shard of schema {SCHEMA} (first part {parts[0].name()!r}); render it again")
     names = [f"L{index:03d}" for index in range(len(parts) - 1)]
     if [part.name() for part in parts[1:]] != names:
@@ -175,7 +196,9 @@ def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
         )
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: incomplete shard ({error}); delete the file and render it again") from error
-    if len(shard.images) != header.get("ps:light_count") or _digest(shard) != header.get("ps:digest"):
+    if len(shard.images) != header.get("ps:light_count"):
+        raise InputError(f"{path}: light parts are missing; delete the file and render it again")
+    if header["ps:schema"] == 1 and _pixel_digest(shard) != header.get("ps:digest"):
         raise InputError(f"{path}: truncated or altered since it was written; delete the file and render it again")
     if scene is not None:
         _compare(path, shard, scene)
@@ -183,16 +206,25 @@ def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
 
 
 def _read_parts(path: str | Path) -> list:
-    """Open an EXR file and return its parts, which a truncated file has fewer of (or none)."""
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such shard; run `sdps render-data` to finish the folder")
+    """Check the digest, then open the EXR file and return its parts.
+
+    In this order because OpenEXR skips over what is damaged, telling so only on stderr.
+    """
     try:
-        parts = OpenEXR.File(os.fspath(path)).parts
+        data = Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such shard; run `sdps render-data` to finish the folder") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    match = _DIGEST.search(data)
+    if match is None:
+        raise InputError(f"{path}: not a shard of schema {SCHEMA}, or truncated; delete the file and render it again")
+    if _digest(data, match) != match.group(1).decode() and _SCHEMA_1 not in data[:4096]:
+        raise InputError(f"{path}: truncated or altered since it was written; delete the file and render it again")
+    try:
+        return OpenEXR.File(os.fspath(path)).parts
     except (RuntimeError, ValueError, OSError) as error:
         raise InputError(f"{path}: damaged EXR ({error}); delete the file and render it again") from error
-    if len(parts) < 2:
-        raise InputError(f"{path}: truncated EXR ({len(parts)} parts); delete the file and render it again")
-    return parts
 
 
 def _compare(path: str | Path, shard: Shard, scene: SceneSpec) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 
 from render.errors import InputError
+from render.files import cache_folder
 
 KNOWN_GOOD = 19
 OLDEST = 17
@@ -44,12 +45,6 @@ class Choice:
     variant: str
     llvm: Path | None
     reason: str
-
-
-def cache_folder() -> Path:
-    """Return the per-user folder for things fetched once (libLLVM, the bunny mesh); `SDPS_CACHE` overrides it."""
-    root = os.environ.get("SDPS_CACHE")
-    return Path(root) if root else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "sdps"
 
 
 def llvm_version(path: Path) -> int | None:

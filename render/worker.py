@@ -5,7 +5,7 @@ from itertools import groupby
 from pathlib import Path
 
 import drjit as dr
-from tqdm import tqdm
+from render.progress import progress_bar
 
 from render import many_lights, variant
 from render.errors import InputError
@@ -43,7 +43,7 @@ def render_scenes(
     """
     folder = Path(folder)
     missing = {scene.id for scene in scenes if not is_finished(scene, folder)}
-    with tqdm(total=len(scenes), initial=len(scenes) - len(missing), unit="scene", desc="render", disable=None) as bar:
+    with progress_bar(total=len(scenes), initial=len(scenes) - len(missing), unit="scene", desc="render") as bar:
         # Consecutive views of one shape share its mesh and acceleration structure.
         for shape, run in groupby(view_groups(scenes, group_size), key=lambda group: group[0].shape):
             groups = [group for group in run if any(scene.id in missing for scene in group)]

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 
 from render.errors import InputError
-from render.files import atomic_path
+from render.files import atomic_path, cache_folder
 from render.shapes.mesh import TriangleMesh, load_mesh, unit
 
 BUNNY_WHEEL = "pymeshfix==0.18.1"
@@ -45,15 +45,6 @@ def bunny() -> TriangleMesh:
     x, y, z = mesh.vertices.T
     nx, ny, nz = mesh.normals.T
     return replace(mesh, vertices=np.stack([x, z, -y], axis=1), normals=np.stack([nx, nz, -ny], axis=1)).normalised()
-
-
-def cache_folder() -> Path:
-    """Return the folder for fetched meshes: $SDPS_CACHE, else sdps in the user's cache folder."""
-    chosen = os.environ.get("SDPS_CACHE")
-    if chosen:
-        return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return (Path(base) if base else Path.home() / ".cache") / "sdps"
 
 
 def bunny_file() -> Path:

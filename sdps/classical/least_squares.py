@@ -5,6 +5,9 @@ import numpy as np
 from render.errors import InputError
 from sdps.estimate import Estimate
 
+_GREY = np.array([0.299, 0.587, 0.114])
+"""Rec. 601 weights of R, G, B, as in the DiLiGenT benchmark's own baseline; blue is the noisiest channel there."""
+
 _MIN_CONDITION = 1e-3
 """Smallest over largest singular value of the light matrix below which lights count as coplanar."""
 
@@ -40,7 +43,8 @@ def least_squares(
     images = images[..., None] if images.ndim == 3 else images
     _check(images, mask, directions, gains, shadow_threshold)
     gains = gains[:, None] if gains.ndim == 1 else gains  # (L, 1 or 3)
-    grey = (images[:, mask] / gains[:, None]).mean(-1)  # (L, P)
+    values = images[:, mask] / gains[:, None]  # (L, P, 1 or 3)
+    grey = values @ (_GREY if values.shape[-1] == 3 else np.ones(1))  # (L, P)
     vectors = np.linalg.lstsq(directions, grey, rcond=None)[0].T  # (P, 3), albedo times normal
     if shadow_threshold > 0.0:
         vectors = _without_shadows(directions, grey, vectors, shadow_threshold)

@@ -34,8 +34,8 @@ class NENet(nn.Module):
             conv(128, 128),
             conv(128, 128),
             deconv(128, 64),  # H x W
-            nn.Conv2d(64, 3, 3, padding=1, bias=False),
         )
+        self.normal = nn.Conv2d(64, 3, 3, padding=1, bias=False)
         initialise(self)
 
     def encode(
@@ -55,8 +55,10 @@ class NENet(nn.Module):
 
     def regress(self, feature: Tensor) -> Tensor:
         """Return unit normals (B, 3, H, W), float32, of the aggregated feature (B, 128, H/2, W/2)."""
-        # float32 from here: bfloat16's 8 bits of mantissa are steps of a fifth of a degree.
-        return functional.normalize(self.regressor(feature).float(), dim=1)
+        feature = self.regressor(feature).float()
+        # Never under autocast: a normal rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
+        with torch.autocast(feature.device.type, enabled=False):
+            return functional.normalize(self.normal(feature), dim=1)
 
     def forward(self, images: Tensor, directions: Tensor) -> Tensor:
         """Return unit normals (B, 3, H, W) of (B, Q, 3, H, W) images and their (B, Q, 3) directions."""

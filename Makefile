@@ -1,0 +1,72 @@
+# Every target sets up what it needs, once: .venv, packages, a libLLVM that works, the bunny mesh.
+#   make demo        render, train, evaluate and regenerate on the demo preset, then write a page
+#   make test        the test-suite
+PYTHON ?= python3
+PRESET ?= small
+OUT ?= out/$(PRESET)
+SHAPES ?= sphere,bunny
+MATERIALS ?= gold-metallic-paint,chrome,lambertian:0.5
+LIGHTS ?= merltest
+SET ?=
+
+VENV := .venv
+SDPS := $(VENV)/bin/sdps
+READY := $(VENV)/.ready
+ASSETS_READY := $(VENV)/.assets-ready
+SETTINGS := $(foreach item,$(SET),--set $(item))
+
+.PHONY: help setup doctor render-data train eval-merltest regenerate demo test test-slow lint bench clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo | test | lint | bench | doctor"
+	@echo "make render-data | train | eval-merltest   PRESET=smoke|demo|small|paper OUT=folder SET='section.field=value ...'"
+	@echo "make regenerate   SHAPES=bunny MATERIALS=chrome,lambertian:0.5 LIGHTS=merltest OUT=folder"
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "$(PYTHON) is older than 3.11; name a newer one: make PYTHON=python3.12"; exit 2; }
+	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
+	@touch $@
+
+$(ASSETS_READY): $(READY)
+	$(SDPS) doctor --fix
+	@touch $@
+
+setup: $(ASSETS_READY)
+
+doctor: $(READY)
+	$(SDPS) doctor
+
+render-data train eval-merltest: $(ASSETS_READY)
+	$(SDPS) $@ --preset $(PRESET) --out $(OUT) $(SETTINGS)
+
+regenerate: OUT = out/regenerated
+regenerate: $(ASSETS_READY)
+	$(SDPS) regenerate --shapes '$(SHAPES)' --materials '$(MATERIALS)' --lights '$(LIGHTS)' --out $(OUT)
+
+demo: PRESET = demo
+demo: $(ASSETS_READY)
+	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
+	$(SDPS) train --preset $(PRESET) --out $(OUT) $(SETTINGS)
+	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
+	$(SDPS) regenerate --shapes bunny --materials '$(MATERIALS)' --lights '$(LIGHTS)' --out $(OUT)/regenerated
+	@echo "open $(OUT)/report.html"
+
+test: $(ASSETS_READY)
+	$(VENV)/bin/python -m pytest -m "not slow and not gpu"
+
+test-slow: $(ASSETS_READY)
+	$(VENV)/bin/python -m pytest -m "slow and not gpu"
+
+lint: $(READY)
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+
+bench: OUT = out/bench
+bench: $(ASSETS_READY)
+	$(SDPS) bench --out $(OUT)
+
+clean:
+	rm -rf $(VENV) out build *.egg-info

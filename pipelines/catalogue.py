@@ -1,0 +1,98 @@
+"""`sdps materials` and `sdps shapes`: what there is to render, as a list or as a contact sheet."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from pipelines import pictures
+from render.errors import InputError
+from render.files import atomic_path
+from render.manifest import View
+from render.materials import library
+
+_LIGHTS = np.array([[-0.45, 0.55, 0.70]])
+_SHAPES = ("sphere", "bunny", *(f"{family}:{seed}" for family in ("blobby", "sculpture") for seed in range(15)))
+_TURNED = View(rotation=(0.9063, 0.0, 0.4226, 0.0746, 0.9843, -0.1600, -0.4160, 0.1765, 0.8921), scale=0.98)
+
+
+def add_material_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps materials`."""
+    parser.add_argument("--category", default=None, help="only this category")
+    parser.add_argument("--sheet", default=None, metavar="FILE.png", help="also render a contact sheet of spheres")
+
+
+def add_shape_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps shapes`."""
+    parser.add_argument("--sheet", default=None, metavar="FILE.png", help="also render a contact sheet")
+
+
+def materials_main(args: argparse.Namespace) -> int:
+    """List the materials with category and fit error."""
+    categories = library.categories()
+    if args.category is not None and args.category not in categories:
+        from render.errors import unknown
+
+        raise unknown("category", args.category, categories)
+    chosen = [name for name in library.names() if args.category is None or name in categories[args.category]]
+    for name in chosen:
+        material = library.load(name)
+        sys.stdout.write(f"{name:<28} {material.category:<16} fit error {100 * material.fit_error:5.1f} %\n")
+    sys.stdout.write(f"{len(chosen)} materials; also lambertian:<albedo>, lambertian:<r>/<g>/<b>, and YAML files\n")
+    if args.sheet:
+        _save(_material_sheet(chosen), args.sheet)
+    return 0
+
+
+def shapes_main(args: argparse.Namespace) -> int:
+    """List the shape families."""
+    from render.shapes import families
+
+    for name, about in families().items():
+        sys.stdout.write(f"{name:<18} {about}\n")
+    sys.stdout.write(f"{'<file>':<18} any mesh trimesh reads: .obj .ply .stl .glb .off ...\n")
+    if args.sheet:
+        _save(_shape_sheet(), args.sheet)
+    return 0
+
+
+def _material_sheet(names: list[str]) -> pictures.Image.Image:
+    """Render a sphere of each material under one light, exposed alike but for the nearly black."""
+    from render import many_lights, scene
+    from render.materials.bsdf import PackedMaterials
+    from render.shapes import load
+
+    built = scene.build(load("sphere"))
+    tiles = []
+    for first in range(0, len(names), 16):
+        part = names[first : first + 16]
+        packed = PackedMaterials([library.load(name) for name in part])
+        _, images = many_lights.render(built, View(scale=0.95), packed, _LIGHTS, size=96, spp=64, bounces=0, seed=0)
+        tiles += [(name[:20], pictures.tone_map(stack[0], 1.2)) for name, (_, stack) in zip(part, images, strict=True)]
+    return pictures.contact_sheet(tiles, columns=min(10, len(tiles)))
+
+
+def _shape_sheet() -> pictures.Image.Image:
+    """Render one view of each shape in white under one light."""
+    from render import many_lights, scene
+    from render.materials.bsdf import PackedMaterials
+    from render.shapes import load
+
+    packed = PackedMaterials([library.load("lambertian:0.8")])
+    tiles = []
+    for name in _SHAPES:
+        view = View(scale=0.98) if name == "bunny" else _TURNED
+        _, images = many_lights.render(
+            scene.build(load(name)), view, packed, _LIGHTS, size=160, spp=32, bounces=2, seed=0
+        )
+        tiles.append((name, pictures.tone_map(next(images)[1][0])))
+    return pictures.contact_sheet(tiles, columns=8)
+
+
+def _save(sheet: pictures.Image.Image, path: str) -> None:
+    if Path(path).suffix.lower() != ".png":
+        raise InputError(f"--sheet {path}: the name must end in .png")
+    with atomic_path(path) as temporary:
+        sheet.save(temporary)
+    sys.stdout.write(f"wrote {path}\n")

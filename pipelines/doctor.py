@@ -1,0 +1,98 @@
+"""`sdps doctor`: what this machine has, what was chosen and why, and a remedy for each thing missing."""
+
+import argparse
+import ctypes
+import importlib.metadata
+import os
+import platform
+import shutil
+import sys
+from pathlib import Path
+
+from render import llvm, variant
+from render.errors import InputError
+from render.shapes.primitives import bunny
+
+PACKAGES = ("mitsuba", "drjit", "torch", "numpy", "scipy", "trimesh", "OpenEXR", "scikit-image", "safetensors")
+LOW_DISK_GB = 5.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps doctor`."""
+    parser.add_argument("--fix", action="store_true", help="fetch what is missing: a libLLVM that works, the bunny mesh")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Print the report; exit code 0 when everything needed is there, 1 otherwise."""
+    if args.fix:
+        _fix()
+    lines, problems = examine(Path.cwd())
+    width = max(len(name) for name, _ in lines)
+    sys.stdout.write("".join(f"{name:<{width}}  {text}\n" for name, text in lines))
+    for problem in problems:
+        sys.stdout.write(f"missing: {problem}\n")
+    return 1 if problems else 0
+
+
+def _fix() -> None:
+    """Fetch libLLVM and the bunny mesh where they are missing."""
+    try:
+        variant.choose()
+    except InputError:
+        sys.stdout.write(llvm.fetch() + "\n")
+    bunny()
+
+
+def examine(folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
+    """Return the report's (name, text) lines and the remedies for what is missing."""
+    problems: list[str] = []
+    lines = [("python", f"{platform.python_version()} ({platform.machine()}, {platform.system()})")]
+    for package in PACKAGES:
+        try:
+            lines.append((package, importlib.metadata.version(package)))
+        except importlib.metadata.PackageNotFoundError:
+            lines.append((package, "not installed"))
+            problems.append(f"{package}: pip install -c constraints.txt .")
+    lines += _variant_lines(problems)
+    lines.append(("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())))
+    free = shutil.disk_usage(folder).free / 1e9
+    lines.append(("free disk", f"{free:.1f} GB"))
+    if free < LOW_DISK_GB:
+        problems.append(f"disk: {free:.1f} GB free; the demo preset wants {LOW_DISK_GB:.0f} GB, choose another --out")
+    try:
+        lines.append(("bunny mesh", f"{len(bunny().faces):,} triangles"))
+    except InputError as error:
+        lines.append(("bunny mesh", "not there"))
+        problems.append(f"bunny mesh: {error}")
+    return lines, problems
+
+
+def _variant_lines(problems: list[str]) -> list[tuple[str, str]]:
+    """Describe the Mitsuba variant, libLLVM, GPU and OptiX."""
+    lines = []
+    try:
+        choice = variant.choose()
+        lines.append(("variant", f"{choice.variant}: {choice.reason}"))
+        lines.append(("libLLVM", str(choice.llvm or "not needed")))
+    except InputError as error:
+        lines.append(("variant", "none works"))
+        problems.append(f"Mitsuba variant: {error}")
+    others = ", ".join(f"{version}{' (aborts)' if version < variant.OLDEST else ''}" for version, _ in variant.find_llvm())
+    lines.append(("libLLVM found", others or "none"))
+    if variant.has_cuda_driver():
+        import torch
+
+        name = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "driver present, torch is a CPU build"
+        lines.append(("GPU", name))
+        lines.append(("OptiX", "library found" if _loads("libnvoptix.so.1") else "libnvoptix.so.1 not found"))
+    else:
+        lines.append(("GPU", "none; everything runs on the CPU"))
+    return lines
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,141 @@
+"""Presets: one YAML file that holds the whole line, and the flags every command shares."""
+
+import argparse
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+import yaml
+
+from render import lights as light_sets
+from render.config import build, read_yaml, to_yaml
+from render.errors import InputError, unknown
+from render.files import write_text
+from render.plan import DataConfig
+from sdps.config import LightingTraining, NormalTraining
+
+
+@dataclass(frozen=True, kw_only=True)
+class TestConfig:
+    """The MERL-Test scenes and how they are scored.
+
+    Attributes:
+        shapes: Shape names.
+        materials: Material names, categories, or `all`.
+        lights: A fixed light set or a file of directions.
+        size: Image side in pixels.
+        spp: Camera samples per pixel.
+        bounces: Interreflection bounces.
+        scale: Radius of the object's unit sphere, in half image widths.
+        seed: Root seed of the renderer and of the random intensities.
+        intensity_range: Range the light intensities are drawn from, uniformly.
+        repeats: Draws of random intensities per scene; scores are averaged over them.
+        pictures: Scenes shown in the report, per shape.
+    """
+
+    shapes: tuple[str, ...] = ("sphere", "bunny")
+    materials: tuple[str, ...] = ("all",)
+    lights: str = "merltest"
+    size: int = 128
+    spp: int = 32
+    bounces: int = 2
+    scale: float = 0.95
+    seed: int = 0
+    intensity_range: tuple[float, float] = (0.2, 2.0)
+    repeats: int = 1
+    pictures: int = 5
+
+    def __post_init__(self) -> None:
+        for name in ("spp", "repeats", "pictures"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.size < 16 or self.size % 4:
+            raise InputError(f"size must be a multiple of 4 from 16 up, got {self.size}")
+        if not 0 < self.intensity_range[0] <= self.intensity_range[1]:
+            raise InputError(f"intensity_range must be two rising positive numbers, got {self.intensity_range}")
+        if not self.shapes or not self.materials:
+            raise InputError("shapes and materials must name at least one each")
+        if self.seed < 0 or self.bounces < 0:
+            raise InputError("seed and bounces must not be negative")
+        light_sets.load(self.lights)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """Everything the commands need; saved, resolved, beside whatever they write.
+
+    Attributes:
+        name: Name of the preset.
+        description: One line.
+        data: Training and validation scenes.
+        lighting: Training of LCNet.
+        normals: Training of NENet.
+        test: The MERL-Test scenes.
+    """
+
+    name: str
+    description: str
+    data: DataConfig = field(default_factory=DataConfig)
+    lighting: LightingTraining = field(default_factory=LightingTraining)
+    normals: NormalTraining = field(default_factory=NormalTraining)
+    test: TestConfig = field(default_factory=TestConfig)
+
+
+def names() -> list[str]:
+    """Return the names of the presets that travel with the package."""
+    folder = resources.files("assets") / "presets"
+    return sorted(item.name[:-5] for item in folder.iterdir() if item.name.endswith(".yaml"))
+
+
+def load(name: str, overrides: list[str] | None = None) -> Preset:
+    """Load a preset by name or YAML path and apply `section.field=value` overrides.
+
+    Raises:
+        InputError: unknown preset, key or value, naming it.
+    """
+    if name in names():
+        path = Path(str(resources.files("assets") / "presets" / f"{name}.yaml"))
+    elif Path(name).suffix in (".yaml", ".yml"):
+        path = Path(name)
+    else:
+        raise unknown("preset", name, names(), "or give the path of a .yaml file")
+    values = read_yaml(path)
+    for override in overrides or []:
+        _apply(values, override)
+    return build(Preset, values)
+
+
+def _apply(values: dict, override: str) -> None:
+    """Set one `section.field=value` (the value is YAML) in a nested mapping."""
+    key, equals, text = override.partition("=")
+    if not equals or not key:
+        raise InputError(f"--set {override}: expected section.field=value")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"--set {override}: {text!r} is not a YAML value") from error
+    *sections, last = key.strip().split(".")
+    for section in sections:
+        values = values.setdefault(section, {})
+        if not isinstance(values, dict):
+            raise InputError(f"--set {override}: {section} has no fields")
+    values[last] = value
+
+
+def add_common_arguments(parser: argparse.ArgumentParser, default: str = "small") -> None:
+    """Declare the flags all long commands share."""
+    parser.add_argument("--preset", default=default, help=f"{', '.join(names())}, or a YAML file (default: {default})")
+    parser.add_argument("--out", default=None, help="output folder (default: out/<preset>)")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="SECTION.FIELD=VALUE",
+                        help="override any field of the preset; may be repeated")  # fmt: skip
+
+
+def from_arguments(args: argparse.Namespace) -> tuple[Preset, Path]:
+    """Return the preset the flags describe, and the output folder."""
+    preset = load(args.preset, args.overrides)
+    return preset, Path(args.out or f"out/{preset.name}")
+
+
+def save_resolved(preset: Preset, folder: Path) -> None:
+    """Write the resolved configuration to `folder/config.yaml`."""
+    write_text(folder / "config.yaml", to_yaml(preset))

@@ -1,0 +1,155 @@
+"""The page: one self-contained HTML file with tables, curves and pictures."""
+
+import html
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines import pictures
+from pipelines.presets import Preset
+from render.errors import InputError
+from render.files import read_jsonl, write_text
+from render.manifest import read_manifest
+from render.shards import read_shard
+
+if TYPE_CHECKING:
+    from pipelines.eval_merltest import SceneResult
+
+CURVES = (
+    ("lighting", "LCNet", (("val_direction_mae", "light direction, degrees"), ("loss", "training loss"))),
+    ("normals", "NENet", (("val_normal_mae", "normals, degrees"), ("loss", "training loss"))),
+)
+ERROR_LIMIT = 45.0
+
+
+def write(path: Path, preset: Preset, tables: dict, results: list["SceneResult"], out: Path) -> None:
+    """Write the report of an evaluation to `path`.
+
+    Args:
+        path: The HTML file.
+        preset: What was run.
+        tables: {title: (header, rows)} from `eval_merltest.build_tables`.
+        results: `SceneResult` of every scene.
+        out: The run's folder, whose training logs and data are shown where present.
+    """
+    template = Template((Path(__file__).parent / "report.html").read_text(encoding="utf-8"))
+    from pipelines.eval_merltest import DEFINITION
+
+    page = template.substitute(
+        title=html.escape(f"SDPS-Net, preset {preset.name}"),
+        description=html.escape(preset.description),
+        tables="".join(_table(title, *table) for title, table in tables.items()),
+        definition=html.escape(DEFINITION),
+        scenes="".join(_scene(result) for result in choose(results, preset.test.pictures)),
+        materials=_per_material(results),
+        curves=_curves(out),
+        training=_training_scenes(out / "data"),
+        limit=f"{ERROR_LIMIT:g}",
+    )
+    write_text(path, page)
+
+
+def choose(results: list["SceneResult"], count: int) -> list["SceneResult"]:
+    """Pick scenes of each shape spread from the best to the worst normal error, so the page shows both ends."""
+    chosen = []
+    for shape in dict.fromkeys(result.scene.shape for result in results):
+        ranked = sorted((r for r in results if r.scene.shape == shape), key=_error)
+        places = np.unique(np.linspace(0, len(ranked) - 1, count).round().astype(int))
+        chosen += [ranked[place] for place in places]
+    return chosen
+
+
+def _error(result: "SceneResult") -> float:
+    return result.scores["LCNet + NENet"]["normal_mae"]
+
+
+def _table(title: str, header: list[str], rows: list[list[str]]) -> str:
+    """Render one table; published rows are marked by their class."""
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
+    body = "".join(
+        f'<tr class="{"paper" if row[0].startswith("paper") else "ours"}">'
+        + "".join(f"<td>{html.escape(cell)}</td>" for cell in row)
+        + "</tr>"
+        for row in rows
+    )
+    caption = html.escape(title)
+    return f"<table><caption>{caption}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _scene(result: "SceneResult") -> str:
+    """Render the pictures of one scene: input, truth, estimate, error, least squares' error, lights."""
+    from sdps.metrics import normal_error_map
+
+    shard, mask = result.shard, result.shard.mask
+    brightest = int(np.argmax(result.images.astype(np.float32)[:, mask].mean((1, 2))))
+    exposure = pictures.auto_exposure(result.images[brightest][None], mask)
+    ours = normal_error_map(result.normals["LCNet + NENet"], shard.normals, mask)
+    classical = normal_error_map(result.normals["least squares, true lights"], shard.normals, mask)
+    scores = result.scores["LCNet + NENet"]
+    tiles = [
+        ("input", pictures.tone_map(result.images[brightest], exposure)),
+        ("true normals", pictures.normal_map(shard.normals, mask)),
+        ("estimated normals", pictures.normal_map(result.normals["LCNet + NENet"], mask)),
+        (f"error, {np.nanmean(ours):.1f}°", pictures.error_map(ours, ERROR_LIMIT)),
+        (f"least squares' error, {np.nanmean(classical):.1f}°", pictures.error_map(classical, ERROR_LIMIT)),
+        (f"lights, {scores['direction_mae']:.1f}°", pictures.light_plot(shard.light_directions, result.lights)),
+    ]
+    figures = "".join(
+        f'<figure><img src="{pictures.data_uri(picture)}" alt="{html.escape(text)}">'
+        f"<figcaption>{html.escape(text)}</figcaption></figure>"
+        for text, picture in tiles
+    )
+    name = html.escape(f"{result.scene.shape}, {result.scene.material}")
+    return f'<section class="scene"><h3>{name}</h3><div class="strip">{figures}</div></section>'
+
+
+def _per_material(results: list["SceneResult"]) -> str:
+    """Render one line per scene, worst first."""
+    rows = [
+        [r.scene.shape, r.scene.material]
+        + [f"{r.scores['LCNet + NENet'][key]:.{digits}f}"
+           for key, digits in (("normal_mae", 2), ("direction_mae", 2), ("intensity_error", 3))]
+        + [f"{r.scores['least squares, true lights']['normal_mae']:.2f}"]
+        for r in sorted(results, key=_error, reverse=True)
+    ]  # fmt: skip
+    header = ["shape", "material", "normals", "directions", "intensities", "least squares, true lights"]
+    return _table("Per scene, worst first", header, rows)
+
+
+def _curves(out: Path) -> str:
+    """Plot the training curves found in the run's folders."""
+    figures = []
+    for folder, name, keys in CURVES:
+        path = out / folder / "metrics.jsonl"
+        if not path.is_file():
+            continue
+        rows, minutes = [], 0.0
+        for row in read_jsonl(path):
+            minutes = row.get("seconds", minutes * 60) / 60
+            rows.append((minutes, row))
+        for key, label in keys:
+            points = [(when, row[key]) for when, row in rows if key in row]
+            if points:
+                x, y = np.array(points).T
+                plot = pictures.curve_plot([(name, x, y)], f"{name}: {label}")
+                alt = html.escape(f"{name} {label} over training")
+                figures.append(f'<figure><img src="{pictures.data_uri(plot)}" alt="{alt}"></figure>')
+    return f'<div class="strip">{"".join(figures)}</div>' if figures else "<p>No training logs in this folder.</p>"
+
+
+def _training_scenes(folder: Path, count: int = 12) -> str:
+    """Show some of the training scenes rendered in this run."""
+    try:
+        scenes = read_manifest(folder)
+        chosen = [scenes[i] for i in np.unique(np.linspace(0, len(scenes) - 1, count).round().astype(int))]
+        tiles = [
+            (f"{scene.shape.split(':')[0]}, {scene.material}"[:60],
+             pictures.preview_strip(read_shard(folder / scene.file, scene), lights=3))
+            for scene in chosen
+        ]  # fmt: skip
+    except InputError:
+        return "<p>No training scenes in this folder.</p>"
+    sheet = pictures.contact_sheet(tiles, columns=2)
+    return f'<img class="sheet" src="{pictures.data_uri(sheet)}" alt="training scenes: normals and three of the images">'

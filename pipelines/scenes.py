@@ -1,0 +1,65 @@
+"""Test scenes: every chosen shape with every chosen material under one fixed set of lights."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from render import lights as light_sets
+from render.errors import InputError
+from render.manifest import SceneSpec, View
+from render.materials import library
+from render.plan import material_pool
+from render.seeds import derived_seed
+
+
+def grid(
+    shapes: Sequence[str],
+    materials: Sequence[str],
+    lights: str,
+    *,
+    size: int,
+    spp: int,
+    bounces: int,
+    seed: int,
+    scale: float,
+) -> list[SceneSpec]:
+    """List one scene per shape and material, upright and centred, in an order that lets materials share rays.
+
+    Raises:
+        InputError: an unknown shape, material or light set, or two scenes of one name.
+    """
+    from render.shapes import load as load_shape
+
+    pool = material_pool(tuple(materials))
+    for name in pool:
+        library.load(name)
+    for shape in shapes:
+        load_shape(shape)
+    directions = tuple(tuple(round(float(c), 6) for c in row) for row in light_sets.load(lights))
+    scenes = [
+        SceneSpec(
+            id=f"{slug(shape)}-{slug(material)}",
+            seed=derived_seed(seed, "test", shape),
+            split="test",
+            shape=shape,
+            material=material,
+            view=View(scale=scale),
+            lights=directions,
+            size=size,
+            spp=spp,
+            bounces=bounces,
+        )
+        for shape in shapes
+        for material in pool
+    ]
+    names = [scene.id for scene in scenes]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise InputError(f"two scenes would both be called {twice!r}; rename one of the files")
+    return scenes
+
+
+def slug(name: str) -> str:
+    """Turn a shape or material name, or a path, into part of a file name."""
+    text = Path(name).stem if Path(name).suffix.lower() in (".yaml", ".yml") or "/" in name.split(":")[0] else name
+    return re.sub(r"[^A-Za-z0-9.]+", "-", text).strip("-")

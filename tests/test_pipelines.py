@@ -1,0 +1,227 @@
+"""The command line: presets and their errors, and the whole line once at smoke scale."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import yaml
+
+from pipelines import pictures, presets, scenes
+from pipelines.cli import main
+from pipelines.regenerate import split_list
+from render.errors import InputError
+from render.manifest import read_manifest
+from render.shards import file_hash, read_shard
+
+TINY = ["--size", "32", "--spp", "2", "--bounces", "0"]
+
+
+def fails(capsys: pytest.CaptureFixture, *argv: str) -> str:
+    """Run the command, expect exit code 2 and one line on standard error, and return that line."""
+    assert main(argv) == 2
+    captured = capsys.readouterr()
+    lines = [line for line in captured.err.splitlines() if line and not re.search(r"\d+%\|", line)]
+    assert len(lines) == 1 and lines[0].startswith("sdps: "), captured.err
+    return lines[0]
+
+
+# ---- Presets ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", presets.names())
+def test_every_shipped_preset_is_valid_and_survives_saving(name, tmp_path):
+    preset = presets.load(name)
+    assert preset.name == name
+    presets.save_resolved(preset, tmp_path)
+    assert presets.load(str(tmp_path / "config.yaml")) == preset
+
+
+def test_paper_preset_has_the_published_composition_and_schedule():
+    preset = presets.load("paper")
+    per_shape = preset.data.views * preset.data.materials_per_view
+    counts = {family: count * per_shape for family, count in preset.data.families.items()}
+    assert counts == {"blobby": 25_920, "sculpture": 59_292}
+    assert preset.data.light_count == 64
+    assert (preset.lighting.epochs, preset.lighting.batch_scenes, preset.lighting.images) == (20, 32, 32)
+    assert (preset.normals.epochs, preset.normals.batch_scenes, preset.normals.loss) == (10, 16, "faithful")
+    assert preset.lighting.learning_rate_at(0.26) == pytest.approx(2.5e-4)
+
+
+def test_overrides_reach_any_field_and_convert_types():
+    preset = presets.load("smoke", ["data.size=32", "lighting.learning_rate=1e-3", "test.materials=[chrome]",
+                                    "data.families.blobby=1", "lighting.augmentation.noise=0"])  # fmt: skip
+    assert preset.data.size == 32
+    assert preset.lighting.learning_rate == 1e-3
+    assert preset.test.materials == ("chrome",)
+    assert preset.data.families == {"blobby": 1, "sculpture": 3}
+    assert preset.lighting.augmentation.noise == 0.0
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("data.sise=32", "did you mean 'data.size'"),
+        ("dta.size=32", "did you mean 'data'"),
+        ("data.size", "expected section.field=value"),
+        ("data.size=big", "data.size: expected int"),
+        ("data.size=30", "size must be a multiple of 4"),
+        ("lighting.precision=bf16", "lighting.precision"),
+        ("test.lights=mertest", "did you mean 'merltest'"),
+        ("data.size=[1", "not a YAML value"),
+    ],
+)
+def test_wrong_override_names_the_field(override, message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        presets.load("smoke", [override])
+
+
+def test_preset_errors_from_the_command_line(capsys, tmp_path):
+    assert "did you mean 'demo'" in fails(capsys, "render-data", "--preset", "dmeo", "--out", str(tmp_path / "a"))
+    assert "no such file" in fails(capsys, "train", "--preset", "absent.yaml")
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("name: [unclosed\n")
+    assert "broken.yaml" in fails(capsys, "render-data", "--preset", str(broken))
+    assert not (tmp_path / "a").exists()
+
+
+# ---- Commands --------------------------------------------------------------------------------------
+
+
+def test_unknown_command_and_flag(capsys):
+    assert "did you mean 'train'" in fails(capsys, "trian")
+    assert "--presett" in fails(capsys, "train", "--presett", "demo")
+
+
+def test_help_lists_every_command(capsys):
+    assert main([]) == 0
+    text = capsys.readouterr().out
+    for command in ("doctor", "render-data", "train", "eval-merltest", "regenerate", "materials", "shapes"):
+        assert command in text
+
+
+def test_train_and_evaluate_without_data_or_weights_say_what_to_run(capsys, tmp_path):
+    assert "sdps render-data" in fails(capsys, "train", "--preset", "smoke", "--out", str(tmp_path / "none"))
+    assert "sdps train" in fails(capsys, "eval-merltest", "--preset", "smoke", "--out", str(tmp_path / "none"))
+    assert not (tmp_path / "none" / "merltest").exists()
+
+
+def test_materials_and_shapes_list_what_there_is(capsys):
+    assert main(["materials"]) == 0
+    assert "100 materials" in (listing := capsys.readouterr().out) and "gold-metallic-paint" in listing
+    assert main(["materials", "--category", "phenolic"]) == 0
+    assert capsys.readouterr().out.count("fit error") == 12
+    assert "did you mean 'plastic'" in fails(capsys, "materials", "--category", "plastik")
+    assert main(["shapes"]) == 0
+    assert "sculpture:<seed>" in capsys.readouterr().out
+
+
+def test_doctor_reports_variant_and_cores(capsys):
+    assert main(["doctor"]) in (0, 1)
+    text = capsys.readouterr().out
+    for name in ("mitsuba", "variant", "libLLVM", "cores", "free disk"):
+        assert re.search(rf"^{name}\s+\S", text, re.MULTILINE)
+
+
+def test_list_flags_take_commas_and_repetition():
+    assert split_list(["a,b", "c", " d ,"]) == ["a", "b", "c", "d"]
+    assert scenes.slug("lambertian:0.8/0.3/0.1") == "lambertian-0.8-0.3-0.1"
+    assert scenes.slug("some/folder/my steel.yaml") == "my-steel"
+
+
+def test_regenerate_writes_scenes_and_reuses_them(capsys, tmp_path):
+    own = tmp_path / "grey.yaml"
+    assert main(["materials"]) == 0
+    from render.config import to_plain
+    from render.materials.model import lambertian
+
+    plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in to_plain(lambertian(0.5)).items()}
+    own.write_text(yaml.safe_dump(plain | {"name": "grey"}))
+    lights = tmp_path / "mine.txt"
+    lights.write_text("0 0 1\n0.5 0 1\n0 -0.5 2\n")
+    out = tmp_path / "scenes"
+    argv = ["regenerate", "--shapes", "sphere", "--materials", f"chrome,{own}", "--materials", "lambertian:0.5",
+            "--lights", str(lights), "--out", str(out), *TINY]  # fmt: skip
+    assert main(argv) == 0
+    manifest = read_manifest(out, "test")
+    assert [scene.id for scene in manifest] == ["sphere-chrome", "sphere-grey", "sphere-lambertian-0.5"]
+    shards = [read_shard(out / scene.file, scene) for scene in manifest]
+    np.testing.assert_array_equal(shards[1].images, shards[2].images)  # a YAML of lambertian:0.5 is lambertian:0.5
+    assert (out / "preview.png").stat().st_size > 1000
+    hashes = [file_hash(out / scene.file) for scene in manifest]
+    assert main(argv) == 0
+    assert "0 rendered now" in capsys.readouterr().out
+    assert [file_hash(out / scene.file) for scene in manifest] == hashes
+    assert "holds another plan" in fails(capsys, *argv, "--seed", "1")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--materials", "chrom"], "did you mean 'chrome'"),
+        (["--materials", "lambertian:1.5"], "albedo"),
+        (["--shapes", "spere"], "did you mean 'sphere'"),
+        (["--shapes", "blobby:x"], "seed"),
+        (["--lights", "merl"], "did you mean 'merltest'"),
+        (["--lights", "merltest,diligent"], "one light set"),
+        (["--size", "3"], "--size"),
+        (["--size", "big"], "--size"),
+    ],
+)
+def test_regenerate_errors_leave_nothing_behind(capsys, tmp_path, flags, message):
+    out = tmp_path / "scenes"
+    base = {"--shapes": "sphere", "--materials": "chrome"} | dict(zip(flags[::2], flags[1::2], strict=True))
+    assert message in fails(capsys, "regenerate", "--out", str(out), *(word for pair in base.items() for word in pair))
+    assert not out.exists()
+
+
+def test_regenerate_refuses_bad_files(capsys, tmp_path):
+    empty = tmp_path / "empty.obj"
+    empty.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+    low = tmp_path / "low.txt"
+    low.write_text("0 0 1\n0 1 -0.1\n")
+    out = ["--out", str(tmp_path / "x")]
+    assert "empty.obj" in fails(capsys, "regenerate", "--shapes", str(empty), "--materials", "chrome", *out)
+    line = fails(capsys, "regenerate", "--shapes", "sphere", "--materials", "chrome", "--lights", str(low), *out)
+    assert "light 2 is below the horizon" in line
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    line = fails(capsys, "regenerate", "--shapes", "sphere", "--materials", "chrome", "--out", str(blocked / "x"))
+    assert "cannot be written" in line
+
+
+# ---- The whole line --------------------------------------------------------------------------------
+
+
+def test_the_whole_line_at_smoke_scale(capsys, tmp_path):
+    flags = ["--preset", "smoke", "--out", str(tmp_path), "--set", "lighting.steps=2", "--set", "normals.steps=2"]
+    for command in ("render-data", "train", "eval-merltest"):
+        assert main([command, *flags]) == 0, capsys.readouterr().err
+    text = capsys.readouterr().out
+    assert "Table A, lighting estimation" in text and "constant predictor" in text
+    results = json.loads((tmp_path / "eval" / "results.json").read_text())
+    assert len(results["scenes"]) == 4
+    for scene in results["scenes"]:
+        assert scene["scores"]["constant"]["direction_mae"] == pytest.approx(42.2, abs=2)  # the light set's own mean
+        assert scene["scores"]["least squares, true lights"]["normal_mae"] < 35
+        assert 0 < scene["scores"]["LCNet + NENet"]["normal_mae"] < 90
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png;base64,") >= 4 * 6
+    assert not re.search(r"(src|href)=\"(?!data:)", page)  # self-contained
+    for folder in ("data", "lighting", "normals", "merltest", "eval"):
+        assert presets.load(str(tmp_path / folder / "config.yaml")).name == "smoke"
+    assert (tmp_path / "lighting" / "lcnet.safetensors").exists()
+
+
+# ---- Pictures --------------------------------------------------------------------------------------
+
+
+def test_pictures_of_known_values():
+    normals = np.zeros((2, 2, 3), np.float32)
+    normals[0, 0] = 0, 0, 1
+    mask = np.array([[True, False], [False, False]])
+    picture = pictures.normal_map(normals, mask)
+    assert picture[0, 0].tolist() == [128, 128, 255] and picture[1, 1].tolist() == [255, 255, 255]
+    assert pictures.tone_map(np.array([[[0.0, 1.0, 0.2140]]])).tolist() == [[[0, 255, 127]]]
+    errors = pictures.error_map(np.array([[0.0, np.nan]]))
+    assert errors[0, 0].sum() < 10 and errors[0, 1].tolist() == [255, 255, 255]
