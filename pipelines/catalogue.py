@@ -68,8 +68,8 @@ def _material_sheet(names: list[str]) -> pictures.Image.Image:
     for first in range(0, len(names), 16):
         part = names[first : first + 16]
         packed = PackedMaterials([library.load(name) for name in part])
-        _, images = many_lights.render(built, View(scale=0.95), packed, _LIGHTS, size=96, spp=64, bounces=0, seed=0)
-        tiles += [(name[:20], pictures.tone_map(stack[0], 1.2)) for name, (_, stack) in zip(part, images, strict=True)]
+        _, images = many_lights.render(built, View(scale=0.95), packed, _LIGHTS, size=120, spp=64, bounces=0, seed=0)
+        tiles += [(name[:21], pictures.tone_map(stack[0], 1.2)) for name, (_, stack) in zip(part, images, strict=True)]
     return pictures.contact_sheet(tiles, columns=min(10, len(tiles)))
 
 
@@ -84,7 +84,7 @@ def _shape_sheet() -> pictures.Image.Image:
     for name in _SHAPES:
         view = View(scale=0.98) if name == "bunny" else _TURNED
         _, images = many_lights.render(
-            scene.build(load(name)), view, packed, _LIGHTS, size=160, spp=32, bounces=2, seed=0
+            scene.build(load(name)), view, packed, _LIGHTS, size=160, spp=256, bounces=2, seed=0
         )
         tiles.append((name, pictures.tone_map(next(images)[1][0])))
     return pictures.contact_sheet(tiles, columns=8)

@@ -19,7 +19,9 @@ LOW_DISK_GB = 5.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps doctor`."""
-    parser.add_argument("--fix", action="store_true", help="fetch what is missing: a libLLVM that works, the bunny mesh")
+    parser.add_argument(
+        "--fix", action="store_true", help="fetch what is missing: a libLLVM that works, the bunny mesh"
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -77,7 +79,9 @@ def _variant_lines(problems: list[str]) -> list[tuple[str, str]]:
     except InputError as error:
         lines.append(("variant", "none works"))
         problems.append(f"Mitsuba variant: {error}")
-    others = ", ".join(f"{version}{' (aborts)' if version < variant.OLDEST else ''}" for version, _ in variant.find_llvm())
+    others = ", ".join(
+        f"{version}{' (aborts)' if version < variant.OLDEST else ''}" for version, _ in variant.find_llvm()
+    )
     lines.append(("libLLVM found", others or "none"))
     if variant.has_cuda_driver():
         import torch

@@ -80,7 +80,9 @@ def main(args: argparse.Namespace) -> int:
     ]
     for path in weights:
         if not path.is_file():
-            raise InputError(f"{path}: no such weights; train them with `sdps train --preset {preset.name} --out {out}`")
+            raise InputError(
+                f"{path}: no such weights; train them with `sdps train --preset {preset.name} --out {out}`"
+            )
     estimator = load_pair(*weights, precision="bfloat16")
     wanted = test_scenes(preset.test)
     folder = out / "merltest"
@@ -205,6 +207,7 @@ def results_json(results: list[SceneResult], tables: dict, preset: Preset, weigh
         "config": to_plain(preset.test),
         "tables": {title: {"header": header, "rows": rows} for title, (header, rows) in tables.items()},
         "scenes": [
-            {"id": r.scene.id, "shape": r.scene.shape, "material": r.scene.material, "scores": r.scores} for r in results
+            {"id": r.scene.id, "shape": r.scene.shape, "material": r.scene.material, "scores": r.scores}
+            for r in results
         ],
     }

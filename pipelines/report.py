@@ -152,4 +152,6 @@ def _training_scenes(folder: Path, count: int = 12) -> str:
     except InputError:
         return "<p>No training scenes in this folder.</p>"
     sheet = pictures.contact_sheet(tiles, columns=2)
-    return f'<img class="sheet" src="{pictures.data_uri(sheet)}" alt="training scenes: normals and three of the images">'
+    return (
+        f'<img class="sheet" src="{pictures.data_uri(sheet)}" alt="training scenes: normals and three of the images">'
+    )

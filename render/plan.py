@@ -113,9 +113,7 @@ def material_pool(chosen: tuple[str, ...]) -> list[str]:
     return list(dict.fromkeys(pool))
 
 
-def _plan_view(
-    config: DataConfig, family: str, number: int, view: int, split: str, pool: list[str]
-) -> list[SceneSpec]:
+def _plan_view(config: DataConfig, family: str, number: int, view: int, split: str, pool: list[str]) -> list[SceneSpec]:
     """Draw pose, lights and materials of one view; each from a stream of its own."""
     from render.shapes.registry import FAMILIES
 

@@ -5,9 +5,9 @@ A shard is one multi-part OpenEXR file (ZIP, lossless) per scene. Part `gt` (flo
 (share of a pixel's samples that hit the object); parts `L000`, `L001`, ... (float16) hold the linear
 RGB radiance under one light of irradiance pi, with its direction in the part's header.
 
-OpenEXR's binding silently corrupts non-contiguous arrays and arrays of unusual channel counts, and
-opens truncated files with fewer parts (openexr #1929); hence one checked writer and a reader that
-refuses whatever differs from the manifest.
+OpenEXR's binding silently corrupts non-contiguous arrays (openexr #1929) and arrays of unusual channel
+counts, and opens damaged files with fewer parts; hence one checked writer, a digest of the whole file, and
+a reader that refuses whatever differs from the digest or the manifest.
 """
 
 import hashlib

@@ -5,13 +5,13 @@ from itertools import groupby
 from pathlib import Path
 
 import drjit as dr
-from render.progress import progress_bar
 
 from render import many_lights, variant
 from render.errors import InputError
 from render.manifest import SceneSpec
 from render.materials import library
 from render.materials.bsdf import PackedMaterials
+from render.progress import progress_bar
 from render.scene import build
 from render.shapes import load as load_shape
 from render.shards import Shard, read_shard, to_half, write_shard
@@ -83,9 +83,7 @@ def _ray_key(scene: SceneSpec) -> tuple:
     return scene.shape, scene.view, scene.seed, scene.lights, scene.size, scene.spp, scene.bounces
 
 
-def _render_group(
-    built: "mi.Scene", group: list[SceneSpec], folder: Path, missing: set[str]
-) -> Iterator[SceneSpec]:
+def _render_group(built: "mi.Scene", group: list[SceneSpec], folder: Path, missing: set[str]) -> Iterator[SceneSpec]:
     """Render the missing scenes of one view, always from the whole group's rays, and write their shards."""
     first = group[0]
     packed = PackedMaterials([library.load(scene.material) for scene in group])

@@ -121,12 +121,12 @@ def test_minutes_are_counted_across_resumed_runs(folder: Path, tmp_path: Path) -
     config = replace(QUICK, steps=None, minutes=0.05, schedule="cosine")
     stopped = train(NormalStage(config), folder, tmp_path, loggers=[StopAt(2)])
     finished = train(NormalStage(config), folder, tmp_path)
-    assert 3.0 <= finished.seconds < 6.0
+    assert finished.seconds >= 3.0
     assert finished.seconds > stopped.seconds
     lines = [json.loads(line) for line in (tmp_path / METRICS).read_text().splitlines()]
     rates = [line["learning_rate"] for line in lines if "learning_rate" in line]
     assert rates == sorted(rates, reverse=True)
-    assert rates[-1] < 0.1 * rates[0]
+    assert rates[-1] < 0.5 * rates[0]
 
 
 def test_metrics_name_speed_waiting_and_validation(uninterrupted: tuple) -> None:

@@ -1,7 +1,6 @@
 """The two shapes of the paper's synthetic test: the sphere and the Stanford bunny."""
 
 import hashlib
-import os
 import subprocess
 import sys
 import tempfile
