@@ -19,6 +19,7 @@ from render.config import to_plain
 from render.errors import InputError
 from render.files import write_json
 from render.manifest import View
+from render.progress import progress_bar
 from render.seeds import generator
 
 
@@ -96,7 +97,7 @@ def run(config: BenchConfig) -> dict:
         many_lights.trace(built, view, one, lights, **settings)
         dr.sync_thread()
 
-    with tqdm(total=3 * (config.repeats + 2) + config.path_repeats, unit="run", desc="bench", disable=None) as bar:
+    with progress_bar(total=3 * (config.repeats + 2) + config.path_repeats, unit="run", desc="bench") as bar:
         ways = {"all_lights": all_lights, "rays_alone": rays_alone, "two_materials": lambda: all_lights(two)}
         times = _interleaved(ways, config.repeats, bar)
         compiled = _compiled(all_lights)

@@ -83,7 +83,7 @@ def main(args: argparse.Namespace) -> int:
             raise InputError(
                 f"{path}: no such weights; train them with `sdps train --preset {preset.name} --out {out}`"
             )
-    estimator = load_pair(*weights, precision="bfloat16")
+    estimator = load_pair(*weights, precision=preset.test.precision, read_out=preset.test.read_out)
     wanted = test_scenes(preset.test)
     folder = out / "merltest"
     render_planned(wanted, folder, preset)

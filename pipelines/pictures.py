@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib import colormaps
@@ -10,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from PIL import Image, ImageDraw
 
-from render.shards import Shard
+from render.manifest import SceneSpec
+from render.shards import Shard, read_shard
 
 _PAPER = (255, 255, 255)
 
@@ -62,6 +64,24 @@ def contact_sheet(tiles: Sequence[tuple[str, np.ndarray]], columns: int = 2, pad
         draw.text((x, y), text, fill=(40, 40, 40))
         sheet.paste(Image.fromarray(picture), (x, y + caption))
     return sheet
+
+
+def scene_sheet(scenes: Sequence[SceneSpec], folder: Path, count: int = 24) -> Image.Image:
+    """Show up to `count` rendered scenes, spread evenly over the list: normals and three images each.
+
+    Raises:
+        InputError: a shard is missing or damaged.
+    """
+    places = np.unique(np.linspace(0, len(scenes) - 1, count).round().astype(int))
+    chosen = [scenes[place] for place in places]
+    tiles = [
+        (
+            f"{scene.shape if len(scene.shape) < 20 else scene.shape.split(':')[0]}, {scene.material}"[:60],
+            preview_strip(read_shard(folder / scene.file, scene), lights=3),
+        )
+        for scene in chosen
+    ]
+    return contact_sheet(tiles, columns=3 if len(tiles) > 2 else len(tiles))
 
 
 def light_plot(truth: np.ndarray, estimate: np.ndarray) -> Figure:

@@ -4,6 +4,7 @@ import argparse
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from typing import Literal
 
 import yaml
 
@@ -13,6 +14,7 @@ from render.errors import InputError, unknown
 from render.files import write_text
 from render.plan import DataConfig
 from sdps.config import LightingTraining, NormalTraining
+from sdps.lighting import ReadOut
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +33,8 @@ class TestConfig:
         intensity_range: Range the light intensities are drawn from, uniformly.
         repeats: Draws of random intensities per scene; scores are averaged over them.
         pictures: Scenes shown in the report, per shape.
+        read_out: How LCNet's classes become lights: `centre` (the paper's) or `expectation`.
+        precision: Arithmetic of the networks, `float32` or `bfloat16`.
     """
 
     shapes: tuple[str, ...] = ("sphere", "bunny")
@@ -44,6 +48,8 @@ class TestConfig:
     intensity_range: tuple[float, float] = (0.2, 2.0)
     repeats: int = 1
     pictures: int = 5
+    read_out: ReadOut = "centre"
+    precision: Literal["float32", "bfloat16"] = "bfloat16"
 
     def __post_init__(self) -> None:
         for name in ("spp", "repeats", "pictures"):

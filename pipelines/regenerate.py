@@ -4,11 +4,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from pipelines import pictures, scenes
+from pipelines import scenes
 from pipelines.render_data import render_planned
 from render.errors import InputError
-from render.files import atomic_path
-from render.shards import read_shard
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,11 +35,6 @@ def main(args: argparse.Namespace) -> int:
     )  # fmt: skip
     folder = Path(args.out)
     rendered = render_planned(wanted, folder)
-    shown = wanted[:24]
-    with atomic_path(folder / "preview.png") as temporary:
-        pictures.contact_sheet(
-            [(scene.id, pictures.preview_strip(read_shard(folder / scene.file, scene))) for scene in shown]
-        ).save(temporary)
     sys.stdout.write(
         f"{folder}: {len(wanted)} scenes x {len(wanted[0].lights)} lights; {rendered} rendered now; see preview.png\n"
     )

@@ -4,8 +4,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from pipelines import presets
+from pipelines import pictures, presets
 from render.errors import InputError
+from render.files import atomic_path
 from render.manifest import MANIFEST, SceneSpec, read_manifest, write_manifest
 
 
@@ -23,12 +24,12 @@ def main(args: argparse.Namespace) -> int:
     scenes = plan(preset.data)
     rendered = render_planned(scenes, folder, preset)
     images = len(scenes) * preset.data.light_count
-    sys.stdout.write(f"{folder}: {len(scenes)} scenes, {images:,} images; {rendered} rendered now\n")
+    sys.stdout.write(f"{folder}: {len(scenes)} scenes, {images:,} images; {rendered} rendered now; see preview.png\n")
     return 0
 
 
 def render_planned(scenes: list[SceneSpec], folder: Path, preset: presets.Preset | None = None) -> int:
-    """Write the manifest (or check that the folder's is the same) and render what is missing.
+    """Write the manifest (or check that the folder's is the same), render what is missing, and a contact sheet.
 
     Returns:
         Number of shards rendered now.
@@ -45,4 +46,8 @@ def render_planned(scenes: list[SceneSpec], folder: Path, preset: presets.Preset
         presets.save_resolved(preset, folder)
     from render.worker import render_scenes
 
-    return render_scenes(scenes, folder)
+    rendered = render_scenes(scenes, folder)
+    if rendered:
+        with atomic_path(folder / "preview.png") as temporary:
+            pictures.scene_sheet(scenes, folder).save(temporary)
+    return rendered

@@ -12,7 +12,6 @@ from pipelines.presets import Preset
 from render.errors import InputError
 from render.files import read_jsonl, write_text
 from render.manifest import read_manifest
-from render.shards import read_shard
 
 if TYPE_CHECKING:
     from pipelines.eval_merltest import SceneResult
@@ -139,19 +138,11 @@ def _curves(out: Path) -> str:
     return f'<div class="strip">{"".join(figures)}</div>' if figures else "<p>No training logs in this folder.</p>"
 
 
-def _training_scenes(folder: Path, count: int = 12) -> str:
+def _training_scenes(folder: Path) -> str:
     """Show some of the training scenes rendered in this run."""
     try:
-        scenes = read_manifest(folder)
-        chosen = [scenes[i] for i in np.unique(np.linspace(0, len(scenes) - 1, count).round().astype(int))]
-        tiles = [
-            (f"{scene.shape.split(':')[0]}, {scene.material}"[:60],
-             pictures.preview_strip(read_shard(folder / scene.file, scene), lights=3))
-            for scene in chosen
-        ]  # fmt: skip
+        sheet = pictures.scene_sheet(read_manifest(folder), folder, count=18)
     except InputError:
         return "<p>No training scenes in this folder.</p>"
-    sheet = pictures.contact_sheet(tiles, columns=2)
-    return (
-        f'<img class="sheet" src="{pictures.data_uri(sheet)}" alt="training scenes: normals and three of the images">'
-    )
+    alt = "training scenes: normals and three of the images"
+    return f'<img class="sheet" src="{pictures.data_uri(sheet)}" alt="{alt}">'

@@ -119,7 +119,7 @@ def render(
         for first in range(0, spp, per_pass)
     ]  # fmt: skip
     wanted = range(len(materials)) if only is None else only
-    images = ((index, sum(shade(paths, materials, index) for paths in passes) / spp) for index in wanted)
+    images = ((index, _average(passes, materials, index, spp)) for index in wanted)
     return _ground_truth(passes, size, spp), images
 
 
@@ -138,7 +138,8 @@ def trace(
 ) -> Paths:
     """Follow the camera paths of samples `first` to `first + spp - 1` of `total` per pixel; see `render`."""
     rotation = _opaque(mi.Matrix3f(view.matrix()))
-    directions = _opaque(mi.Vector3f(rotation.T @ mi.Vector3f(np.ascontiguousarray(lights.T, dtype=np.float32))))
+    rows = np.ascontiguousarray(lights.T, dtype=np.float32)  # uploaded one by one for the reason given at `_numpy`
+    directions = _opaque(mi.Vector3f(rotation.T @ mi.Vector3f(*(mi.Float(row) for row in rows))))
     ray, sample = _camera_rays(view, rotation, size, spp, seed, first, total or spp)
     depths: list[Vertices] = []
     pixel_count, throughput = size * size, (mi.Color3f(1),) * len(materials)
@@ -179,6 +180,15 @@ def shade(paths: Paths, materials: PackedMaterials, index: int) -> np.ndarray:
     for vertices in paths.depths:
         _add_depth(image, paths, vertices, vertices.throughput[index], materials, material)
     return np.array(image).reshape(paths.lights, paths.size, paths.size, 3)
+
+
+def _average(passes: list[Paths], materials: PackedMaterials, index: int, spp: int) -> np.ndarray:
+    """Shade every pass and divide by the samples, in place: the stack is the largest array there is."""
+    image = shade(passes[0], materials, index)
+    for paths in passes[1:]:
+        image += shade(paths, materials, index)
+    image /= spp
+    return image
 
 
 def _add_depth(
@@ -313,8 +323,8 @@ def _sums(depths: list[Vertices], view: View, spp: int, pixel_count: int) -> tup
         first, rotation = depths[0], view.matrix()
         pixels, starts = np.array(first.pixels), np.array(first.start)
         hits[pixels] = np.array(first.length)
-        normals[pixels] = np.add.reduceat(np.array(first.normal, dtype=np.float64).T @ rotation.T, starts)
-        z = np.array(first.position, dtype=np.float64).T @ rotation[2] * view.scale
+        normals[pixels] = np.add.reduceat(_numpy(first.normal).T @ rotation.T, starts)
+        z = _numpy(first.position).T @ rotation[2] * view.scale
         depth[pixels] = np.add.reduceat(z, starts)
     return hits, normals, depth
 
@@ -345,6 +355,11 @@ def _take(kind: type, source: Any, index: Any) -> Any:
     """Gather the lanes `index` of an array; one that is uniform (width 1) stays so."""
     source = kind(source)
     return dr.gather(kind, source, index) if dr.width(source) > 1 else source
+
+
+def _numpy(vectors: Any) -> np.ndarray:  # (3, N) float64
+    """Convert by component: Dr.Jit's own conversion has N in its code, and would compile anew for every view."""
+    return np.stack([np.array(component, dtype=np.float64) for component in vectors])
 
 
 def _opaque(value: Any) -> Any:

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import torch
 from torch.utils.data import DataLoader
-from tqdm import tqdm
 
 from render.config import to_plain
 from render.errors import InputError
 from render.manifest import MANIFEST, read_manifest
+from render.progress import progress_bar
 from render.shards import file_hash
 from sdps.checkpoint import TrainedModel, code_version, load_state, save_state, save_weights
 from sdps.dataset import Batch, SampleKey, SampleStream, SceneDataset, collate
@@ -115,7 +115,7 @@ def _run(trainer: "Trainer", loggers: Iterable[Logger], stop: StopRequest) -> fl
     batches = iter(trainer.loader())
     meter = Meter()
     saved = time.perf_counter()
-    bar = tqdm(total=100.0, initial=100.0 * trainer.progress(), desc=trainer.stage.name, disable=None,
+    bar = progress_bar(total=100.0, initial=100.0 * trainer.progress(), desc=trainer.stage.name,
                bar_format="{l_bar}{bar}| {elapsed}<{remaining} {postfix}")  # fmt: skip
     with bar:
         while trainer.progress() < 1.0 and not stop.requested:

@@ -1,0 +1,289 @@
+"""Configuration, seeds, light sets and the plan: strict, reproducible, and stable when something is added."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from render import config, lights, seeds
+from render.errors import InputError, unknown
+from render.manifest import SceneSpec, View, read_manifest, write_manifest
+from render.plan import DataConfig, material_pool, plan
+
+STREAM = 398556000  # frozen: another value would mean that every plan changes
+SMALL = DataConfig(families={"blobby": 4}, views=2, materials_per_view=2, light_count=5, validation=0.25)
+
+
+def by_id(scenes: list[SceneSpec]) -> dict[str, SceneSpec]:
+    return {scene.id: scene for scene in scenes}
+
+
+def test_same_configuration_same_plan():
+    assert plan(SMALL) == plan(SMALL)
+    assert plan(SMALL) != plan(replace(SMALL, seed=1))
+    assert len(by_id(plan(SMALL))) == 4 * 2 * 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"families": {"sculpture": 2, "blobby": 4}}, {"families": {"blobby": 7}}, {"views": 3}, {"validation": 0.0}],
+)
+def test_adding_scenes_leaves_the_others_alone(change):
+    before, after = by_id(plan(SMALL)), by_id(plan(replace(SMALL, **change)))
+    for name, scene in before.items():
+        assert replace(after[name], split="") == replace(scene, split="")
+
+
+def test_another_material_per_view_keeps_the_first_ones():
+    before, after = by_id(plan(SMALL)), by_id(plan(replace(SMALL, materials_per_view=4)))
+    assert all(after[name] == scene for name, scene in before.items())
+
+
+def test_scenes_of_a_view_stand_together_and_share_all_but_the_material():
+    scenes = plan(SMALL)
+    for first, second in zip(scenes[::2], scenes[1::2], strict=True):
+        assert replace(second, id=first.id, material=first.material) == first
+        assert first.material != second.material
+    assert len({scene.seed for scene in scenes}) == 8 and len({scene.lights for scene in scenes}) == 8
+
+
+def test_validation_shapes_are_unseen_in_training():
+    scenes = plan(replace(SMALL, families={"blobby": 10, "sculpture": 3}, validation=0.05))
+    shapes = {split: {scene.shape for scene in scenes if scene.split == split} for split in ("train", "val")}
+    assert not shapes["train"] & shapes["val"]
+    assert sorted(shape.split(":")[0] for shape in shapes["val"]) == ["blobby", "sculpture"]
+    assert {scene.split for scene in plan(replace(SMALL, validation=0))} == {"train"}
+
+
+def test_poses_are_rotations_within_their_ranges():
+    scenes = plan(replace(SMALL, families={"blobby": 20, "sculpture": 20}, materials_per_view=1))
+    for scene in scenes:
+        matrix = scene.view.matrix()
+        assert abs(np.linalg.det(matrix) - 1) < 1e-6
+        low, high = SMALL.upright_scale if scene.shape.startswith("sculpture") else SMALL.scale
+        assert low - 1e-6 <= scene.view.scale <= high + 1e-6
+        if scene.shape.startswith("sculpture"):
+            assert matrix[1, 1] > 0.5  # up stays up
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"views": 0}, "views"),
+        ({"size": 30}, "size must be a multiple of 4"),
+        ({"seed": -1}, "seed"),
+        ({"validation": 0.9}, "validation"),
+        ({"bounces": -1}, "bounces"),
+        ({"lights": "hemispere"}, "did you mean 'hemisphere'"),
+        ({"scale": (1.0, 0.5)}, "scale"),
+        ({"families": {}}, "families"),
+    ],
+)
+def test_configuration_is_checked(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(SMALL, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"families": {"bloby": 1}}, "did you mean 'blobby'"),
+        ({"families": {"sphere": 1}}, "unknown shape family"),
+        ({"families": {"blobby": 0}}, "no scene"),
+        ({"materials": ("crome",)}, "did you mean 'chrome"),
+        ({"materials": ("chrome",)}, "materials_per_view is 2"),
+    ],
+)
+def test_plan_refuses(change, message):
+    with pytest.raises(InputError, match=message):
+        plan(replace(SMALL, **change))
+
+
+def test_material_pool_expands_categories_once():
+    assert len(material_pool(("all",))) == 100
+    pool = material_pool(("fabric", "chrome", "lambertian:0.5", "chrome"))
+    assert pool.count("chrome") == 1 and "lambertian:0.5" in pool and "pink-fabric" in pool
+
+
+def test_manifest_round_trip_and_refusals(tmp_path: Path):
+    scenes = plan(SMALL)
+    write_manifest(tmp_path, scenes)
+    assert read_manifest(tmp_path) == scenes
+    assert {scene.split for scene in read_manifest(tmp_path, "val")} == {"val"}
+    with pytest.raises(InputError, match="no scene of split 'test'"):
+        read_manifest(tmp_path, "test")
+    with pytest.raises(InputError, match="no manifest"):
+        read_manifest(tmp_path / "elsewhere")
+    path = tmp_path / "manifest.jsonl"
+    path.write_text(path.read_text().replace('"spp"', '"sp"', 1))
+    with pytest.raises(InputError, match=r"line 1\.sp'; did you mean"):
+        read_manifest(tmp_path)
+    path.write_text('{"id": \n')
+    with pytest.raises(InputError, match="line 1 is not JSON"):
+        read_manifest(tmp_path)
+
+
+def test_view_refuses_what_is_no_rotation():
+    with pytest.raises(InputError, match=r"view\.rotation"):
+        View(rotation=(2.0, 0, 0, 0, 1, 0, 0, 0, 1))
+    with pytest.raises(InputError, match=r"view\.rotation"):
+        View(rotation=(1.0, 0, 0))
+    with pytest.raises(InputError, match=r"view\.scale"):
+        View(scale=0)
+
+
+# --- lights ---
+
+
+def test_distributions_are_as_their_names_say():
+    def many(name: str) -> np.ndarray:
+        return lights.draw(name, 40_000, seeds.generator(0, name))
+
+    for name in lights.DISTRIBUTIONS:
+        vectors = many(name)
+        np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-9)
+        assert (vectors[:, 2] > 0).all()
+    vectors = many("azimuth-elevation")
+    azimuth = np.degrees(np.arctan2(vectors[:, 0], vectors[:, 2]))
+    elevation = np.degrees(np.arcsin(vectors[:, 1]))
+    for angle in (azimuth, elevation):
+        counts, _ = np.histogram(angle, bins=8, range=(-88, 88))
+        assert np.abs(counts / 5000 - 1).max() < 0.06
+    low = np.cos(np.radians(88))
+    assert abs(many("hemisphere")[:, 2].mean() - (1 + low) / 2) < 0.005
+    disc = many("near-uniform")
+    assert abs((disc[:, :2] ** 2).sum(1).mean() - 0.5) < 0.005 and np.abs(disc[:, :2].mean(0)).max() < 0.01
+    assert many("biased")[:, 1].min() > -0.1 and many("biased")[:, 1].max() > 0.9
+
+
+@pytest.mark.parametrize(("name", "count"), [("merltest", 100), ("diligent", 96)])
+def test_fixed_sets(name, count):
+    vectors = lights.load(name)
+    assert vectors.shape == (count, 3) and (vectors[:, 2] > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-6)
+    assert len(np.unique(vectors.round(6), axis=0)) == count
+    assert name in lights.names()
+
+
+def test_user_sets(tmp_path: Path):
+    text = tmp_path / "mine.txt"
+    text.write_text("0 0 2\n\n1, 0, 1\n")
+    np.testing.assert_allclose(lights.load(str(text)), [[0, 0, 1], [0.5**0.5, 0, 0.5**0.5]])
+    document = tmp_path / "mine.yaml"
+    document.write_text("directions:\n- [0, 3, 4]\n")
+    np.testing.assert_allclose(lights.load(str(document)), [[0, 0.6, 0.8]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 0 1\n1 0 -0.2\n", "light 2 is below the horizon"),
+        ("1 0 0\n", "light 1 is below the horizon"),
+        ("0 0 1\n1 2\n", "light 2: expected three numbers"),
+        ("0 0 nan\n", "light 1: expected three numbers"),
+        ("x y z\n", "light 1: expected three numbers"),
+        ("\n", "expected a list"),
+    ],
+)
+def test_bad_user_sets_name_the_light(tmp_path: Path, text, message):
+    path = tmp_path / "mine.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        lights.load(str(path))
+
+
+def test_unknown_sets_suggest_the_nearest():
+    with pytest.raises(InputError, match="did you mean 'merltest'"):
+        lights.load("merl-test")
+    with pytest.raises(InputError, match="did you mean 'biased'"):
+        lights.draw("biassed", 3, seeds.generator(0))
+
+
+# --- seeds, configuration ---
+
+
+def test_streams_are_independent_and_stable():
+    def first(*key) -> int:
+        return int(seeds.generator(*key).integers(2**62))
+
+    assert first(0, "a") == first(0, "a")
+    keys = [(0,), (1,), (0, "a"), (0, "b"), (0, "a", 1), (0, "a", 2), (0, "a", "1"), (1, "a", 1), (0, 0, "a")]
+    assert len({first(*key) for key in keys}) == len(keys)
+    assert 0 <= seeds.derived_seed(0, "blobby", 3) < 2**31
+    assert seeds.derived_seed(0, "blobby", 3) == STREAM
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inner:
+    rate: float = 0.1
+    kind: Literal["adam", "sgd"] = "adam"
+
+    def __post_init__(self) -> None:
+        if self.rate <= 0:
+            raise ValueError("rate must be positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outer:
+    name: str
+    inner: Inner = Inner()
+    steps: int | None = None
+    sizes: tuple[int, ...] = ()
+    pair: tuple[float, float] = (0.0, 1.0)
+    counts: dict[str, int] | None = None
+    flag: bool = False
+
+
+def test_build_converts_what_yaml_gives():
+    built = config.build(
+        Outer,
+        {"name": 7, "inner": {"rate": "1e-3", "kind": "sgd"}, "steps": "1e3", "sizes": [1, 2], "pair": [0, 2],
+         "counts": {"a": 1}, "flag": True},
+    )  # fmt: skip
+    assert built == Outer(
+        name="7", inner=Inner(rate=0.001, kind="sgd"), steps=1000, sizes=(1, 2), pair=(0.0, 2.0), counts={"a": 1},
+        flag=True,
+    )  # fmt: skip
+    assert config.build(Outer, config.to_plain(built)) == built
+    assert config.build(Outer, {"name": "x", "steps": None}).steps is None
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"name": "x", "inner": {"rat": 1}}, "unknown key 'inner.rat'; did you mean 'inner.rate'"),
+        ({"inner": {}}, "missing key 'name'"),
+        ({"name": "x", "inner": {"rate": "fast"}}, "inner.rate: expected float, got 'fast'"),
+        ({"name": "x", "inner": {"rate": -1}}, "inner.rate must be positive"),
+        ({"name": "x", "inner": {"kind": "adm"}}, "did you mean 'adam'"),
+        ({"name": "x", "inner": 3}, "inner: expected a section"),
+        ({"name": "x", "steps": 1.5}, "steps: expected int"),
+        ({"name": "x", "steps": True}, "steps: expected int"),
+        ({"name": "x", "pair": [1]}, "pair: expected 2 values"),
+        ({"name": "x", "sizes": ["a"]}, "sizes: expected int"),
+        ({"name": "x", "counts": [1]}, "counts: expected a mapping"),
+        ({"name": "x", "flag": "yes"}, "flag: expected bool"),
+    ],
+)
+def test_build_refuses_and_names_the_field(values, message):
+    with pytest.raises(InputError) as caught:
+        config.build(Outer, values)
+    assert message in str(caught.value)
+
+
+def test_read_yaml_names_file_and_line(tmp_path: Path):
+    path = tmp_path / "a.yaml"
+    with pytest.raises(InputError, match=r"a\.yaml: no such file"):
+        config.read_yaml(path)
+    path.write_text("a: 1\nb: [1\n")
+    with pytest.raises(InputError, match=r"a\.yaml: line 3 is not valid YAML"):
+        config.read_yaml(path)
+    path.write_text("- 1\n")
+    with pytest.raises(InputError, match="expected a mapping"):
+        config.read_yaml(path)
+
+
+def test_unknown_lists_a_few_names_when_none_is_near():
+    assert "known: a, b" in str(unknown("thing", "zzz", ["a", "b"]))

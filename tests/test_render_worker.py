@@ -1,0 +1,116 @@
+"""Rendering a plan: resumable to the byte, never twice, and never half a shard."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from render import worker
+from render.errors import InputError
+from render.manifest import SceneSpec, View
+from render.plan import DataConfig, plan
+from render.shards import file_hash, read_shard
+
+CONFIG = DataConfig(
+    families={"blobby": 2}, views=2, materials_per_view=3, materials=("fabric", "chrome"), light_count=6, size=24, spp=4
+)
+
+
+class Stopped(Exception):
+    pass
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[SceneSpec]:
+    return plan(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def whole(scenes, tmp_path_factory) -> dict[str, str]:
+    """Render the plan without a break; return the hash of every shard."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert worker.render_scenes(scenes, folder) == len(scenes)
+    return hashes(folder)
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    return {path.name: file_hash(path) for path in sorted((folder / "shards").iterdir())}
+
+
+def stop_after(count: int):
+    """Return a callback that interrupts the run after `count` shards."""
+    written = []
+
+    def on_shard(scene: SceneSpec) -> None:
+        written.append(scene.id)
+        if len(written) == count:
+            raise Stopped
+
+    return on_shard
+
+
+@pytest.mark.parametrize("count", [1, 3, 5, 11])
+def test_interrupted_and_resumed_equals_uninterrupted(scenes, whole, tmp_path, count):
+    """Views have three materials, so 1, 5 and 11 stop in the middle of a group that shares rays."""
+    with pytest.raises(Stopped):
+        worker.render_scenes(scenes, tmp_path, on_shard=stop_after(count))
+    first = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "shards").iterdir()}
+    assert len(first) == count
+    assert worker.render_scenes(scenes, tmp_path) == len(scenes) - count
+    assert hashes(tmp_path) == whole
+    assert all((tmp_path / "shards" / name).stat().st_mtime_ns == time for name, time in first.items())
+    assert worker.render_scenes(scenes, tmp_path) == 0
+
+
+def test_damaged_and_foreign_shards_are_rendered_again(scenes, whole, tmp_path):
+    worker.render_scenes(scenes[:3], tmp_path)
+    first, second, third = (tmp_path / scene.file for scene in scenes[:3])
+    first.write_bytes(first.read_bytes()[:-500])
+    data = bytearray(second.read_bytes())
+    data[len(data) // 2] ^= 1
+    second.write_bytes(data)
+    third.unlink()
+    assert [worker.is_finished(scene, tmp_path) for scene in scenes[:3]] == [False, False, False]
+    assert worker.render_scenes(scenes[:3], tmp_path) == 3
+    assert hashes(tmp_path) == {name: whole[name] for name in hashes(tmp_path)}
+
+
+def test_shard_holds_what_the_manifest_says(scenes, whole, tmp_path):
+    worker.render_scenes(scenes[:3], tmp_path)
+    shard = read_shard(tmp_path / scenes[1].file, scenes[1])
+    assert shard.images.shape == (6, 24, 24, 3) and shard.mask.any()
+    assert not shard.images[:, shard.coverage == 0].any()
+    expected = {name: getattr(scenes[1], name) for name in ("seed", "shape", "material", "spp", "bounces")}
+    assert expected.items() <= shard.provenance.items() and "mitsuba" in shard.provenance
+    json.dumps(shard.provenance)
+
+
+def test_groups_share_rays_only_within_a_view(scenes):
+    groups = list(worker.view_groups(scenes, 2))
+    assert [len(group) for group in groups] == [2, 1] * 4
+    assert [scene for group in groups for scene in group] == scenes
+    other = replace(scenes[1], spp=8)
+    assert len(list(worker.view_groups([scenes[0], other], 16))) == 2
+
+
+def test_lights_brighten_the_side_they_stand_on(tmp_path):
+    """End to end, from manifest line to shard: the frame survives every step."""
+    lights = ((0.9, 0.0, 0.436), (-0.9, 0.0, 0.436), (0.0, 0.9, 0.436))
+    scene = SceneSpec(
+        id="sphere", seed=0, split="test", shape="sphere", material="lambertian:0.8", view=View(scale=0.9),
+        lights=lights, size=32, spp=16, bounces=1,
+    )  # fmt: skip
+    worker.render_scenes([scene], tmp_path)
+    shard = read_shard(tmp_path / scene.file, scene)
+    expected = 0.8 * np.maximum(np.einsum("hwc,lc->lhw", shard.normals, shard.light_directions), 0)
+    inner = shard.normals[..., 2] > 0.4
+    np.testing.assert_allclose(shard.images[..., 1].astype(np.float32)[:, inner], expected[:, inner], atol=0.02)
+
+
+def test_object_outside_the_frame_is_told(scenes, tmp_path):
+    lost = replace(scenes[0], view=View(scale=0.05, offset=(4.0, 0.0)))
+    with pytest.raises(InputError, match=r"outside the frame; check view\.scale"):
+        worker.render_scenes([lost], tmp_path)
+    assert not (tmp_path / "shards").exists() or not any((tmp_path / "shards").iterdir())
