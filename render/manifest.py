@@ -1,5 +1,7 @@
 """The plan of a data folder: one line per scene, written before the first pixel is rendered."""
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,6 +74,10 @@ class SceneSpec:
     def file(self) -> str:
         """Path of the shard relative to the data folder."""
         return f"shards/{self.id}.exr"
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the whole line, which its shard carries."""
+        return hashlib.sha256(json.dumps(to_plain(self), sort_keys=True).encode()).hexdigest()
 
     def light_directions(self) -> np.ndarray:  # (L, 3) float32
         """Return the light directions as an array."""

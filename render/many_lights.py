@@ -15,7 +15,7 @@ heuristic, Veach 1997, eq. 9.15). The slow counterpart is `render.reference`.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -112,15 +112,26 @@ def render(
         The ground truth, and an iterator over (material number, images) with images (L, size, size, 3) float32,
         linear radiance under irradiance pi. Passes over many samples are averaged.
     """
+    wanted = range(len(materials)) if only is None else only
     per_pass = max(1, SAMPLES_PER_PASS // size**2)
-    passes = [
+    passes = (
         trace(scene, view, materials, lights, size=size, spp=min(per_pass, spp - first), bounces=bounces,
               seed=seed, first=first, total=spp)
         for first in range(0, spp, per_pass)
-    ]  # fmt: skip
-    wanted = range(len(materials)) if only is None else only
-    images = ((index, _average(passes, materials, index, spp)) for index in wanted)
-    return _ground_truth(passes, size, spp), images
+    )  # fmt: skip
+    first_pass = next(passes)
+    if per_pass >= spp:  # shaded one by one as they are asked for, so that a hundred materials need no more memory
+        images = ((index, _averaged(shade(first_pass, materials, index), spp)) for index in wanted)
+        return _ground_truth([first_pass], size, spp), images
+    stacks = {index: shade(first_pass, materials, index) for index in wanted}
+    truths = [_without_paths(first_pass)]
+    del first_pass
+    for paths in passes:
+        truths.append(_without_paths(paths))
+        for index in wanted:
+            stacks[index] += shade(paths, materials, index)
+    images = ((index, _averaged(stacks.pop(index), spp)) for index in wanted)
+    return _ground_truth(truths, size, spp), images
 
 
 def trace(
@@ -182,13 +193,15 @@ def shade(paths: Paths, materials: PackedMaterials, index: int) -> np.ndarray:
     return np.array(image).reshape(paths.lights, paths.size, paths.size, 3)
 
 
-def _average(passes: list[Paths], materials: PackedMaterials, index: int, spp: int) -> np.ndarray:
-    """Shade every pass and divide by the samples, in place: the stack is the largest array there is."""
-    image = shade(passes[0], materials, index)
-    for paths in passes[1:]:
-        image += shade(paths, materials, index)
+def _averaged(image: np.ndarray, spp: int) -> np.ndarray:
+    """Divide by the samples in place: the stack is the largest array there is."""
     image /= spp
     return image
+
+
+def _without_paths(paths: Paths) -> Paths:
+    """Keep only the ground truth of a pass, so that its vertices can be freed."""
+    return replace(paths, depths=())
 
 
 def _add_depth(
@@ -247,9 +260,7 @@ def _camera_rays(
     return mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction)), index
 
 
-def _visibility(
-    scene: "mi.Scene", position: Any, normal: Any, facet: Any, directions: Any, lights: int
-) -> "mi.UInt32":
+def _visibility(scene: "mi.Scene", position: Any, normal: Any, facet: Any, directions: Any, lights: int) -> "mi.UInt32":
     """Cast one shadow ray per vertex and light; return the packed bits (see `Vertices.words`)."""
     count, groups = dr.width(position), -(-lights // _WORD)
     width, total = _opaque(mi.UInt32(count)), _opaque(mi.UInt32(lights))

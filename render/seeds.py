@@ -17,9 +17,10 @@ def generator(root: int, *keys: int | str) -> np.random.Generator:
     Args:
         root: Non-negative root seed.
         keys: What the stream is for, e.g. `("blobby", 17, "lights")`; strings are hashed with SHA-256,
-            so the stream is the same on every machine and in every process.
+            so the stream is the same on every machine and in every process. Their number counts too, since
+            `SeedSequence` takes missing words for zeros.
     """
-    return np.random.default_rng(np.random.SeedSequence([root, *(_word(key) for key in keys)]))
+    return np.random.default_rng(np.random.SeedSequence([root, len(keys), *(_word(key) for key in keys)]))
 
 
 def derived_seed(root: int, *keys: int | str) -> int:

@@ -23,11 +23,10 @@ from render.errors import InputError
 from render.files import atomic_path
 from render.manifest import SceneSpec
 
-SCHEMA = 2
+SCHEMA = 1
 HALF_LIMIT = 65504.0
 _OWN_ATTRIBUTES = ("ps:schema", "ps:scene_id", "ps:light_count", "ps:digest")
 _DIGEST = re.compile(rb"ps:digest\0string\0\x40\0\0\0([0-9a-f]{64})")  # as OpenEXR lays an attribute out
-_SCHEMA_1 = b"ps:schema\0int\0\4\0\0\0\1\0\0\0"  # its digest covers pixels and lights only
 _DTYPES = (np.dtype(np.float16), np.dtype(np.float32), np.dtype(np.uint32))
 
 
@@ -149,14 +148,6 @@ def _digest(data: bytes, match: re.Match) -> str:
     return digest.hexdigest()
 
 
-def _pixel_digest(shard: Shard) -> str:
-    """Return the digest of schema 1."""
-    digest = hashlib.sha256()
-    for array in (shard.images, shard.normals, shard.depth, shard.mask, shard.coverage, shard.light_directions):
-        digest.update(np.ascontiguousarray(array))
-    return digest.hexdigest()
-
-
 def to_half(images: np.ndarray) -> np.ndarray:
     """Round radiance to float16, saturating at the largest half instead of overflowing to infinity."""
     return np.minimum(images, HALF_LIMIT).astype(np.float16)
@@ -174,7 +165,7 @@ def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
     """
     parts = _read_parts(path)
     header = parts[0].header
-    if parts[0].name() != "gt" or header.get("ps:schema") not in (1, SCHEMA):
+    if parts[0].name() != "gt" or header.get("ps:schema") != SCHEMA:
         raise InputError(f"{path}: not a shard of schema {SCHEMA} (first part {parts[0].name()!r}); render it again")
     names = [f"L{index:03d}" for index in range(len(parts) - 1)]
     if [part.name() for part in parts[1:]] != names:
@@ -198,8 +189,6 @@ def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
         raise InputError(f"{path}: incomplete shard ({error}); delete the file and render it again") from error
     if len(shard.images) != header.get("ps:light_count"):
         raise InputError(f"{path}: light parts are missing; delete the file and render it again")
-    if header["ps:schema"] == 1 and _pixel_digest(shard) != header.get("ps:digest"):
-        raise InputError(f"{path}: truncated or altered since it was written; delete the file and render it again")
     if scene is not None:
         _compare(path, shard, scene)
     return shard
@@ -219,7 +208,7 @@ def _read_parts(path: str | Path) -> list:
     match = _DIGEST.search(data)
     if match is None:
         raise InputError(f"{path}: not a shard of schema {SCHEMA}, or truncated; delete the file and render it again")
-    if _digest(data, match) != match.group(1).decode() and _SCHEMA_1 not in data[:4096]:
+    if _digest(data, match) != match.group(1).decode():
         raise InputError(f"{path}: truncated or altered since it was written; delete the file and render it again")
     try:
         return OpenEXR.File(os.fspath(path)).parts
@@ -238,8 +227,10 @@ def _compare(path: str | Path, shard: Shard, scene: SceneSpec) -> None:
         raise InputError(f"{path}: light directions differ from the manifest; render it again")
     if shard.images.shape[1:3] != (scene.size, scene.size):
         raise InputError(f"{path}: images are {shard.images.shape[1:3]}, the manifest says {scene.size}; render again")
-    if int(shard.provenance.get("seed", scene.seed)) != scene.seed:
-        raise InputError(f"{path}: rendered with another seed than the manifest's; render it again")
+    if shard.provenance.get("spec", scene.digest()) != scene.digest():
+        raise InputError(
+            f"{path}: rendered from another manifest line (shape, material, view, seed or samples differ); render again"
+        )
 
 
 def file_hash(path: str | Path) -> str:

@@ -113,6 +113,7 @@ def _render_group(built: "mi.Scene", group: list[SceneSpec], folder: Path, missi
 def _provenance(scene: SceneSpec) -> dict[str, str | int | float]:
     """Describe how the scene was rendered, for the shard's header."""
     return {
+        "spec": scene.digest(),
         "seed": scene.seed,
         "shape": scene.shape,
         "material": scene.material,

@@ -5,7 +5,6 @@ Sidak-corrected as in Mitsuba's own render tests (Subr and Arvo 2007), must not 
 with any one part of the light transport taken away it must.
 """
 
-
 import drjit as dr
 import numpy as np
 import pytest

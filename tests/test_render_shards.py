@@ -44,8 +44,9 @@ def scene(shard) -> SceneSpec:
 
 
 @pytest.fixture
-def path(shard, tmp_path) -> Path:
-    write_shard(tmp_path / "shards" / "a.exr", shard)
+def path(shard, scene, tmp_path) -> Path:
+    sealed = replace(shard, provenance=shard.provenance | {"spec": scene.digest()})
+    write_shard(tmp_path / "shards" / "a.exr", sealed)
     return tmp_path / "shards" / "a.exr"
 
 
@@ -109,7 +110,10 @@ def test_every_altered_byte_is_refused(path, scene):
         ({"lights": ((0.0, 0.0, 1.0),) * COUNT}, "light directions"),
         ({"lights": ((0.0, 0.0, 1.0),) * 2}, "3 lights, the manifest says 2"),
         ({"size": 32}, "the manifest says 32"),
-        ({"seed": 18}, "another seed"),
+        ({"seed": 18}, "another manifest line"),
+        ({"shape": "blobby:2"}, "another manifest line"),
+        ({"view": View(scale=0.5)}, "another manifest line"),
+        ({"spp": 5}, "another manifest line"),
     ],
 )
 def test_another_manifest_line_is_refused(path, scene, change, message):
