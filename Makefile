@@ -44,14 +44,16 @@ render-data train eval-merltest: $(ASSETS_READY)
 
 regenerate: OUT = out/regenerated
 regenerate: $(ASSETS_READY)
-	$(SDPS) regenerate --shapes '$(SHAPES)' --materials '$(MATERIALS)' --lights '$(LIGHTS)' --out $(OUT)
+	$(SDPS) regenerate --preset $(PRESET) --shapes '$(SHAPES)' --materials '$(MATERIALS)' --lights '$(LIGHTS)' \
+		--out $(OUT) $(SETTINGS)
 
 demo: PRESET = demo
 demo: $(ASSETS_READY)
 	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
 	$(SDPS) train --preset $(PRESET) --out $(OUT) $(SETTINGS)
 	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
-	$(SDPS) regenerate --shapes bunny --materials '$(MATERIALS)' --lights '$(LIGHTS)' --out $(OUT)/regenerated
+	$(SDPS) regenerate --preset $(PRESET) --shapes bunny --materials '$(MATERIALS)' --lights '$(LIGHTS)' \
+		--out $(OUT)/regenerated $(SETTINGS)
 	@echo "open $(OUT)/report.html"
 
 test: $(ASSETS_READY)
@@ -66,7 +68,7 @@ lint: $(READY)
 
 bench: OUT = out/bench
 bench: $(ASSETS_READY)
-	$(SDPS) bench --out $(OUT)
+	$(SDPS) bench --out $(OUT)/bench.json
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

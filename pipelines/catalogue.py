@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines import pictures
-from render.errors import InputError
+from render.errors import unknown
 from render.files import atomic_path
 from render.manifest import View
 from render.materials import library
@@ -20,28 +20,26 @@ _TURNED = View(rotation=(0.9063, 0.0, 0.4226, 0.0746, 0.9843, -0.1600, -0.4160, 
 def add_material_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps materials`."""
     parser.add_argument("--category", default=None, help="only this category")
-    parser.add_argument("--sheet", default=None, metavar="FILE.png", help="also render a contact sheet of spheres")
+    parser.add_argument("--out", default=None, help="also render a contact sheet of spheres, <out>/materials.png")
 
 
 def add_shape_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps shapes`."""
-    parser.add_argument("--sheet", default=None, metavar="FILE.png", help="also render a contact sheet")
+    parser.add_argument("--out", default=None, help="also render a contact sheet, <out>/shapes.png")
 
 
 def materials_main(args: argparse.Namespace) -> int:
     """List the materials with category and fit error."""
     categories = library.categories()
     if args.category is not None and args.category not in categories:
-        from render.errors import unknown
-
         raise unknown("category", args.category, categories)
     chosen = [name for name in library.names() if args.category is None or name in categories[args.category]]
     for name in chosen:
         material = library.load(name)
         sys.stdout.write(f"{name:<28} {material.category:<16} fit error {100 * material.fit_error:5.1f} %\n")
     sys.stdout.write(f"{len(chosen)} materials; also lambertian:<albedo>, lambertian:<r>/<g>/<b>, and YAML files\n")
-    if args.sheet:
-        _save(_material_sheet(chosen), args.sheet)
+    if args.out:
+        _save(_material_sheet(chosen), Path(args.out) / "materials.png")
     return 0
 
 
@@ -52,8 +50,8 @@ def shapes_main(args: argparse.Namespace) -> int:
     for name, about in families().items():
         sys.stdout.write(f"{name:<18} {about}\n")
     sys.stdout.write(f"{'<file>':<18} any mesh trimesh reads: .obj .ply .stl .glb .off ...\n")
-    if args.sheet:
-        _save(_shape_sheet(), args.sheet)
+    if args.out:
+        _save(_shape_sheet(), Path(args.out) / "shapes.png")
     return 0
 
 
@@ -90,9 +88,7 @@ def _shape_sheet() -> pictures.Image.Image:
     return pictures.contact_sheet(tiles, columns=8)
 
 
-def _save(sheet: pictures.Image.Image, path: str) -> None:
-    if Path(path).suffix.lower() != ".png":
-        raise InputError(f"--sheet {path}: the name must end in .png")
+def _save(sheet: pictures.Image.Image, path: Path) -> None:
     with atomic_path(path) as temporary:
         sheet.save(temporary)
     sys.stdout.write(f"wrote {path}\n")

@@ -84,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
                 f"{path}: no such weights; train them with `sdps train --preset {preset.name} --out {out}`"
             )
     estimator = load_pair(*weights, precision=preset.test.precision, read_out=preset.test.read_out)
-    wanted = test_scenes(preset.test)
+    wanted = scenes.test_scenes(preset.test)
     folder = out / "merltest"
     render_planned(wanted, folder, preset)
     results = list(evaluate(wanted, folder, preset.test, estimator))
@@ -95,14 +95,6 @@ def main(args: argparse.Namespace) -> int:
     sys.stdout.write("\n".join(render_text(title, *table) for title, table in tables.items()))
     sys.stdout.write(f"\n{DEFINITION}\n{out / 'report.html'}\n")
     return 0
-
-
-def test_scenes(config: TestConfig) -> list[SceneSpec]:
-    """List the scenes of a test configuration."""
-    return scenes.grid(
-        config.shapes, config.materials, config.lights, size=config.size, spp=config.spp, bounces=config.bounces,
-        seed=config.seed, scale=config.scale,
-    )  # fmt: skip
 
 
 def evaluate(

@@ -2,39 +2,37 @@
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
-from pipelines import scenes
+from pipelines import presets, scenes
 from pipelines.render_data import render_planned
 from render.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of `sdps regenerate`."""
-    parser.add_argument("--shapes", action="append", help="sphere, bunny, blobby:7, a mesh file ... (default: both)")
-    parser.add_argument("--materials", action="append", help="names, categories, `all`, lambertian:0.5, YAML files")
-    parser.add_argument("--lights", action="append", help="merltest, diligent, or a file of directions")
-    parser.add_argument("--out", default="out/regenerated", help="output folder (default: out/regenerated)")
-    parser.add_argument("--size", type=int, default=128, help="image side in pixels (default: 128)")
-    parser.add_argument("--spp", type=int, default=64, help="samples per pixel (default: 64)")
-    parser.add_argument("--bounces", type=int, default=2, help="interreflection bounces (default: 2)")
-    parser.add_argument("--scale", type=float, default=0.95, help="radius in half image widths (default: 0.95)")
-    parser.add_argument("--seed", type=int, default=0, help="sampler seed (default: 0)")
+    """Declare the flags of `sdps regenerate`; what they leave open comes from the preset's `test` section."""
+    parser.add_argument("--shapes", action="append", help="sphere, bunny, blobby:7, a mesh file, ...; commas or repeat")
+    parser.add_argument("--materials", action="append", help="names, categories, all, lambertian:0.5, YAML files")
+    parser.add_argument("--lights", action="append", help="merltest, diligent, biased:64, or a file of directions")
+    presets.add_common_arguments(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     """Render the scenes and a contact sheet of them."""
-    if args.size < 16 or args.spp < 1 or not 0 <= args.bounces <= 16 or args.seed < 0:
-        raise InputError("--size must be at least 16, --spp at least 1, --bounces in 0..16, --seed not negative")
-    lights = split_list(args.lights) or ["merltest"]
+    preset, _ = presets.from_arguments(args)
+    lights = split_list(args.lights) or [preset.test.lights]
     if len(lights) != 1:
         raise InputError(f"--lights: name one light set per run, got {', '.join(lights)}")
-    wanted = scenes.grid(
-        split_list(args.shapes) or ["sphere", "bunny"], split_list(args.materials) or ["all"], lights[0],
-        size=args.size, spp=args.spp, bounces=args.bounces, seed=args.seed, scale=args.scale,
-    )  # fmt: skip
-    folder = Path(args.out)
-    rendered = render_planned(wanted, folder)
+    test = replace(
+        preset.test,
+        shapes=tuple(split_list(args.shapes)) or preset.test.shapes,
+        materials=tuple(split_list(args.materials)) or preset.test.materials,
+        lights=lights[0],
+    )
+    wanted = scenes.test_scenes(test)
+    folder = Path(args.out or "out/regenerated")
+    rendered = render_planned(wanted, folder, replace(preset, test=test))
     sys.stdout.write(
         f"{folder}: {len(wanted)} scenes x {len(wanted[0].lights)} lights; {rendered} rendered now; see preview.png\n"
     )

@@ -1,55 +1,44 @@
 """Test scenes: every chosen shape with every chosen material under one fixed set of lights."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
+from pipelines.presets import TestConfig
 from render import lights as light_sets
 from render.errors import InputError
 from render.manifest import SceneSpec, View
 from render.materials import library
 from render.plan import material_pool
 from render.seeds import derived_seed
+from render.shapes import load as load_shape
 
 
-def grid(
-    shapes: Sequence[str],
-    materials: Sequence[str],
-    lights: str,
-    *,
-    size: int,
-    spp: int,
-    bounces: int,
-    seed: int,
-    scale: float,
-) -> list[SceneSpec]:
+def test_scenes(config: TestConfig) -> list[SceneSpec]:
     """List one scene per shape and material, upright and centred, in an order that lets materials share rays.
 
     Raises:
         InputError: an unknown shape, material or light set, or two scenes of one name.
     """
-    from render.shapes import load as load_shape
-
-    pool = material_pool(tuple(materials))
+    pool = material_pool(config.materials)
     for name in pool:
         library.load(name)
-    for shape in shapes:
+    for shape in config.shapes:
         load_shape(shape)
-    directions = tuple(tuple(round(float(c), 6) for c in row) for row in light_sets.load(lights))
+    directions = tuple(tuple(round(float(c), 6) for c in row) for row in light_sets.load(config.lights))
     scenes = [
         SceneSpec(
             id=f"{slug(shape)}-{slug(material)}",
-            seed=derived_seed(seed, "test", shape),
+            seed=derived_seed(config.seed, "test", shape),
             split="test",
             shape=shape,
             material=material,
-            view=View(scale=scale),
+            view=View(scale=config.scale),
             lights=directions,
-            size=size,
-            spp=spp,
-            bounces=bounces,
+            size=config.size,
+            spp=config.spp,
+            bounces=config.bounces,
         )
-        for shape in shapes
+        for shape in config.shapes
         for material in pool
     ]
     names = [scene.id for scene in scenes]

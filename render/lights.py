@@ -12,6 +12,7 @@ import numpy as np
 from render.config import read_yaml
 from render.errors import InputError, unknown
 from render.files import read_text
+from render.seeds import generator
 
 MAX_ANGLE = 88.0  # degrees; beyond it the image is black but for rim pixels
 BIASED_MIN_Y = -0.1
@@ -82,19 +83,25 @@ def draw(name: str, count: int, rng: np.random.Generator) -> np.ndarray:  # (cou
 
 
 def load(name: str) -> np.ndarray:  # (L, 3)
-    """Read a fixed set by name (`merltest`, `diligent`), or a user's list of directions.
+    """Read a fixed set by name (`merltest`), draw one (`biased:64`), or read a user's list of directions.
 
-    A user's list is a YAML file with `directions`, or a text file with three numbers a line; vectors
-    are brought to unit length.
+    A drawn set is the same every time, for its name and count. A user's list is a YAML file with `directions`, or a
+    text file with three numbers a line; vectors are brought to unit length.
 
     Raises:
         InputError: unknown name, malformed file, no light, or a light below the horizon (named by its line).
     """
     if name in names():
         return _check(read_yaml(str(resources.files("assets") / "lights" / f"{name}.yaml")).get("directions"), name)
+    distribution, colon, count = name.partition(":")
+    if colon and distribution in DISTRIBUTIONS:
+        if not (count.isascii() and count.isdecimal() and int(count) > 0):
+            raise InputError(f"light set {name!r}: expected a number of lights after the colon, as in 'biased:64'")
+        return draw(distribution, int(count), generator(0, "light set", distribution, int(count)))
     path = Path(name)
     if not path.suffix and not path.exists():
-        raise unknown("light set", name, names(), "or give a file of directions")
+        known = [*names(), *(f"{name}:64" for name in DISTRIBUTIONS)]
+        raise unknown("light set", name, known, "or give a file of directions")
     if path.suffix in (".yaml", ".yml"):
         return _check(read_yaml(path).get("directions"), name)
     rows = [line.replace(",", " ").split() for line in read_text(path).splitlines() if line.strip()]

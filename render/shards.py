@@ -27,6 +27,7 @@ SCHEMA = 1
 HALF_LIMIT = 65504.0
 _OWN_ATTRIBUTES = ("ps:schema", "ps:scene_id", "ps:light_count", "ps:digest")
 _DIGEST = re.compile(rb"ps:digest\0string\0\x40\0\0\0([0-9a-f]{64})")  # as OpenEXR lays an attribute out
+_SPEC = re.compile(rb"ps:spec\0string\0\x40\0\0\0([0-9a-f]{64})")
 _DTYPES = (np.dtype(np.float16), np.dtype(np.float32), np.dtype(np.uint32))
 
 
@@ -194,10 +195,20 @@ def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
     return shard
 
 
-def _read_parts(path: str | Path) -> list:
-    """Check the digest, then open the EXR file and return its parts.
+def is_whole(path: str | Path, scene: SceneSpec) -> bool:
+    """Tell, without decoding a pixel, whether the shard is there, unaltered, and of this manifest line."""
+    try:
+        data = _read_sealed(path)
+    except InputError:
+        return False
+    spec = _SPEC.search(data)
+    return spec is not None and spec.group(1).decode() == scene.digest()
 
-    In this order because OpenEXR skips over what is damaged, telling so only on stderr.
+
+def _read_sealed(path: str | Path) -> bytes:
+    """Read the file and check its digest.
+
+    This comes before OpenEXR opens a file, because OpenEXR skips over what is damaged, telling so only on stderr.
     """
     try:
         data = Path(path).read_bytes()
@@ -210,6 +221,12 @@ def _read_parts(path: str | Path) -> list:
         raise InputError(f"{path}: not a shard of schema {SCHEMA}, or truncated; delete the file and render it again")
     if _digest(data, match) != match.group(1).decode():
         raise InputError(f"{path}: truncated or altered since it was written; delete the file and render it again")
+    return data
+
+
+def _read_parts(path: str | Path) -> list:
+    """Return the parts of a file whose digest is right."""
+    _read_sealed(path)
     try:
         return OpenEXR.File(os.fspath(path)).parts
     except (RuntimeError, ValueError, OSError) as error:

@@ -14,7 +14,7 @@ from render.materials.bsdf import PackedMaterials
 from render.progress import progress_bar
 from render.scene import build
 from render.shapes import load as load_shape
-from render.shards import Shard, read_shard, to_half, write_shard
+from render.shards import Shard, is_whole, to_half, write_shard
 
 mi = variant.load()
 
@@ -42,7 +42,7 @@ def render_scenes(
         InputError: an unusable shape or material, or a full disk. Finished shards stay.
     """
     folder = Path(folder)
-    missing = {scene.id for scene in scenes if not is_finished(scene, folder)}
+    missing = {scene.id for scene in scenes if not is_whole(folder / scene.file, scene)}
     with progress_bar(total=len(scenes), initial=len(scenes) - len(missing), unit="scene", desc="render") as bar:
         # Consecutive views of one shape share its mesh and acceleration structure.
         for shape, run in groupby(view_groups(scenes, group_size), key=lambda group: group[0].shape):
@@ -57,18 +57,6 @@ def render_scenes(
                         on_shard(scene)
             dr.flush_malloc_cache()
     return len(missing)
-
-
-def is_finished(scene: SceneSpec, folder: str | Path) -> bool:
-    """Tell whether the scene's shard is there and whole; a damaged or foreign one counts as missing."""
-    path = Path(folder) / scene.file
-    if not path.exists():
-        return False
-    try:
-        read_shard(path, scene)
-    except InputError:
-        return False
-    return True
 
 
 def view_groups(scenes: Sequence[SceneSpec], group_size: int) -> Iterator[list[SceneSpec]]:

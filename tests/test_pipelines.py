@@ -14,7 +14,7 @@ from render.errors import InputError
 from render.manifest import read_manifest
 from render.shards import file_hash, read_shard
 
-TINY = ["--size", "32", "--spp", "2", "--bounces", "0"]
+TINY = [word for item in ("size=32", "spp=2", "bounces=0") for word in ("--set", f"test.{item}")]
 
 
 def fails(capsys: pytest.CaptureFixture, *argv: str) -> str:
@@ -152,7 +152,7 @@ def test_regenerate_writes_scenes_and_reuses_them(capsys, tmp_path):
     assert main(argv) == 0
     assert "0 rendered now" in capsys.readouterr().out
     assert [file_hash(out / scene.file) for scene in manifest] == hashes
-    assert "holds another plan" in fails(capsys, *argv, "--seed", "1")
+    assert "holds another plan" in fails(capsys, *argv, "--set", "test.seed=1")
 
 
 @pytest.mark.parametrize(
@@ -164,8 +164,9 @@ def test_regenerate_writes_scenes_and_reuses_them(capsys, tmp_path):
         (["--shapes", "blobby:x"], "seed"),
         (["--lights", "merl"], "did you mean 'merltest'"),
         (["--lights", "merltest,diligent"], "one light set"),
-        (["--size", "3"], "--size"),
-        (["--size", "big"], "--size"),
+        (["--lights", "biased:many"], "number of lights"),
+        (["--set", "test.size=30"], "size must be a multiple of 4"),
+        (["--set", "test.sise=32"], "did you mean 'test.size'"),
     ],
 )
 def test_regenerate_errors_leave_nothing_behind(capsys, tmp_path, flags, message):

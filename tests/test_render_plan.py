@@ -199,6 +199,16 @@ def test_unknown_sets_suggest_the_nearest():
         lights.load("merl-test")
     with pytest.raises(InputError, match="did you mean 'biased'"):
         lights.draw("biassed", 3, seeds.generator(0))
+    with pytest.raises(InputError, match="did you mean 'biased:64'"):
+        lights.load("biassed")
+
+
+def test_drawn_sets_are_fixed_by_name_and_count():
+    drawn = lights.load("biased:40")
+    assert drawn.shape == (40, 3) and drawn[:, 1].min() > lights.BIASED_MIN_Y
+    np.testing.assert_array_equal(drawn, lights.load("biased:40"))
+    with pytest.raises(InputError, match="number of lights"):
+        lights.load("biased:none")
 
 
 # --- seeds, configuration ---

@@ -11,7 +11,7 @@ from render import worker
 from render.errors import InputError
 from render.manifest import SceneSpec, View
 from render.plan import DataConfig, plan
-from render.shards import file_hash, read_shard
+from render.shards import file_hash, is_whole, read_shard
 
 CONFIG = DataConfig(
     families={"blobby": 2}, views=2, materials_per_view=3, materials=("fabric", "chrome"), light_count=6, size=24, spp=4
@@ -72,7 +72,7 @@ def test_damaged_and_foreign_shards_are_rendered_again(scenes, whole, tmp_path):
     data[len(data) // 2] ^= 1
     second.write_bytes(data)
     third.unlink()
-    assert [worker.is_finished(scene, tmp_path) for scene in scenes[:3]] == [False, False, False]
+    assert [is_whole(tmp_path / scene.file, scene) for scene in scenes[:3]] == [False, False, False]
     assert worker.render_scenes(scenes[:3], tmp_path) == 3
     assert hashes(tmp_path) == {name: whole[name] for name in hashes(tmp_path)}
 
