@@ -41,7 +41,7 @@ class BenchConfig:
         seed: Seed of lights and sampler.
     """
 
-    shape: str = "blobby:3"
+    shape: str = "blobby:9"
     scale: float = 0.8
     material: str = "blue-acrylic"
     second: str = "gold-metallic-paint"

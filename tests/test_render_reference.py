@@ -5,6 +5,8 @@ Sidak-corrected as in Mitsuba's own render tests (Subr and Arvo 2007), must not 
 with any one part of the light transport taken away it must.
 """
 
+import logging
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -15,6 +17,8 @@ from render import many_lights, reference, scene, shapes
 from render.manifest import View
 from render.materials import library
 from render.materials.bsdf import PackedMaterials
+
+_log = logging.getLogger(__name__)
 
 SIGNIFICANCE = 0.01
 REPEATS = 24
@@ -83,7 +87,9 @@ def p_value(first: np.ndarray, second: np.ndarray) -> float:
     seen = (first.var(0) + second.var(0)) > 1e-14
     np.testing.assert_allclose(first.mean(0)[~seen], second.mean(0)[~seen], atol=1e-5)
     p = stats.ttest_ind(first[:, seen], second[:, seen], equal_var=False).pvalue
-    return float(-np.expm1(p.size * np.log1p(-min(p.min(), 1 - 1e-12))))
+    worst = float(-np.expm1(p.size * np.log1p(-min(p.min(), 1 - 1e-12))))
+    _log.info("p = %.2g over %d pixels and lights", worst, p.size)
+    return worst
 
 
 @pytest.mark.parametrize("name", SCENES)
