@@ -8,7 +8,7 @@ from pathlib import Path
 
 from render.errors import InputError
 from render.files import cache_folder
-from render.variant import KNOWN_GOOD, REMEDY, find_llvm
+from render.variant import KNOWN_GOOD, REMEDY, find_llvm, works
 
 PACKAGE = f"libllvm{KNOWN_GOOD}"
 
@@ -37,8 +37,9 @@ def fetch() -> str:
             for package in Path(folder).glob("*.deb"):
                 _run(["dpkg", "-x", str(package), str(target)])
         done = f"unpacked the Debian package {PACKAGE} into the cache folder"
-    if not any(version == KNOWN_GOOD for version, _ in find_llvm()):
-        raise InputError(f"{done}, but no library was found in it; {REMEDY}")
+    found = [path for version, path in find_llvm() if version == KNOWN_GOOD]
+    if not found or not works("llvm_ad_rgb", found[0]):
+        raise InputError(f"{done}, but {'it does not work' if found else 'no library was found in it'}; {REMEDY}")
     return done
 
 

@@ -68,7 +68,7 @@ def find_llvm() -> list[tuple[int, Path]]:
     return sorted(found.values(), key=lambda item: (item[0] != KNOWN_GOOD, -item[0]))
 
 
-def _works(variant: str, llvm: Path | None = None) -> bool:
+def works(variant: str, llvm: Path | None = None) -> bool:
     """Try a variant in a process of its own, since a bad libLLVM or OptiX aborts instead of raising."""
     environment = dict(os.environ)
     if llvm:
@@ -103,7 +103,7 @@ def choose() -> Choice:
     if forced not in (None, "", "cuda_ad_rgb", "llvm_ad_rgb"):
         raise InputError(f"SDPS_VARIANT={forced}: use cuda_ad_rgb or llvm_ad_rgb")
     if forced != "llvm_ad_rgb" and has_cuda_driver():
-        if _works("cuda_ad_rgb"):
+        if works("cuda_ad_rgb"):
             return Choice("cuda_ad_rgb", None, "a GPU is visible and OptiX traced a test ray")
         if forced == "cuda_ad_rgb":
             raise InputError("SDPS_VARIANT=cuda_ad_rgb: OptiX failed a test ray; unset SDPS_VARIANT to use the CPU")
@@ -127,7 +127,7 @@ def _choose_llvm(why: str) -> Choice:
     for version, path in candidates:
         if version == KNOWN_GOOD:
             return Choice("llvm_ad_rgb", path, f"{why}; libLLVM {version} is known to work")
-        if version >= OLDEST and _works("llvm_ad_rgb", path):
+        if version >= OLDEST and works("llvm_ad_rgb", path):
             return Choice("llvm_ad_rgb", path, f"{why}; libLLVM {version} passed a test render")
     seen = ", ".join(str(version) for version, _ in candidates) or "none"
     raise InputError(f"no working libLLVM (found: {seen}; versions before {OLDEST} abort); {REMEDY}")

@@ -1,10 +1,11 @@
 """Which variant and libLLVM are chosen, and what is said when there is none."""
 
+import subprocess
 from pathlib import Path
 
 import pytest
 
-from render import variant
+from render import llvm, variant
 from render.errors import InputError
 
 
@@ -15,7 +16,7 @@ def clean(monkeypatch):
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(variant, "has_cuda_driver", lambda: False)
     monkeypatch.setattr(variant, "find_llvm", lambda: [])
-    monkeypatch.setattr(variant, "_works", lambda *_: True)
+    monkeypatch.setattr(variant, "works", lambda *_: True)
     return monkeypatch
 
 
@@ -47,7 +48,7 @@ def test_this_machine_has_a_usable_variant():
 
 def test_known_good_library_is_taken_untried(clean):
     clean.setattr(variant, "find_llvm", lambda: [(19, Path("/x/libLLVM.so.19.1")), (20, Path("/x/libLLVM.so.20"))])
-    clean.setattr(variant, "_works", lambda *_: pytest.fail("tried"))
+    clean.setattr(variant, "works", lambda *_: pytest.fail("tried"))
     assert choose().llvm == Path("/x/libLLVM.so.19.1")
 
 
@@ -58,7 +59,7 @@ def test_other_versions_are_tried_and_aborting_ones_are_not(clean):
         tried.append(path.name)
         return "17" in path.name
 
-    clean.setattr(variant, "_works", works)
+    clean.setattr(variant, "works", works)
     clean.setattr(variant, "find_llvm", lambda: [(n, Path(f"/x/libLLVM.so.{n}")) for n in (20, 17, 16, 15, 14)])
     assert choose().llvm == Path("/x/libLLVM.so.17")
     assert tried == ["libLLVM.so.20", "libLLVM.so.17"]
@@ -99,7 +100,7 @@ def test_forced_variants(clean):
         choose()
     clean.setattr(variant, "has_cuda_driver", lambda: True)
     assert choose().variant == "cuda_ad_rgb"
-    clean.setattr(variant, "_works", lambda *_: False)
+    clean.setattr(variant, "works", lambda *_: False)
     with pytest.raises(InputError, match="OptiX failed"):
         choose()
     clean.setenv("SDPS_VARIANT", "llvm_ad_rgb")
@@ -109,7 +110,45 @@ def test_forced_variants(clean):
 
 def test_a_gpu_without_optix_falls_back_to_the_cpu(clean):
     clean.setattr(variant, "has_cuda_driver", lambda: True)
-    clean.setattr(variant, "_works", lambda name, *_: name == "llvm_ad_rgb")
+    clean.setattr(variant, "works", lambda name, *_: name == "llvm_ad_rgb")
     clean.setattr(variant, "find_llvm", lambda: [(19, Path("/x/libLLVM.so.19.1"))])
     choice = choose()
     assert choice.variant == "llvm_ad_rgb" and "no GPU with a working OptiX" in choice.reason
+
+
+# --- fetching a libLLVM ---
+
+
+def test_fetch_without_apt_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(llvm.shutil, "which", lambda name: None)
+    with pytest.raises(InputError, match="install libLLVM 19"):
+        llvm.fetch()
+
+
+def test_fetch_reports_the_failing_command_in_one_line(monkeypatch):
+    failed = subprocess.CompletedProcess([], 100, stdout="", stderr="reading lists\nE: no such package\n")
+    monkeypatch.setattr(llvm.shutil, "which", lambda name: "/usr/bin/apt-get")
+    monkeypatch.setattr(llvm.subprocess, "run", lambda *args, **options: failed)
+    with pytest.raises(InputError, match="no such package") as caught:
+        llvm.fetch()
+    assert "\n" not in str(caught.value)
+
+
+def test_fetch_unpacks_into_the_cache_without_root(monkeypatch, tmp_path):
+    def run(command, **options):
+        if command[0] == "apt-get":
+            (Path(options["cwd"]) / "libllvm19.deb").write_text("")
+        else:
+            library = Path(command[-1]) / "usr/lib/x86_64-linux-gnu/libLLVM.so.19.1"
+            library.parent.mkdir(parents=True)
+            library.write_text("")
+        return subprocess.CompletedProcess(command, 0, stdout="", stderr="")
+
+    monkeypatch.setenv("SDPS_CACHE", str(tmp_path))
+    monkeypatch.setattr(llvm.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(llvm.shutil, "which", lambda name: "/usr/bin/apt-get")
+    monkeypatch.setattr(llvm.subprocess, "run", run)
+    tried = []
+    monkeypatch.setattr(llvm, "works", lambda name, path: tried.append(path) or True)
+    assert "unpacked" in llvm.fetch()
+    assert tried == [tmp_path / "llvm/usr/lib/x86_64-linux-gnu/libLLVM.so.19.1"]
