@@ -8,7 +8,7 @@ under the true lights, and a constant predictor, which shows what knowing nothin
 import argparse
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,14 +51,27 @@ DEFINITION = (
 
 @dataclass(frozen=True, eq=False)
 class SceneResult:
-    """Scores and pictures of one scene: `scores[method][metric]`, averaged over the repeats."""
+    """Scores and pictures of one scene, without its images, so that 200 results stay small.
+
+    Attributes:
+        scene: The manifest line.
+        scores: `scores[method][metric]`, averaged over the repeats.
+        mask: (H, W) bool.
+        truth: (H, W, 3) true normals.
+        normals: (H, W, 3) estimated normals per method.
+        true_lights: (L, 3) directions.
+        lights: (L, 3) directions LCNet estimated.
+        picture: (H, W, 3) float32, the brightest input image.
+    """
 
     scene: SceneSpec
-    shard: Shard
     scores: dict[str, dict[str, float]]
-    normals: dict[str, np.ndarray] = field(default_factory=dict)
-    lights: np.ndarray | None = None
-    images: np.ndarray | None = None
+    mask: np.ndarray
+    truth: np.ndarray
+    normals: dict[str, np.ndarray]
+    true_lights: np.ndarray
+    lights: np.ndarray
+    picture: np.ndarray
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -109,7 +122,7 @@ def evaluate(
             method: {metric: float(np.mean([run.scores[method][metric] for run in runs])) for metric in values}
             for method, values in first.scores.items()
         }
-        yield SceneResult(scene, shard, averaged, first.normals, first.lights, first.images)
+        yield replace(first, scores=averaged)
 
 
 def _evaluate_once(
@@ -136,7 +149,16 @@ def _evaluate_once(
         truth = {"light_directions": lights, "intensities": gains} if blind else {}
         scores[method] = {item.name: item.value for item in score(estimate, mask, normals=shard.normals, **truth)}
     normals = {method: estimate.normals for method, estimate in estimates.items()}
-    return SceneResult(scene, shard, scores, normals, estimates["LCNet + NENet"].light_directions, images)
+    return SceneResult(
+        scene=scene,
+        scores=scores,
+        mask=mask,
+        truth=shard.normals,
+        normals=normals,
+        true_lights=lights,
+        lights=estimates["LCNet + NENet"].light_directions,
+        picture=images[np.argmax(images[:, mask].mean((1, 2)))].copy(),  # a view would keep the whole stack alive
+    )
 
 
 def build_tables(results: list[SceneResult]) -> dict[str, tuple[list[str], list[list[str]]]]:

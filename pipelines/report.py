@@ -81,19 +81,18 @@ def _scene(result: "SceneResult") -> str:
     """Render the pictures of one scene: input, truth, estimate, error, least squares' error, lights."""
     from sdps.metrics import normal_error_map
 
-    shard, mask = result.shard, result.shard.mask
-    brightest = int(np.argmax(result.images.astype(np.float32)[:, mask].mean((1, 2))))
-    exposure = pictures.auto_exposure(result.images[brightest][None], mask)
-    ours = normal_error_map(result.normals["LCNet + NENet"], shard.normals, mask)
-    classical = normal_error_map(result.normals["least squares, true lights"], shard.normals, mask)
+    mask = result.mask
+    exposure = pictures.auto_exposure(result.picture[None], mask)
+    ours = normal_error_map(result.normals["LCNet + NENet"], result.truth, mask)
+    classical = normal_error_map(result.normals["least squares, true lights"], result.truth, mask)
     scores = result.scores["LCNet + NENet"]
     tiles = [
-        ("input", pictures.tone_map(result.images[brightest], exposure)),
-        ("true normals", pictures.normal_map(shard.normals, mask)),
+        ("input", pictures.tone_map(result.picture, exposure)),
+        ("true normals", pictures.normal_map(result.truth, mask)),
         ("estimated normals", pictures.normal_map(result.normals["LCNet + NENet"], mask)),
         (f"error, {np.nanmean(ours):.1f}°", pictures.error_map(ours, ERROR_LIMIT)),
         (f"least squares' error, {np.nanmean(classical):.1f}°", pictures.error_map(classical, ERROR_LIMIT)),
-        (f"lights, {scores['direction_mae']:.1f}°", pictures.light_plot(shard.light_directions, result.lights)),
+        (f"lights, {scores['direction_mae']:.1f}°", pictures.light_plot(result.true_lights, result.lights)),
     ]
     figures = "".join(
         f'<figure><img src="{pictures.data_uri(picture)}" alt="{html.escape(text)}">'
