@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from pipelines import pictures
-from render.errors import unknown
+from render.errors import InputError, unknown
 from render.files import atomic_path
 from render.manifest import View
-from render.materials import library
+from render.materials import library, surfaces
+from render.materials.model import Material
+from render.plan import material_pool
 
 _LIGHTS = np.array([[-0.45, 0.55, 0.70]])
 _SHAPES = ("sphere", "bunny", *(f"{family}:{seed}" for family in ("blobby", "sculpture") for seed in range(15)))
@@ -20,6 +22,7 @@ _TURNED = View(rotation=(0.9063, 0.0, 0.4226, 0.0746, 0.9843, -0.1600, -0.4160, 
 def add_material_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps materials`."""
     parser.add_argument("--category", default=None, help="only this category")
+    parser.add_argument("--materials", action="append", help="only these names and files; commas or repeat")
     parser.add_argument("--out", default=None, help="also render a contact sheet of spheres, <out>/materials.png")
 
 
@@ -29,18 +32,41 @@ def add_shape_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def materials_main(args: argparse.Namespace) -> int:
-    """List the materials with category and fit error."""
-    categories = library.categories()
-    if args.category is not None and args.category not in categories:
-        raise unknown("category", args.category, categories)
-    chosen = [name for name in library.names() if args.category is None or name in categories[args.category]]
+    """List the chosen materials: category and error of the fit, or that they are measured or vary."""
+    chosen = _chosen(args.category, args.materials)
     for name in chosen:
-        material = library.load(name)
-        sys.stdout.write(f"{name:<28} {material.category:<16} fit error {100 * material.fit_error:5.1f} %\n")
-    sys.stdout.write(f"{len(chosen)} materials; also lambertian:<albedo>, lambertian:<r>/<g>/<b>, and YAML files\n")
+        sys.stdout.write(f"{name:<28} {_about(surfaces.load(name))}\n")
+    sys.stdout.write(
+        f"{len(chosen)} materials; also lambertian:<albedo>, lambertian:<r>/<g>/<b>, and files: {library.FILES}\n"
+    )
     if args.out:
         _save(_material_sheet(chosen), Path(args.out) / "materials.png")
     return 0
+
+
+def _about(surface: surfaces.Surface) -> str:
+    """Describe a material by its category and what it is, or a spatially varying surface by its pattern."""
+    if surface.pattern:
+        return f"{surface.pattern.kind:<16} {surface.pattern.count} materials"
+    (material,) = surface.components
+    error = f"fit error {100 * material.fit_error:5.1f} %" if isinstance(material, Material) else "table"
+    return f"{material.category:<16} {error}"
+
+
+def _chosen(category: str | None, wanted: list[str] | None) -> list[str]:
+    """Return the built-in materials, of one category if given, or the `wanted` names, categories and files."""
+    if wanted:
+        from pipelines.regenerate import split_list
+
+        if category is not None:
+            raise InputError("--category and --materials: give one of them; --materials takes categories too")
+        return material_pool(tuple(split_list(wanted)))
+    categories = library.categories()
+    if category is None:
+        return library.names()
+    if category not in categories:
+        raise unknown("category", category, categories)
+    return list(categories[category])
 
 
 def shapes_main(args: argparse.Namespace) -> int:
@@ -58,14 +84,14 @@ def shapes_main(args: argparse.Namespace) -> int:
 def _material_sheet(names: list[str]) -> pictures.Image.Image:
     """Render a sphere of each material under one light, exposed alike but for the nearly black."""
     from render import many_lights, scene
-    from render.materials.bsdf import PackedMaterials
+    from render.materials.packed import pack
     from render.shapes import load
 
     built = scene.build(load("sphere"))
     tiles = []
     for first in range(0, len(names), 16):
         part = names[first : first + 16]
-        packed = PackedMaterials([library.load(name) for name in part])
+        packed = pack(part, built.mesh)
         _, images = many_lights.render(built, View(scale=0.95), packed, _LIGHTS, size=120, spp=64, bounces=0, seed=0)
         tiles += [(name[:21], pictures.tone_map(stack[0], 1.2)) for name, (_, stack) in zip(part, images, strict=True)]
     return pictures.contact_sheet(tiles, columns=min(10, len(tiles)))
@@ -74,10 +100,10 @@ def _material_sheet(names: list[str]) -> pictures.Image.Image:
 def _shape_sheet() -> pictures.Image.Image:
     """Render one view of each shape in white under one light."""
     from render import many_lights, scene
-    from render.materials.bsdf import PackedMaterials
+    from render.materials.packed import pack
     from render.shapes import load
 
-    packed = PackedMaterials([library.load("lambertian:0.8")])
+    packed = pack(["lambertian:0.8"])
     tiles = []
     for name in _SHAPES:
         view = View(scale=0.98) if name == "bunny" else _TURNED

@@ -12,9 +12,11 @@ from render.errors import InputError, unknown
 COMMANDS = {
     "doctor": ("doctor", "add_arguments", "main", "show what this machine has and what is missing"),
     "render-data": ("render_data", "add_arguments", "main", "render the training scenes of a preset"),
+    "data": ("data", "add_arguments", "main", "plan, check, preview, describe, export and import data folders"),
     "train": ("train", "add_arguments", "main", "train LCNet, then NENet"),
     "eval-merltest": ("eval_merltest", "add_arguments", "main", "render and score MERL-Test scenes"),
     "regenerate": ("regenerate", "add_arguments", "main", "render test scenes of chosen shapes and materials"),
+    "fit-material": ("fit_material", "add_arguments", "main", "fit the built-in model to a MERL .binary table"),
     "materials": ("catalogue", "add_material_arguments", "materials_main", "list the built-in materials"),
     "shapes": ("catalogue", "add_shape_arguments", "shapes_main", "list the shape families"),
     "bench": ("bench", "add_arguments", "main", "measure the renderer against Mitsuba's path integrator"),

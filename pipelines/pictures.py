@@ -45,11 +45,36 @@ def error_map(errors: np.ndarray, limit: float = 45.0) -> np.ndarray:  # (H, W, 
 
 
 def preview_strip(shard: Shard, lights: int = 4) -> np.ndarray:  # (H, W * (1 + lights), 3) uint8
-    """Lay out the normal map of a shard and some of its images side by side, under one exposure."""
-    chosen = np.linspace(0, len(shard.images) - 1, lights).round().astype(int)
+    """Lay out the normal map of a shard and some of its images side by side, under one exposure.
+
+    Spatially-varying scenes show their material weights in the place of one image.
+    """
+    tiles = [normal_map(shard.normals, shard.mask)]
+    weights = shard.weights
+    if weights is not None:
+        tiles.append(weight_map(weights, shard.mask))
+    chosen = np.linspace(0, len(shard.images) - 1, max(1, lights + 1 - len(tiles))).round().astype(int)
     exposure = auto_exposure(shard.images, shard.mask)
-    tiles = [normal_map(shard.normals, shard.mask), *(tone_map(shard.images[k], exposure) for k in chosen)]
+    tiles += [tone_map(shard.images[number], exposure) for number in chosen]
     return np.concatenate(tiles, axis=1)
+
+
+def weight_map(weights: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
+    """Mix one colour per material by its weight (M, H, W), white outside the mask."""
+    colours = np.array([colormaps["tab10"](number % 10)[:3] for number in range(len(weights))])
+    picture = (255 * np.clip(np.tensordot(np.moveaxis(weights, 0, -1), colours, 1), 0, 1) + 0.5).astype(np.uint8)
+    picture[~mask] = 255
+    return picture
+
+
+def fitted(picture: np.ndarray, side: int) -> np.ndarray:  # (h, w, 3) uint8
+    """Bring a picture to a height of `side`: averaged down, or up by whole pixels where it is smaller."""
+    height, width = picture.shape[:2]
+    if height == side:
+        return picture
+    scaled = (max(1, round(width * side / height)), side)
+    resample = Image.Resampling.BOX if height > side else Image.Resampling.NEAREST
+    return np.asarray(Image.fromarray(picture).resize(scaled, resample))
 
 
 def contact_sheet(tiles: Sequence[tuple[str, np.ndarray]], columns: int = 2, pad: int = 6) -> Image.Image:
@@ -110,9 +135,12 @@ def curve_plot(series: Sequence[tuple[str, np.ndarray, np.ndarray]], ylabel: str
     return figure
 
 
-def data_uri(picture: np.ndarray | Image.Image | Figure) -> str:
-    """Encode a picture as a PNG data URI, so that a page needs no other file."""
+def data_uri(picture: np.ndarray | Image.Image | Figure, quality: int | None = None) -> str:
+    """Encode a picture as a data URI, so that a page needs no other file: PNG, or JPEG when given its quality."""
     buffer = io.BytesIO()
+    if quality is not None:
+        Image.fromarray(np.asarray(picture)).save(buffer, format="jpeg", quality=quality, subsampling=0)
+        return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
     if isinstance(picture, Figure):
         picture.savefig(buffer, format="png")
     else:

@@ -7,10 +7,12 @@ from pipelines.presets import TestConfig
 from render import lights as light_sets
 from render.errors import InputError
 from render.manifest import SceneSpec, View
-from render.materials import library
+from render.materials import surfaces
 from render.plan import material_pool
 from render.seeds import derived_seed
 from render.shapes import load as load_shape
+
+_MEASURED = (".binary", ".bsdf")
 
 
 def test_scenes(config: TestConfig) -> list[SceneSpec]:
@@ -21,7 +23,7 @@ def test_scenes(config: TestConfig) -> list[SceneSpec]:
     """
     pool = material_pool(config.materials)
     for name in pool:
-        library.load(name)
+        surfaces.load(name)
     for shape in config.shapes:
         load_shape(shape)
     directions = tuple(tuple(round(float(c), 6) for c in row) for row in light_sets.load(config.lights))
@@ -49,6 +51,17 @@ def test_scenes(config: TestConfig) -> list[SceneSpec]:
 
 
 def slug(name: str) -> str:
-    """Turn a shape or material name, or a path, into part of a file name."""
-    text = Path(name).stem if Path(name).suffix.lower() in (".yaml", ".yml") or "/" in name.split(":")[0] else name
-    return re.sub(r"[^A-Za-z0-9.]+", "-", text).strip("-")
+    """Turn a shape or material name, or a path, into part of a file name: letters, digits, dots and hyphens.
+
+    Folders are dropped; of a measured material the suffix stays, so that `chrome.binary` is not taken for `chrome`. The
+    materials of a spatially varying name are joined by two hyphens: `stripes-7-chrome--blue-fabric`.
+    """
+    pattern, materials = surfaces.split(name)
+    if pattern:
+        return f"{pattern.kind}-{pattern.seed}-" + "--".join(slug(part) for part in materials)
+    path = Path(name)
+    if path.suffix.lower() in _MEASURED:
+        name = path.name
+    elif path.suffix.lower() in (".yaml", ".yml") or "/" in name.split(":")[0]:
+        name = path.stem
+    return re.sub(r"[^A-Za-z0-9.]+", "-", name).strip("-")

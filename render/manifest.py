@@ -54,7 +54,7 @@ class SceneSpec:
         material: A name `render.materials.library.load` understands.
         view: Pose.
         lights: Unit directions (x, y, z) from the surface to each light, camera frame, z > 0.
-        size: Image side in pixels.
+        size: Image side in pixels; (height, width) where they differ, which only imported scenes may.
         spp: Camera samples per pixel.
         bounces: Interreflection bounces (0 = direct light only).
     """
@@ -66,7 +66,7 @@ class SceneSpec:
     material: str
     view: View
     lights: tuple[tuple[float, float, float], ...]
-    size: int
+    size: int | tuple[int, int]
     spp: int
     bounces: int
 
@@ -74,6 +74,11 @@ class SceneSpec:
     def file(self) -> str:
         """Path of the shard relative to the data folder."""
         return f"shards/{self.id}.exr"
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """Height and width of the images in pixels."""
+        return (self.size, self.size) if isinstance(self.size, int) else self.size
 
     def digest(self) -> str:
         """Return the SHA-256 of the whole line, which its shard carries."""

@@ -1,98 +1,88 @@
 """From a data configuration to the list of scenes, before the first pixel."""
 
-from dataclasses import dataclass, field
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from render import lights as light_sets
+from render.data_config import UPRIGHT, DataConfig
 from render.errors import InputError, unknown
 from render.manifest import SceneSpec, View
-from render.materials import library
+from render.materials import library, surfaces
+from render.progress import progress_bar
 from render.seeds import derived_seed, generator
 
-UPRIGHT = ("sculpture", "bunny")  # families that stand; others have no up
+__all__ = ["DataConfig", "is_validation", "material_pool", "plan", "random_view"]
+
+POSES_TRIED = 24  # per view, before the shape is given up
+SHAPES_TRIED = 8
+EMPTY = 0.02  # share of the frame below which a tile shows nothing worth rendering
 
 
-@dataclass(frozen=True, kw_only=True)
-class DataConfig:
-    """Which scenes to render.
-
-    Attributes:
-        seed: Root seed; 0 is a seed like any other.
-        families: Seeded shape families and how many shapes of each.
-        views: Random views per shape.
-        materials_per_view: Different random materials per view (each is a sample of its own; they share rays).
-        materials: Names, categories, or `all`; `lambertian:<albedo>` and YAML files are allowed.
-        validation: Share of the shapes of each family kept for validation, in [0, 0.5]; rounded up when above 0.
-        lights: Distribution of the light directions, drawn anew for each view.
-        light_count: Lights per view.
-        size: Image side in pixels, a multiple of 4.
-        spp: Camera samples per pixel.
-        bounces: Interreflection bounces.
-        scale: Range of the radius of the bounding sphere of blobs, in half image widths.
-        upright_scale: The same for standing shapes, which fill less of their bounding sphere.
-        offset: Largest image-plane offset of the object, in half image widths, per unit of scale above 0.5.
-    """
-
-    seed: int = 0
-    families: dict[str, int] = field(default_factory=lambda: {"blobby": 8, "sculpture": 8})
-    views: int = 2
-    materials_per_view: int = 2
-    materials: tuple[str, ...] = ("all",)
-    validation: float = 0.05
-    lights: str = "azimuth-elevation"
-    light_count: int = 64
-    size: int = 128
-    spp: int = 16
-    bounces: int = 2
-    scale: tuple[float, float] = (0.75, 1.25)
-    upright_scale: tuple[float, float] = (0.95, 2.0)
-    offset: float = 0.25
-
-    def __post_init__(self) -> None:
-        for name in ("views", "materials_per_view", "light_count", "spp"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.seed < 0:
-            raise InputError(f"seed must not be negative, got {self.seed}")
-        if self.size < 16 or self.size % 4:
-            raise InputError(f"size must be a multiple of 4 from 16 up, got {self.size}")
-        if not 0 <= self.bounces <= 16:
-            raise InputError(f"bounces must be in 0..16, got {self.bounces}")
-        if not 0 <= self.validation <= 0.5:
-            raise InputError(f"validation must be in [0, 0.5], got {self.validation}")
-        if self.lights not in light_sets.DISTRIBUTIONS:
-            raise unknown("value for lights:", self.lights, light_sets.DISTRIBUTIONS)
-        for name in ("scale", "upright_scale"):
-            low, high = getattr(self, name)
-            if not 0 < low <= high:
-                raise InputError(f"{name} must be two rising positive numbers, got {low}, {high}")
-        if not self.families or min(self.families.values()) < 0:
-            raise InputError("families must name at least one shape family with a count of 0 or more")
-
-
-def plan(config: DataConfig) -> list[SceneSpec]:
+def plan(config: DataConfig, processes: int = 1) -> list[SceneSpec]:
     """List every scene of `config`; the same configuration gives the same list.
 
     Scenes of one view differ only in material and stand together, so that the renderer can share their rays.
 
+    Args:
+        config: What to render.
+        processes: Processes that share the work where views depend on the mesh; they change nothing in the list.
+
     Raises:
-        InputError: an unknown family or material, or more materials per view than there are.
+        InputError: an unknown family or material, more materials per view than there are, or a shape that cannot be
+            framed as the configuration asks.
     """
+    from render.shapes.registry import FAMILIES
+
     pool = material_pool(config.materials)
-    if config.materials_per_view > len(pool):
-        raise InputError(f"materials_per_view is {config.materials_per_view}, but there are {len(pool)} materials")
-    scenes = []
-    for family, count in config.families.items():
-        held_out = int(np.ceil(config.validation * count))
-        for number in range(count):
-            split = "val" if number >= count - held_out else "train"
-            for view in range(config.views):
-                scenes += _plan_view(config, family, number, view, split, pool)
-    if not scenes:
+    most = max(config.materials_per_view, config.mixture[1] if config.spatially_varying else 1)
+    if most > len(pool):
+        name = "materials_per_view" if most == config.materials_per_view else "mixture"
+        raise InputError(f"{name} is {most}, but there are {len(pool)} materials")
+    joined = next((name for name in pool if "+" in name), None)
+    if config.spatially_varying and joined:
+        raise InputError(f"materials: {joined!r} has a '+' and cannot be mixed with others; leave it out or rename it")
+    for family in config.families:
+        if family not in FAMILIES or not FAMILIES[family].seeded:
+            raise unknown("shape family", family, [name for name, entry in FAMILIES.items() if entry.seeded])
+    shapes = [(family, number) for family, count in config.families.items() for number in range(count)]
+    if not shapes:
         raise InputError("families: no scene to render; raise a count above 0")
-    return scenes
+    framed = any(config.is_framed(family) for family, _ in shapes)
+    with _mapping(processes if framed else 1) as mapping:
+        planned = mapping(partial(_plan_shape, config, pool), shapes)
+        bar = progress_bar(planned, total=len(shapes), desc="plan", unit="shape", disable=not framed)
+        return [scene for scenes in bar for scene in scenes]
+
+
+@contextmanager
+def _mapping(processes: int) -> Iterator[Any]:
+    """Yield `map`, or one that spreads the work over processes and keeps its order."""
+    if processes <= 1:
+        yield map
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=context) as executor:
+        try:
+            yield partial(executor.map, chunksize=4)
+        except BaseException:
+            executor.shutdown(cancel_futures=True)
+            raise
+
+
+def is_validation(number: int, share: float) -> bool:
+    """Tell whether shape `number` of a family is held out for validation.
+
+    Every 1/share-th shape is, the first one included, so of the first N shapes exactly ceil(share N), and whether a
+    shape is does not depend on how many there are.
+    """
+    return share > 0 and (number == 0 or int(round(number * share, 9)) > int(round((number - 1) * share, 9)))
 
 
 def material_pool(chosen: tuple[str, ...]) -> list[str]:
@@ -108,25 +98,74 @@ def material_pool(chosen: tuple[str, ...]) -> list[str]:
         elif name in categories:
             pool += categories[name]
         else:
-            library.load(name)
+            surfaces.load(name)
             pool.append(name)
     return list(dict.fromkeys(pool))
 
 
-def _plan_view(config: DataConfig, family: str, number: int, view: int, split: str, pool: list[str]) -> list[SceneSpec]:
-    """Draw pose, lights and materials of one view; each from a stream of its own."""
-    from render.shapes.registry import FAMILIES
+def _plan_shape(config: DataConfig, pool: list[str], key: tuple[str, int]) -> list[SceneSpec]:
+    """Plan all views of one shape; a shape that cannot be framed as asked is replaced by another one."""
+    family, number = key
+    for attempt in range(SHAPES_TRIED):
+        replaced = ("instead", attempt) if attempt else ()
+        shape = f"{family}:{derived_seed(config.seed, family, number, *replaced)}"
+        views = _views(config, family, number, shape)
+        if views is not None:
+            return [
+                scene
+                for view, pose in enumerate(views)
+                for scene in _plan_view(config, (family, number, view), shape, pose, pool)
+            ]
+    raise InputError(
+        f"{family} {number}: {SHAPES_TRIED} shapes in turn have a view without a fitting pose in {POSES_TRIED}; lower "
+        f"min_foreground.{family} or min_normal_spread.{family}, or raise the scale"
+    )
 
-    if family not in FAMILIES or not FAMILIES[family].seeded:
-        raise unknown("shape family", family, [name for name, entry in FAMILIES.items() if entry.seeded])
-    keys = (family, number, view)
-    pose = random_view(config, family, generator(config.seed, *keys, "view"))
+
+def _views(config: DataConfig, family: str, number: int, shape: str) -> list[View] | None:
+    """Draw the poses of a shape, or None when one of them cannot be framed as asked."""
+    if not config.is_framed(family):
+        return [
+            random_view(config, family, generator(config.seed, family, number, view, "view"))
+            for view in range(config.views)
+        ]
+    from render.shapes import load
+
+    mesh, views = load(shape), []
+    for view in range(config.views):
+        pose = _framed_view(config, family, (family, number, view), mesh)
+        if pose is None:
+            return None
+        views.append(pose)
+    return views
+
+
+def _framed_view(config: DataConfig, family: str, keys: tuple, mesh: Any) -> View | None:
+    """Draw poses until one, or one of its tiles, shows enough of the shape."""
+    from render.framing import measure, tile_view
+
+    tiles = config.tiles_of(family)
+    least = max(config.min_foreground.get(family, 0.0), EMPTY)
+    for attempt in range(POSES_TRIED):
+        again = (attempt,) if attempt else ()
+        pose = random_view(config, family, generator(config.seed, *keys, "view", *again))
+        framing = measure(mesh, pose, tiles)
+        fits = (framing.foreground >= least) & (framing.spread >= config.min_normal_spread.get(family, 0.0))
+        if fits.any():
+            choice = generator(config.seed, *keys, "tile", *again).choice(np.flatnonzero(fits))
+            return tile_view(pose, *divmod(int(choice), tiles), tiles)
+    return None
+
+
+def _plan_view(config: DataConfig, keys: tuple, shape: str, pose: View, pool: list[str]) -> list[SceneSpec]:
+    """Draw lights and materials of one view; each from a stream of its own."""
+    family, number, view = keys
     directions = light_sets.draw(config.lights, config.light_count, generator(config.seed, *keys, "lights"))
     order = generator(config.seed, *keys, "materials").permutation(len(pool))[: config.materials_per_view]
     common = {
         "seed": derived_seed(config.seed, *keys, "sampler"),
-        "split": split,
-        "shape": f"{family}:{derived_seed(config.seed, family, number)}",
+        "split": "val" if is_validation(number, config.validation) else "train",
+        "shape": shape,
         "view": pose,
         "lights": tuple(tuple(round(float(c), 6) for c in row) for row in directions),
         "size": config.size,
@@ -134,7 +173,22 @@ def _plan_view(config: DataConfig, family: str, number: int, view: int, split: s
         "bounces": config.bounces,
     }
     name = f"{family}-{number:05d}-v{view}"
-    return [SceneSpec(id=f"{name}-m{slot}", material=pool[index], **common) for slot, index in enumerate(order)]
+    return [
+        SceneSpec(id=f"{name}-m{slot}", material=_surface(config, (*keys, "surface", slot), pool, index), **common)
+        for slot, index in enumerate(order)
+    ]
+
+
+def _surface(config: DataConfig, keys: tuple, pool: list[str], first: int) -> str:
+    """Name the surface of a scene: material `first` alone, or mixed with others by a seeded pattern."""
+    rng = generator(config.seed, *keys)
+    if rng.random() >= config.spatially_varying:
+        return pool[first]
+    count = int(rng.integers(config.mixture[0], config.mixture[1] + 1))
+    others = [index for index in rng.permutation(len(pool)) if index != first][: count - 1]
+    names = "+".join(pool[index] for index in (first, *others))
+    pattern = config.patterns[int(rng.integers(len(config.patterns)))]
+    return f"{pattern}:{int(rng.integers(2**31))}:{names}"
 
 
 def random_view(config: DataConfig, family: str, rng: np.random.Generator) -> View:

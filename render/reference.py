@@ -9,7 +9,7 @@ import numpy as np
 
 from render import variant
 from render.manifest import View
-from render.materials import bsdf as material_bsdf
+from render.materials import surface_bsdf
 from render.scene import build_mesh
 from render.shapes.mesh import TriangleMesh
 
@@ -24,12 +24,19 @@ def posed(mesh: TriangleMesh, view: View) -> TriangleMesh:
     return TriangleMesh(vertices=vertices.astype(np.float32), faces=mesh.faces, normals=normals)
 
 
-def scene_dict(mesh: TriangleMesh, view: View, material: str, size: int, spp: int, bounces: int) -> dict:
+def scene_dict(
+    mesh: TriangleMesh, view: View, material: str, size: int, spp: int, bounces: int, shape: str | None = None
+) -> dict:
     """Describe the scene for `mi.load_dict`: orthographic camera, box filter, one directional emitter.
 
     The camera stands at +z and looks along -z, which makes image-right +x (see the frame tests).
     """
     depth = 4.0 * view.scale
+    to_camera = np.eye(4)
+    to_camera[:3, :3], to_camera[:2, 3] = view.matrix() * view.scale, view.offset
+    bsdf = {"type": "ps_surface", "material": material, "to_object": mi.ScalarTransform4f(np.linalg.inv(to_camera))}
+    if shape is not None:
+        bsdf["shape"] = shape
     return {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": bounces + 2, "rr_depth": 1000},
@@ -48,28 +55,30 @@ def scene_dict(mesh: TriangleMesh, view: View, material: str, size: int, spp: in
             },
             "sampler": {"type": "independent", "sample_count": spp},
         },
-        "object": build_mesh(posed(mesh, view), {"type": "ps_material", "material": material}),
+        "object": build_mesh(posed(mesh, view), bsdf),
         "light": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": np.pi}},
     }
 
 
 def render_each_light(
-    mesh: TriangleMesh, view: View, material: str, lights: np.ndarray, *, size: int, spp: int, bounces: int, seed: int
-) -> Iterator[np.ndarray]:
+    mesh: TriangleMesh, view: View, material: str, lights: np.ndarray, *, size: int, spp: int, bounces: int,
+    seed: int, shape: str | None = None,
+) -> Iterator[np.ndarray]:  # fmt: skip
     """Yield one image (size, size, 3) float32 per light, updating the emitter of a scene loaded once.
 
     Args:
         mesh: Object in the unit sphere.
         view: Pose.
-        material: Library name or YAML path.
+        material: Any surface name (see `render.materials.surfaces.load`).
         lights: (L, 3) unit vectors to the lights, camera frame.
         size: Image side in pixels.
         spp: Samples per pixel.
         bounces: Interreflection bounces; Mitsuba's `max_depth` is this plus two.
         seed: Seed of the first light's image; the next ones follow.
+        shape: Name of the shape, which patterns that follow a mesh's pieces need.
     """
-    material_bsdf.register()
-    scene = mi.load_dict(scene_dict(mesh, view, material, size, spp, bounces))
+    surface_bsdf.register()
+    scene = mi.load_dict(scene_dict(mesh, view, material, size, spp, bounces, shape))
     parameters = mi.traverse(scene)
     key = next(name for name in parameters.keys() if name.endswith("light.to_world"))  # noqa: SIM118
     for number, light in enumerate(np.asarray(lights, np.float64)):

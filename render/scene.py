@@ -1,11 +1,57 @@
 """Meshes as Mitsuba scenes; the only module that touches Mitsuba's mesh parameters, which 3.10 renames."""
 
+from typing import Any, NamedTuple
+
+import drjit as dr
 import numpy as np
 
 from render import variant
+from render.sampling import opaque
 from render.shapes.mesh import TriangleMesh
 
 mi = variant.load()
+
+
+class Triangles(NamedTuple):
+    """Corners of N triangles: positions and unnormalised-interpolation normals, object frame."""
+
+    positions: tuple  # 3 Point3f (N)
+    normals: tuple  # 3 Vector3f (N)
+
+
+class Scene:
+    """One object, ready to be hit by rays.
+
+    Args:
+        mesh: Object in the unit sphere.
+    """
+
+    def __init__(self, mesh: TriangleMesh) -> None:
+        self.mesh = mesh
+        self._scene = mi.load_dict({"type": "scene", "object": build_mesh(mesh)})
+        self._corners: tuple | None = None
+
+    def ray_intersect(self, ray: Any, coherent: bool) -> tuple:
+        """Return the surface interaction with its shading frame, and the barycentric coordinates (u, v) of the hit."""
+        hit = self._scene.ray_intersect_preliminary(ray, coherent)
+        return hit.compute_surface_interaction(ray, +mi.RayFlags.ShadingFrame), hit.prim_uv
+
+    def ray_test(self, ray: Any, coherent: bool, active: Any = True) -> "mi.Bool":
+        """Tell which rays meet the object."""
+        return self._scene.ray_test(ray, coherent, active)
+
+    def triangles(self, prim: "mi.UInt32") -> Triangles:
+        """Return the triangles of the given numbers."""
+        if self._corners is None:
+            arrays = (self.mesh.vertices, self.mesh.normals)
+            floats = tuple(opaque(mi.Float(np.ascontiguousarray(a, np.float32).ravel())) for a in arrays)
+            self._corners = (*floats, opaque(mi.UInt32(np.ascontiguousarray(self.mesh.faces, np.uint32).ravel())))
+        vertices, normals, faces = self._corners
+        corners = [dr.gather(mi.UInt32, faces, 3 * prim + k) for k in range(3)]
+        return Triangles(
+            tuple(dr.gather(mi.Point3f, vertices, corner) for corner in corners),
+            tuple(dr.gather(mi.Vector3f, normals, corner) for corner in corners),
+        )
 
 
 def build_mesh(mesh: TriangleMesh, bsdf: dict | None = None) -> "mi.Mesh":
@@ -27,6 +73,6 @@ def build_mesh(mesh: TriangleMesh, bsdf: dict | None = None) -> "mi.Mesh":
     return shape
 
 
-def build(mesh: TriangleMesh) -> "mi.Scene":
+def build(mesh: TriangleMesh) -> Scene:
     """Return a scene that holds only `mesh`: all that `render.many_lights` traces rays against."""
-    return mi.load_dict({"type": "scene", "object": build_mesh(mesh)})
+    return Scene(mesh)

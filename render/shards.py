@@ -2,7 +2,8 @@
 
 A shard is one multi-part OpenEXR file (ZIP, lossless) per scene. Part `gt` (float32) holds
 `normal.X/Y/Z` (camera frame, zero outside the mask), `Z` (depth), `mask` (0 or 1) and `coverage`
-(share of a pixel's samples that hit the object); parts `L000`, `L001`, ... (float16) hold the linear
+(share of a pixel's samples that hit the object); a part `materials` (float32) of spatially-varying scenes holds the
+weights `w0`, `w1`, ... of the materials its header names; parts `L000`, `L001`, ... (float16) hold the linear
 RGB radiance under one light of irradiance pi, with its direction in the part's header.
 
 OpenEXR's binding silently corrupts non-contiguous arrays (openexr #1929) and arrays of unusual channel
@@ -24,6 +25,7 @@ from render.files import atomic_path
 from render.manifest import SceneSpec
 
 SCHEMA = 1
+_MATERIALS = "materials"
 HALF_LIMIT = 65504.0
 _OWN_ATTRIBUTES = ("ps:schema", "ps:scene_id", "ps:light_count", "ps:digest")
 _DIGEST = re.compile(rb"ps:digest\0string\0\x40\0\0\0([0-9a-f]{64})")  # as OpenEXR lays an attribute out
@@ -43,6 +45,9 @@ class Shard:
         mask: (H, W) bool, pixels of which at least half the samples hit the object.
         coverage: (H, W) float32 in [0, 1], share of samples that hit the object.
         light_directions: (L, 3) float32, unit, from the surface to the light.
+        weights: (M, H, W) float32 in [0, 1], mean weight of each material in a pixel of the mask (they sum to 1), zero
+            outside; None for a scene of one material.
+        materials: Names of the M materials; empty for a scene of one material.
         provenance: File-level header attributes (schema, seed, versions, names), all text or numbers.
     """
 
@@ -53,6 +58,8 @@ class Shard:
     mask: np.ndarray
     coverage: np.ndarray
     light_directions: np.ndarray
+    weights: np.ndarray | None = None
+    materials: tuple[str, ...] = ()
     provenance: dict[str, str | int | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -65,8 +72,10 @@ class Shard:
             "coverage": ((height, width), np.float32),
             "light_directions": ((count, 3), np.float32),
         }
+        if self.weights is not None or self.materials:
+            expected["weights"] = ((len(self.materials), height, width), np.float32)
         for name, (shape, dtype) in expected.items():
-            array = getattr(self, name)
+            array = np.asarray(getattr(self, name))
             if array.shape != shape or array.dtype != dtype:
                 raise InputError(
                     f"shard {self.scene_id}: {name} must be {np.dtype(dtype)} of shape {shape}, "
@@ -126,6 +135,9 @@ def write_shard(path: str | Path, shard: Shard) -> None:
         "coverage": shard.coverage,
     }
     parts = [("gt", attributes, ground_truth)]
+    if shard.weights is not None:
+        channels = {f"w{number}": weight for number, weight in enumerate(shard.weights)}
+        parts.append((_MATERIALS, {"ps:materials": "+".join(shard.materials)}, channels))
     for index, (image, direction) in enumerate(zip(shard.images, shard.light_directions, strict=True)):
         header = {"ps:light_dir": direction.astype(np.float32)}
         parts.append((f"L{index:03d}", header, {"RGB": image}))
@@ -168,20 +180,22 @@ def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
     header = parts[0].header
     if parts[0].name() != "gt" or header.get("ps:schema") != SCHEMA:
         raise InputError(f"{path}: not a shard of schema {SCHEMA} (first part {parts[0].name()!r}); render it again")
-    names = [f"L{index:03d}" for index in range(len(parts) - 1)]
-    if [part.name() for part in parts[1:]] != names:
+    mixture, lit = (parts[1], parts[2:]) if len(parts) > 1 and parts[1].name() == _MATERIALS else (None, parts[1:])
+    if [part.name() for part in lit] != [f"L{index:03d}" for index in range(len(lit))]:
         raise InputError(f"{path}: light parts are missing or out of order; delete the file and render it again")
     truth = {name: channel.pixels for name, channel in parts[0].channels.items()}
     try:
         normals = truth["normal"] if "normal" in truth else np.stack([truth[f"normal.{c}"] for c in "XYZ"], axis=-1)
         shard = Shard(
             scene_id=str(header["ps:scene_id"]),
-            images=np.stack([part.channels["RGB"].pixels for part in parts[1:]]),
+            images=np.stack([part.channels["RGB"].pixels for part in lit]),
             normals=normals,
             depth=truth["Z"],
             mask=truth["mask"] > 0.5,
             coverage=truth["coverage"],
-            light_directions=np.stack([np.asarray(part.header["ps:light_dir"], np.float32) for part in parts[1:]]),
+            light_directions=np.stack([np.asarray(part.header["ps:light_dir"], np.float32) for part in lit]),
+            weights=mixture and np.stack([mixture.channels[f"w{k}"].pixels for k in range(len(mixture.channels))]),
+            materials=tuple(str(mixture.header["ps:materials"]).split("+")) if mixture else (),
             provenance={
                 key[3:]: value for key, value in header.items() if key.startswith("ps:") and key not in _OWN_ATTRIBUTES
             },
@@ -242,7 +256,7 @@ def _compare(path: str | Path, shard: Shard, scene: SceneSpec) -> None:
         raise InputError(f"{path}: {len(shard.images)} lights, the manifest says {len(directions)}; render it again")
     if not np.allclose(shard.light_directions, directions, atol=1e-5):
         raise InputError(f"{path}: light directions differ from the manifest; render it again")
-    if shard.images.shape[1:3] != (scene.size, scene.size):
+    if shard.images.shape[1:3] != scene.resolution:
         raise InputError(f"{path}: images are {shard.images.shape[1:3]}, the manifest says {scene.size}; render again")
     if shard.provenance.get("spec", scene.digest()) != scene.digest():
         raise InputError(

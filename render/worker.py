@@ -1,29 +1,89 @@
-"""Rendering planned scenes into shards: view by view, resumable, each shard whole or absent."""
+"""Rendering planned scenes into shards: view by view, resumable, each shard whole or absent.
 
+`render_scenes` does it in this process and stops at the first mistake; `render.supervisor` has the same pieces run by
+processes of their own, and goes on after failures.
+"""
+
+import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
 
 import drjit as dr
 
 from render import many_lights, variant
+from render.chunks import GROUP_SIZE, view_groups
 from render.errors import InputError
 from render.manifest import SceneSpec
-from render.materials import library
-from render.materials.bsdf import PackedMaterials
+from render.materials import surfaces as surface_names
+from render.materials.packed import pack
 from render.progress import progress_bar
-from render.scene import build
+from render.scene import Scene, build
 from render.shapes import load as load_shape
 from render.shards import Shard, is_whole, to_half, write_shard
 
 mi = variant.load()
 
 
+class Unwritable(InputError):
+    """The disk is full or the folder cannot be written: a mistake that every further scene would meet, too."""
+
+
+class Stages:
+    """Seconds per stage of the work, split among the scenes that share them.
+
+    What several scenes share (a shape and its acceleration structure, the rays of a view) is spread over them in equal
+    parts; `lap` returns what one scene took.
+
+    Attributes:
+        view_traced: Whether the rays of the view at work are done, so that a failure concerns one material only.
+    """
+
+    def __init__(self) -> None:
+        self.view_traced = False
+        self._seconds: dict[str, float] = {}
+        self._shares: dict[str, dict[str, float]] = {}
+
+    @contextmanager
+    def time(self, stage: str) -> Iterator[None]:
+        """Count the time spent inside as `stage`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def each(self, stage: str, items: Iterator) -> Iterator:
+        """Iterate over `items`, counting the time they take to appear as `stage`."""
+        while True:
+            with self.time(stage):
+                item = next(items, None)
+            if item is None:
+                return
+            yield item
+
+    def spread(self, level: str, count: int) -> None:
+        """Share what was counted since the last call or lap among `count` scenes, until `level` is spread again."""
+        self._shares[level] = {stage: seconds / max(count, 1) for stage, seconds in self._seconds.items()}
+        self._seconds = {}
+        self.view_traced = level == "view"
+
+    def lap(self) -> dict[str, float]:
+        """Return the seconds per stage of the scene just finished, its shares included."""
+        total = dict(self._seconds)
+        for share in self._shares.values():
+            for stage, seconds in share.items():
+                total[stage] = total.get(stage, 0.0) + seconds
+        self._seconds = {}
+        return total
+
+
 def render_scenes(
     scenes: Sequence[SceneSpec],
     folder: str | Path,
     *,
-    group_size: int = 16,
+    group_size: int = GROUP_SIZE,
     on_shard: Callable[[SceneSpec], None] | None = None,
 ) -> int:
     """Render every scene that has no whole shard yet in `folder`, with a progress bar and ETA.
@@ -49,9 +109,9 @@ def render_scenes(
             groups = [group for group in run if any(scene.id in missing for scene in group)]
             if not groups:
                 continue
-            built = build(load_shape(shape))
+            built, stages = build(load_shape(shape)), Stages()
             for group in groups:
-                for scene in _render_group(built, group, folder, missing):
+                for scene in render_group(built, group, folder, missing, stages):
                     bar.update()
                     if on_shard:
                         on_shard(scene)
@@ -59,30 +119,29 @@ def render_scenes(
     return len(missing)
 
 
-def view_groups(scenes: Sequence[SceneSpec], group_size: int) -> Iterator[list[SceneSpec]]:
-    """Split the manifest into runs of scenes that differ only in id, split and material."""
-    for _, run in groupby(scenes, key=_ray_key):
-        group = list(run)
-        for first in range(0, len(group), group_size):
-            yield group[first : first + group_size]
+def render_group(
+    built: Scene, group: list[SceneSpec], folder: Path, missing: set[str], stages: Stages
+) -> Iterator[SceneSpec]:
+    """Render the missing scenes of one view, always from the whole group's rays, and write their shards.
 
+    Yields each scene, in the order of the group, after its shard is written.
 
-def _ray_key(scene: SceneSpec) -> tuple:
-    return scene.shape, scene.view, scene.seed, scene.lights, scene.size, scene.spp, scene.bounces
-
-
-def _render_group(built: "mi.Scene", group: list[SceneSpec], folder: Path, missing: set[str]) -> Iterator[SceneSpec]:
-    """Render the missing scenes of one view, always from the whole group's rays, and write their shards."""
-    first = group[0]
-    packed = PackedMaterials([library.load(scene.material) for scene in group])
-    truth, images = many_lights.render(
-        built, first.view, packed, first.light_directions(), size=first.size, spp=first.spp,
-        bounces=first.bounces, seed=first.seed,
-        only=[number for number, scene in enumerate(group) if scene.id in missing],
-    )  # fmt: skip
+    Raises:
+        InputError: an unusable material, an object outside the frame, or images that are not finite.
+        Unwritable: a full disk or an unwritable folder.
+    """
+    stages.view_traced = False
+    first, only = group[0], [number for number, scene in enumerate(group) if scene.id in missing]
+    with stages.time("render"):
+        surfaces = pack([scene.material for scene in group], built.mesh)
+        truth, images = many_lights.render(
+            built, first.view, surfaces, first.light_directions(), size=first.size, spp=first.spp,
+            bounces=first.bounces, seed=first.seed, only=only,
+        )  # fmt: skip
     if not truth.mask.any():
         raise InputError(f"scene {first.id}: {first.shape} is outside the frame; check view.scale and view.offset")
-    for number, stack in images:
+    stages.spread("view", len(only))
+    for number, stack in stages.each("render", images):
         scene = group[number]
         shard = Shard(
             scene_id=scene.id,
@@ -92,10 +151,28 @@ def _render_group(built: "mi.Scene", group: list[SceneSpec], folder: Path, missi
             mask=truth.mask,
             coverage=truth.coverage,
             light_directions=scene.light_directions(),
+            weights=truth.weights[number],
+            materials=surface_names.split(scene.material)[1] if truth.weights[number] is not None else (),
             provenance=_provenance(scene),
         )
-        write_shard(folder / scene.file, shard)
+        with stages.time("write"):
+            _write(folder / scene.file, shard)
         yield scene
+
+
+def _write(path: Path, shard: Shard) -> None:
+    """Write a shard; tell a disk that refuses it from images that must not be written.
+
+    Raises:
+        Unwritable: the disk is full or the folder unwritable.
+        InputError: non-finite values.
+    """
+    try:
+        write_shard(path, shard)
+    except InputError as error:
+        if isinstance(error.__cause__, OSError):
+            raise Unwritable(str(error)) from error
+        raise
 
 
 def _provenance(scene: SceneSpec) -> dict[str, str | int | float]:

@@ -7,13 +7,12 @@ import numpy as np
 
 from render import many_lights, scene
 from render.manifest import View
-from render.materials import library
-from render.materials.bsdf import PackedMaterials
+from render.materials.packed import PackedSurfaces, pack
 from render.shapes import TriangleMesh
 
 
-def packed(*names: str) -> PackedMaterials:
-    return PackedMaterials([library.load(name) for name in names])
+def packed(*names: str) -> PackedSurfaces:
+    return pack(names)
 
 
 def plane() -> TriangleMesh:

@@ -9,8 +9,11 @@ import pytest
 
 from render import config, lights, seeds
 from render.errors import InputError, unknown
+from render.framing import measure
 from render.manifest import SceneSpec, View, read_manifest, write_manifest
-from render.plan import DataConfig, material_pool, plan
+from render.materials import surfaces
+from render.plan import DataConfig, is_validation, material_pool, plan
+from render.shapes import load as load_shape
 
 STREAM = 1681681659  # frozen: another value would mean that every plan changes
 SMALL = DataConfig(families={"blobby": 4}, views=2, materials_per_view=2, light_count=5, validation=0.25)
@@ -33,7 +36,8 @@ def test_same_configuration_same_plan():
 def test_adding_scenes_leaves_the_others_alone(change):
     before, after = by_id(plan(SMALL)), by_id(plan(replace(SMALL, **change)))
     for name, scene in before.items():
-        assert replace(after[name], split="") == replace(scene, split="")
+        changed = {"split": "train"} if "validation" in change else {}
+        assert after[name] == replace(scene, **changed)
 
 
 def test_another_material_per_view_keeps_the_first_ones():
@@ -55,6 +59,57 @@ def test_validation_shapes_are_unseen_in_training():
     assert not shapes["train"] & shapes["val"]
     assert sorted(shape.split(":")[0] for shape in shapes["val"]) == ["blobby", "sculpture"]
     assert {scene.split for scene in plan(replace(SMALL, validation=0))} == {"train"}
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.05, 1), (0.05, 40), (0.07, 100), (0.29, 200), (0.5, 3), (0.01, 1098)])
+def test_the_share_held_out_is_exact_at_every_count(share, count):
+    held_out = [number for number in range(count) if is_validation(number, share)]
+    assert len(held_out) == int(np.ceil(round(share * count, 9))) and held_out[0] == 0
+
+
+def test_spatially_varying_scenes_change_nothing_else():
+    config = replace(SMALL, families={"blobby": 60}, materials=("fabric", "metal"))
+    plain = plan(config)
+    mixed = plan(replace(config, spatially_varying=0.25))
+    more = plan(replace(config, spatially_varying=0.5, mixture=(2, 3)))
+    chosen = [number for number, scene in enumerate(mixed) if scene.material != plain[number].material]
+    assert 0.15 < len(chosen) / len(plain) < 0.35
+    assert [replace(scene, material="") for scene in mixed] == [replace(scene, material="") for scene in plain]
+    pool = set(material_pool(config.materials))
+    for number in chosen:
+        surface = surfaces.load(mixed[number].material)
+        names = surface.component_names
+        assert len(names) in (2, 3) and len(set(names)) == len(names) and set(names) <= pool
+        assert names[0] == plain[number].material and more[number].material == mixed[number].material
+    assert len({mixed[number].material.split(":")[0] for number in chosen}) == 5
+    only = plan(replace(config, spatially_varying=1.0, patterns=("noise",), mixture=(3, 3)))
+    assert all(scene.material.startswith("noise:") and scene.material.count("+") == 2 for scene in only)
+
+
+FRAMED = DataConfig(
+    families={"sculpture": 1}, views=4, materials_per_view=1, light_count=1, tiles=4, upright_scale=(0.8, 1.0),
+    min_foreground={"sculpture": 0.5}, min_normal_spread={"sculpture": 10.0},
+)  # fmt: skip
+
+
+def test_tiles_show_as_much_as_asked():
+    scenes = plan(FRAMED)
+    assert len(scenes) == 4
+    mesh = load_shape(scenes[0].shape)
+    for scene in scenes:
+        framing = measure(mesh, scene.view)
+        assert framing.foreground[0, 0] > 0.45 and framing.spread[0, 0] > 8  # at twice the resolution
+        assert 3.2 - 1e-6 <= scene.view.scale <= 4 + 1e-6
+
+
+def test_a_shape_that_cannot_be_framed_is_replaced_and_at_last_refused(monkeypatch):
+    tried = []
+    monkeypatch.setattr("render.plan.SHAPES_TRIED", 2)
+    monkeypatch.setattr("render.shapes.load", lambda name: tried.append(name) or load_shape(name))
+    small = replace(SMALL, families={"blobby": 1}, views=1, scale=(0.5, 0.5), min_foreground={"blobby": 0.9})
+    with pytest.raises(InputError, match=r"lower min_foreground\.blobby"):
+        plan(small)
+    assert len(set(tried)) == 2
 
 
 def test_poses_are_rotations_within_their_ranges():
@@ -79,6 +134,15 @@ def test_poses_are_rotations_within_their_ranges():
         ({"lights": "hemispere"}, "did you mean 'hemisphere'"),
         ({"scale": (1.0, 0.5)}, "scale"),
         ({"families": {}}, "families"),
+        ({"spatially_varying": 1.5}, "spatially_varying"),
+        ({"patterns": ("stripe",)}, "did you mean 'stripes'"),
+        ({"patterns": ()}, "patterns"),
+        ({"mixture": (1, 2)}, "mixture"),
+        ({"tiles": 0}, "tiles"),
+        ({"tiles": 8}, "tiles x upright_scale"),
+        ({"min_foreground": {"bloby": 0.5}}, "did you mean 'blobby'"),
+        ({"min_foreground": {"blobby": 1.5}}, r"min_foreground\.blobby"),
+        ({"min_normal_spread": {"blobby": -1}}, r"min_normal_spread\.blobby"),
     ],
 )
 def test_configuration_is_checked(change, message):
@@ -94,6 +158,8 @@ def test_configuration_is_checked(change, message):
         ({"families": {"blobby": 0}}, "no scene"),
         ({"materials": ("crome",)}, "did you mean 'chrome"),
         ({"materials": ("chrome",)}, "materials_per_view is 2"),
+        ({"materials": ("chrome", "nylon"), "spatially_varying": 0.1}, "mixture is 3"),
+        ({"materials": ("all", "noise:1:chrome+nylon"), "spatially_varying": 0.1}, "cannot be mixed"),
     ],
 )
 def test_plan_refuses(change, message):

@@ -12,7 +12,7 @@ import numpy as np
 
 from render import variant
 from render.errors import InputError
-from render.materials import model
+from render.materials import highlight, model
 from render.materials.library import load
 from render.materials.model import Material
 
@@ -51,9 +51,10 @@ class PackedMaterials:
         if not materials:
             raise InputError("materials: at least one is needed")
         self.names = tuple(material.name for material in materials)
-        self.tables = _opaque(np.stack([_packed_tables(material) for material in materials]))
-        self.shadowing = _opaque(np.stack([_packed_shadowing(material) for material in materials]))
-        self.lobes = _opaque(np.stack([lobe_distribution(material) for material in materials]))
+        self.highlight = np.array([narrow_share(material) for material in materials])
+        self.tables = upload(np.stack([_packed_tables(material) for material in materials]))
+        self.shadowing = upload(np.stack([_packed_shadowing(material) for material in materials]))
+        self.lobes = upload(np.stack([lobe_distribution(material) for material in materials]))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -65,17 +66,14 @@ class PackedMaterials:
         half = dr.normalize(wi + wo)
         sin2_h = dr.fma(half.x, half.x, half.y * half.y)
         cos_d = dr.minimum(dr.dot(wi, half), 1)
-        root = dr.sqrt(dr.sqrt(dr.minimum(sin2_h / (1 + dr.maximum(half.z, 0)), 1)))
-        row, a = _cell(2 * root / (1 + root), _ROWS)
-        column, b = _cell(dr.sqrt(dr.maximum(1 - cos_d, 0)), _COLUMNS)
-        slope = wi.z - wo.z
-        product = sin2_h * (1 - cos_d) * (1 + cos_d)
+        row, a = half_cell(sin2_h, half.z)
+        column, b = _difference_cell(cos_d)
         return Coordinates(
             corner=dr.fma(row, _COLUMNS, column),
             weights=((1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b),
-            azimuth=dr.minimum(slope * slope / (4 * dr.maximum(product, 1e-9)), 1),
-            shadow_i=_cell(1 - wi.z, _SHADOW),
-            shadow_o=_cell(1 - wo.z, _SHADOW),
+            azimuth=azimuth(wi.z, wo.z, sin2_h, cos_d),
+            shadow_i=shadow_cell(wi.z),
+            shadow_o=shadow_cell(wo.z),
             cos_o=dr.select(active, wo.z, 0),
             active=active,
         )
@@ -85,15 +83,65 @@ class PackedMaterials:
         base = 2 * dr.fma(index, _ROWS * _COLUMNS, at.corner)
         value = mi.Color3f(0)
         for offset, weight in zip((0, 1, _COLUMNS, _COLUMNS + 1), at.weights, strict=True):
-            zero = _rgb(self.tables, base + 2 * offset, at.active)
-            one = _rgb(self.tables, base + 2 * offset + 1, at.active)
+            zero = load_rgb(self.tables, base + 2 * offset, at.active)
+            one = load_rgb(self.tables, base + 2 * offset + 1, at.active)
             value += weight * dr.fma(at.azimuth, one - zero, zero)
-        for cell, c in (at.shadow_i, at.shadow_o):
-            entry = 2 * dr.fma(index, _SHADOW - 1, cell)
-            lower = _rgb(self.shadowing, entry, at.active)
-            slope = _rgb(self.shadowing, entry + 1, at.active)
-            value *= dr.fma(c, slope, lower)
+        for cell in (at.shadow_i, at.shadow_o):
+            value *= self.shadow(index, cell, at.active)
         return value * at.cos_o
+
+    def shadow(self, index: "mi.UInt32", cell: tuple, active: "mi.Bool | bool" = True) -> "mi.Color3f":
+        """Return the factor S of the materials `index` at a `shadow_cell`."""
+        entry = 2 * dr.fma(index, _SHADOW - 1, cell[0])
+        lower = load_rgb(self.shadowing, entry, mi.Bool(active))
+        slope = load_rgb(self.shadowing, entry + 1, mi.Bool(active))
+        return dr.fma(cell[1], slope, lower)
+
+    def rows(self, index: "mi.UInt32", wi: "mi.Vector3f", directions: "mi.Vector3f") -> list:
+        """Reduce the table of one material to a row over theta_h for each of L light directions seen from one side.
+
+        Args:
+            index: The material.
+            wi: (1) unit vector to the viewer.
+            directions: (L) unit vectors to the lights, any common frame.
+
+        Returns:
+            Six Float arrays (L * 32): RGB at e = 0, then RGB at e = 1.
+        """
+        lane = dr.arange(mi.UInt32, dr.width(directions) * _ROWS)
+        light = lane // _ROWS
+        direction = dr.gather(mi.Vector3f, directions, light)
+        column, b = _difference_cell(dr.minimum(dr.dot(wi, dr.normalize(wi + direction)), 1))
+        corner = 2 * (dr.fma(index, _ROWS, lane - light * _ROWS) * _COLUMNS + column)
+        values = []
+        for azimuth_end in range(2):
+            left = load_rgb(self.tables, corner + azimuth_end, mi.Bool(True))
+            right = load_rgb(self.tables, corner + azimuth_end + 2, mi.Bool(True))
+            values += [left[c] + b * (right[c] - left[c]) for c in range(3)]
+        dr.eval(values)
+        return values
+
+    @staticmethod
+    def eval_row(rows: list, light: "mi.UInt32", cell: tuple, azimuth: "mi.Float") -> "mi.Color3f":
+        """Evaluate T in the rows of `rows` at a `half_cell`, without the factors S and the cosine."""
+        entry = light * _ROWS + cell[0]
+        lower = [dr.gather(mi.Float, row, entry) for row in rows]
+        upper = [dr.gather(mi.Float, row, entry + 1) for row in rows]
+        ends = [low + cell[1] * (high - low) for low, high in zip(lower, upper, strict=True)]
+        return mi.Color3f(*(dr.fma(azimuth, ends[c + 3] - ends[c], ends[c]) for c in range(3)))
+
+    def shadow_row(self, index: "mi.UInt32") -> list:
+        """Return the factor S of one material as six short Float arrays (8): RGB at the cells, and its change."""
+        entry = 2 * dr.fma(index, _SHADOW - 1, dr.arange(mi.UInt32, _SHADOW - 1))
+        values = [*load_rgb(self.shadowing, entry, mi.Bool(True)), *load_rgb(self.shadowing, entry + 1, mi.Bool(True))]
+        dr.eval(values)
+        return values
+
+    @staticmethod
+    def eval_shadow(row: list, cell: tuple) -> "mi.Color3f":
+        """Evaluate S in a `shadow_row` at a `shadow_cell`."""
+        values = [dr.gather(mi.Float, entry, cell[0]) for entry in row]
+        return mi.Color3f(*(dr.fma(cell[1], values[c + 3], values[c]) for c in range(3)))
 
     def eval(
         self, index: "mi.UInt32", wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True
@@ -149,8 +197,7 @@ class PackedMaterials:
         """Return the density per solid angle with which `sample_lobe` draws `wo`; zero below the horizon."""
         active = mi.Bool(active) & (wi.z > 0) & (wo.z > 0)
         half = dr.normalize(wi + wo)
-        root = dr.sqrt(dr.sqrt(dr.minimum(dr.fma(half.x, half.x, half.y * half.y) / (1 + half.z), 1)))
-        cell, _ = _cell(2 * root / (1 + root), _ROWS)
+        cell, _ = half_cell(dr.fma(half.x, half.x, half.y * half.y), half.z)
         start = index * _LOBE
         probability = dr.gather(mi.Float, self.lobes, start, active)
         low = dr.gather(mi.Float, self.lobes, start + 1 + cell, active)
@@ -159,7 +206,28 @@ class PackedMaterials:
         return dr.select(active, dr.lerp(wo.z * dr.inv_pi, lobe, probability), 0)
 
 
-def _rgb(source: "mi.Float", entry: "mi.UInt32", active: "mi.Bool") -> "mi.Color3f":
+def half_cell(sin2_h: "mi.Float", cos_h: "mi.Float") -> tuple:
+    """Return the cell and fraction of theta_h; its sine is what float32 keeps exact near zero."""
+    root = dr.sqrt(dr.sqrt(dr.minimum(sin2_h / (1 + dr.maximum(cos_h, 0)), 1)))
+    return _cell(2 * root / (1 + root), _ROWS)
+
+
+def shadow_cell(cosine: "mi.Float") -> tuple:
+    """Return the cell and fraction of an elevation for the factor S."""
+    return _cell(1 - cosine, _SHADOW)
+
+
+def azimuth(cos_i: "mi.Float", cos_o: "mi.Float", sin2_h: "mi.Float", cos_d: "mi.Float") -> "mi.Float":
+    """Return e = cos^2(phi_d) (see `model.coordinates`)."""
+    product = sin2_h * (1 - cos_d) * (1 + cos_d)
+    return dr.minimum(dr.square(cos_i - cos_o) / (4 * dr.maximum(product, 1e-9)), 1)
+
+
+def _difference_cell(cos_d: "mi.Float") -> tuple:
+    return _cell(dr.sqrt(dr.maximum(1 - cos_d, 0)), _COLUMNS)
+
+
+def load_rgb(source: "mi.Float", entry: "mi.UInt32", active: "mi.Bool") -> "mi.Color3f":
     """Load one RGB entry of four floats.
 
     One packet load on the GPU. On the CPU three plain loads, which are as fast: Dr.Jit compiles a packet load into
@@ -187,6 +255,12 @@ def lobe_distribution(material: Material) -> np.ndarray:
     if probability < 0.01:
         return np.concatenate([[0.0], np.linspace(0, 1, len(height))])
     return np.concatenate([[min(probability, 0.9)], [0.0], np.cumsum(mass) / mass.sum()])
+
+
+def narrow_share(material: Material) -> float:
+    """Return the share of its light that a narrow highlight reflects (see `highlight.share`)."""
+    luminance = np.array([0.2126, 0.7152, 0.0722]) @ material.bivariate[:, :, :4].mean(2)
+    return highlight.share(np.arccos(1 - model.half_knots()), luminance)
 
 
 def register() -> None:
@@ -259,7 +333,7 @@ def _packed_shadowing(material: Material) -> np.ndarray:
     return np.pad(np.stack([knots[:-1], np.diff(knots, axis=0)], 1), ((0, 0), (0, 0), (0, 1)))
 
 
-def _opaque(values: np.ndarray) -> "mi.Float":
+def upload(values: np.ndarray) -> "mi.Float":
     """Upload as a flat float32 array that kernels see as data, not as a literal."""
     array = mi.Float(np.ascontiguousarray(values, np.float32).ravel())
     dr.make_opaque(array)

@@ -6,11 +6,13 @@ python -m render.materials.fitting --networks FILE.npz --compare TABLE.md --publ
 
 import argparse
 import dataclasses
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import yaml
 from tqdm import tqdm
 
 from render.errors import InputError, unknown
@@ -19,6 +21,7 @@ from render.materials import candidates, model, solver, spheres
 from render.materials.categories import category
 from render.materials.model import Material
 from render.materials.network import Brdf, NetworkFile
+from render.materials.spheres import Samples
 from render.seeds import generator
 
 SOURCE = (
@@ -39,33 +42,47 @@ class Fitter:
         lights = spheres.hemisphere_lights(_LIGHTS, generator(seed, "materials", "test"))
         self.test = spheres.sphere_image(_IMAGE_SIZE, lights)
 
-    def fit(self, name: str, brdf: Brdf) -> Material:
+    def fit(
+        self, name: str, brdf: Brdf, *, family: str | None = None, source: str = SOURCE, terms: str = TERMS
+    ) -> Material:
         """Fit one material.
 
         A sample brighter than the metric's clipping level counts by its relative error, as bright as the level, so that
         a mirror peak neither dominates nor is ignored.
 
         Args:
-            name: Its library name, which gives the category.
-            brdf: Function of (N, 3) `wi`, `wo` giving the (N, 3) BRDF in 1/sr; reciprocal.
+            name: Its library name.
+            brdf: Function of (N, 3) `wi`, `wo` giving the (N, 3) BRDF in 1/sr; reciprocal. NaN where it is not known:
+                such pairs are left out of the fit and of its error.
+            family: Its category; by default the one of a MERL material of this name.
+            source: Where the data come from.
+            terms: Terms of use of the data.
 
         Returns:
             The material with tables as written to YAML (rounded), albedo at most 1, and its error on the test sphere.
+
+        Raises:
+            InputError: the BRDF is known nowhere, or zero everywhere.
         """
-        wi, wo = self.samples.wi, self.samples.wo
-        target = brdf(wi, wo)
-        limit = max(spheres.radiance_limit(target, self.samples), 1e-6)
+        target = brdf(self.samples.wi, self.samples.wo)
+        known = np.isfinite(target).all(1)
+        if not target[known].any():
+            raise InputError(f"material {name!r} is black or unknown in every direction: nothing to fit")
+        samples, basis, target = _subset(self.samples, known), self._basis, target[known]
+        if not known.all():
+            basis = solver.Basis(*(rows[known] for rows in vars(basis).values()))
+        limit = max(spheres.radiance_limit(target, samples), 1e-6)
+        cosine = samples.wi[:, 2]
         channels = []
         for channel in target.T:
-            radiance = channel * wi[:, 2]
-            weight = self.samples.weight * (wi[:, 2] * np.minimum(1, limit / np.maximum(radiance, 1e-12))) ** 2
-            channels.append(solver.tables(solver.Channel(self._basis, channel, weight, 1e-4 * limit).solve()))
+            weight = samples.weight * (cosine * np.minimum(1, limit / np.maximum(channel * cosine, 1e-12))) ** 2
+            channels.append(solver.tables(solver.Channel(basis, channel, weight, 1e-4 * limit).solve()))
         bivariate, shadowing, azimuth = (np.stack(tables) for tables in zip(*channels, strict=True))
         fitted = Material(
             name=name,
-            category=category(name),
-            source=SOURCE,
-            terms=TERMS,
+            category=category(name) if family is None else family,
+            source=source,
+            terms=terms,
             bivariate=bivariate,
             shadowing=shadowing,
             azimuth=azimuth,
@@ -74,9 +91,16 @@ class Fitter:
         return dataclasses.replace(fitted, fit_error=round(self.error(fitted, brdf), 4))
 
     def error(self, material: Material, brdf: Brdf) -> float:
-        """Return the relative RMS error of the sphere, `spheres.sphere_error`."""
-        fit = model.evaluate(material, self.test.wi, self.test.wo)
-        return spheres.sphere_error(fit, brdf(self.test.wi, self.test.wo), self.test)
+        """Return the relative RMS error of the sphere, `spheres.sphere_error`, where the BRDF is known."""
+        reference = brdf(self.test.wi, self.test.wo)
+        known = np.isfinite(reference).all(1)
+        test = _subset(self.test, known)
+        return spheres.sphere_error(model.evaluate(material, test.wi, test.wo), reference[known], test)
+
+
+def _subset(samples: Samples, rows: np.ndarray) -> Samples:
+    """Return the samples of a (N,) mask."""
+    return Samples(*(array[rows] for array in vars(samples).values()))
 
 
 def conserve_energy(material: Material, limit: float = 0.999) -> Material:
@@ -115,8 +139,8 @@ def rounded(material: Material) -> Material:
 
 def to_yaml(material: Material) -> str:
     """Write a material as YAML: one row of a table a line, a block of rows per colour channel."""
-    lines = [f"{key}: {getattr(material, key)}" for key in ("name", "category", "fit_error", "model")]
-    lines += [f'{key}: "{getattr(material, key)}"' for key in ("source", "terms")]
+    lines = [f"{key}: {_plain(getattr(material, key))}" for key in ("name", "category", "fit_error", "model")]
+    lines += [f"{key}: {json.dumps(getattr(material, key))}" for key in ("source", "terms")]
     lines.append("# (rgb, theta_h, theta_d) in 1/sr; render/materials/model.py explains the tables")
     for field, digits in (("bivariate", ".4g"), ("azimuth", ".2f")):
         lines.append(f"{field}:")
@@ -126,6 +150,11 @@ def to_yaml(material: Material) -> str:
     lines.append("shadowing:")
     lines += [f"- [{', '.join(f'{value:.4g}' for value in channel)}]" for channel in material.shadowing]
     return "\n".join(lines) + "\n"
+
+
+def _plain(value: str | float) -> str:
+    """Return a scalar as YAML, in quotes only where it would be read as something else."""
+    return str(value) if yaml.safe_load(str(value)) == value else json.dumps(value)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

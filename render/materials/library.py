@@ -1,16 +1,28 @@
-"""The materials by name: 100 fitted MERL materials, Lambertian of any albedo, and YAML files of the user."""
+"""The materials by name: 100 fitted MERL materials, Lambertian of any albedo, and files of the user.
 
+A file is a fitted material (YAML), a MERL table (`.binary`) or an RGL tensor file (`.bsdf`).
+"""
+
+import os
 from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import yaml
 
 from render import config
 from render.errors import InputError, unknown
+from render.materials import merl
+from render.materials.merl import MerlTable
 from render.materials.model import Material, directional_albedo, lambertian
 
+if TYPE_CHECKING:
+    from render.materials.rgl import RglMaterial
+
+AnyMaterial: TypeAlias = "Material | MerlTable | RglMaterial"
+FILES = ".yaml (fitted), .binary (MERL) or .bsdf (RGL)"
 _ALBEDO_COSINES = np.linspace(0.05, 1, 8)
 
 
@@ -33,21 +45,44 @@ def categories() -> dict[str, list[str]]:
     return {key: groups[key] for key in sorted(groups)}
 
 
-def load(name_or_path: str | Path) -> Material:
+def load(name_or_path: str | Path) -> AnyMaterial:
     """Return a material.
 
     Args:
         name_or_path: A name from `names()`; `lambertian:0.5` or `lambertian:0.8/0.3/0.1` (linear RGB albedo); or the
-            path of a YAML file of the same form as the built-in ones, ending in `.yaml` or `.yml`.
+            path of a file: `.yaml` or `.yml` of the same form as the built-in ones, `.binary` of the MERL database, or
+            `.bsdf` of the RGL database. Measured files are taken as they are, whatever their albedo.
 
     Raises:
-        InputError: an unknown name (with the nearest), an albedo outside (0, 1], or a file that is not a material,
-            naming the file and the field.
+        InputError: an unknown name (with the nearest), an albedo outside (0, 1], a file of another kind, or one that
+            is not a material, naming the file and the field.
     """
     text = str(name_or_path)
-    if text.endswith((".yaml", ".yml")):
+    suffix = Path(text).suffix.lower()
+    if suffix in (".yaml", ".yml"):
         return _user_material(text)
+    if suffix in (merl.SUFFIX, ".bsdf"):
+        return _measured(text, _changed(text))
+    if text not in _names() and (Path(text).is_file() or (os.sep in text and ":" not in text)):
+        raise InputError(f"{text}: a material file must end in {FILES}")
     return _builtin(text)
+
+
+@lru_cache(maxsize=16)
+def _measured(path: str, changed: int) -> "MerlTable | RglMaterial":
+    """Read a measured file; `changed` is the time of its last change, so that a rewritten one is read again."""
+    if path.lower().endswith(merl.SUFFIX):
+        return merl.read(path)
+    from render.materials import rgl
+
+    return rgl.load(path)
+
+
+def _changed(path: str) -> int:
+    try:
+        return os.stat(path).st_mtime_ns
+    except OSError:
+        return 0  # reading it tells why
 
 
 @lru_cache(maxsize=256)
@@ -56,7 +91,7 @@ def _builtin(name: str) -> Material:
     if kind == "lambertian":
         return _lambertian(name, value)
     if separator or name not in _names():
-        raise unknown("material", name, [*_names(), "lambertian:0.5"], "or give the path of a .yaml file")
+        raise unknown("material", name, [*_names(), "lambertian:0.5"], f"or give the path of a file ending in {FILES}")
     text = resources.files("assets").joinpath("materials", f"{name}.yaml").read_text(encoding="utf-8")
     return config.build(Material, yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)))
 

@@ -1,0 +1,140 @@
+"""`sdps data preview`: contact sheets and one self-contained page that shows what a data folder holds."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pipelines import pictures, preview_page
+from render.composition import components, compose
+from render.errors import InputError
+from render.files import atomic_path, write_text
+from render.manifest import SceneSpec, read_manifest
+from render.progress import progress_bar
+from render.shards import Shard, read_shard
+from render.validation_stats import SceneStatistics, measure, slants
+
+PER_SHEET = 24  # scenes of one contact sheet
+ON_PAGE = 48  # most scenes shown on the page, so that it stays small
+MEASURED = 120  # shards read for the histograms, besides those shown
+SIDE = 128  # pixels of a picture's side
+SLANTS = 400  # normals per shard in the slant histogram
+
+
+@dataclass
+class Sample:
+    """What is kept of the shards that were read: pictures, captions and measures, never a shard.
+
+    Attributes:
+        tiles: (scene, strip) of the scenes that are shown.
+        statistics: Measures of every shard read.
+        slants: (N,) angles of normals to the viewing axis, degrees.
+        damaged: Ids of shards that could not be read.
+    """
+
+    tiles: list[tuple[SceneSpec, np.ndarray]] = field(default_factory=list)
+    statistics: list[SceneStatistics] = field(default_factory=list)
+    slants: list[np.ndarray] = field(default_factory=list)
+    damaged: list[str] = field(default_factory=list)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps data preview`."""
+    parser.add_argument("folder", type=Path, help="data folder (the one with manifest.jsonl)")
+    parser.add_argument("--count", type=int, default=PER_SHEET, help=f"scenes to show (default: {PER_SHEET})")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Write the sheets and the page, and say where they are."""
+    written = preview(args.folder, args.count)
+    sys.stdout.write("".join(f"{path}\n" for path in written))
+    return 0
+
+
+def preview(folder: str | Path, count: int = PER_SHEET) -> list[Path]:
+    """Write `preview.png` (or `preview-000.png`, ... for more than 24 scenes) and `preview.html` into the folder.
+
+    Scenes that are not rendered yet, and shards that cannot be read, are left out and told on the page.
+
+    Args:
+        folder: Data folder with a manifest.
+        count: Scenes to show, spread evenly over those that are there.
+
+    Raises:
+        InputError: not a data folder, or nothing rendered in it.
+    """
+    folder = Path(folder)
+    if count < 1:
+        raise InputError(f"--count must be at least 1, got {count}")
+    scenes = read_manifest(folder)
+    there = [scene for scene in scenes if (folder / scene.file).is_file()]
+    if not there:
+        raise InputError(f"{folder}: no shard is there yet; run `sdps render-data` first")
+    sample = read_sample(folder, there, count)
+    if not sample.tiles:
+        raise InputError(f"{folder}: none of the {len(sample.damaged)} shards read is whole; run `sdps data validate`")
+    written = write_sheets(folder, sample.tiles)
+    page = preview_page.render(folder, scenes, there, compose(scenes), sample, shown=sample.tiles[:: _stride(sample)])
+    write_text(folder / "preview.html", page)
+    return [*written, folder / "preview.html"]
+
+
+def _stride(sample: Sample) -> int:
+    return -(-len(sample.tiles) // ON_PAGE)
+
+
+def read_sample(folder: Path, there: Sequence[SceneSpec], count: int) -> Sample:
+    """Read the scenes to be shown, and some more for the histograms, one shard at a time."""
+    shown = {there[place].id for place in _spread(len(there), count)}
+    places = np.union1d(_spread(len(there), count), _spread(len(there), MEASURED))
+    sample = Sample()
+    for place in progress_bar(places, unit="shard", desc="preview"):
+        scene = there[place]
+        try:
+            shard = read_shard(folder / scene.file, scene)
+        except InputError:
+            sample.damaged.append(scene.id)
+            continue
+        sample.statistics.append(measure(shard, (folder / scene.file).stat().st_size))
+        sample.slants.append(_some(slants(shard)))
+        if scene.id in shown:
+            sample.tiles.append((scene, strip(shard)))
+    return sample
+
+
+def _spread(length: int, count: int) -> np.ndarray:
+    """Return up to `count` places spread evenly over `range(length)`."""
+    return np.unique(np.linspace(0, length - 1, min(count, length)).round().astype(int))
+
+
+def _some(values: np.ndarray) -> np.ndarray:
+    return values[:: max(1, len(values) // SLANTS)]
+
+
+def strip(shard: Shard) -> np.ndarray:  # (128, 512, 3) uint8
+    """Show the normals and three images (or the material weights and two) under one exposure, at most 128 high."""
+    picture = pictures.preview_strip(shard, lights=3)
+    return pictures.fitted(picture, SIDE)
+
+
+def caption(scene: SceneSpec) -> str:
+    """Name a scene shortly: its shape's family, and its material or materials."""
+    shape = scene.shape if len(scene.shape) < 20 else scene.shape.split(":")[0]
+    return f"{shape}, {' + '.join(components(scene.material))}"
+
+
+def write_sheets(folder: Path, tiles: Sequence[tuple[SceneSpec, np.ndarray]]) -> list[Path]:
+    """Write the contact sheets, and remove those of an earlier preview that are not written again."""
+    pages = [tiles[first : first + PER_SHEET] for first in range(0, len(tiles), PER_SHEET)]
+    names = ["preview.png"] if len(pages) == 1 else [f"preview-{number:03d}.png" for number in range(len(pages))]
+    for name, page in zip(names, pages, strict=True):
+        labelled = [(caption(scene)[:80], picture) for scene, picture in page]
+        with atomic_path(folder / name) as temporary:
+            pictures.contact_sheet(labelled, columns=min(2, len(labelled))).save(temporary, optimize=True)
+    for old in [folder / "preview.png", *folder.glob("preview-[0-9][0-9][0-9].png")]:
+        if old.name not in names:
+            old.unlink(missing_ok=True)
+    return [folder / name for name in names]

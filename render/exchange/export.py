@@ -1,0 +1,160 @@
+"""Shards into another layout, scene by scene: each folder whole or absent, resumable, with a record of it all."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from render.errors import InputError, unknown
+from render.exchange.folders import MARKER, RECORD, atomic_folder, claim, read_record
+from render.exchange.layouts import LAYOUTS, Layout
+from render.exchange.names import Place
+from render.exchange.samples import ExportOptions, prepare
+from render.files import write_json
+from render.manifest import MANIFEST, SceneSpec, read_manifest
+from render.progress import progress_bar
+from render.shards import file_hash, read_shard
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What an export did: scenes written now, scenes that were there, and the record of every scene in the tree."""
+
+    written: int
+    kept: int
+    scenes: dict[str, dict[str, Any]]
+
+    def worst(self, field: str) -> tuple[float, float, str]:
+        """Return mean and maximum of the shares `clipped` or `black`, and the scene that has the maximum."""
+        shares = {name: scene[field] for name, scene in self.scenes.items()}
+        worst = max(shares, key=shares.__getitem__)
+        return float(np.mean(list(shares.values()))), shares[worst], worst
+
+
+def export(folder: str | Path, out: str | Path, options: ExportOptions, scenes: Sequence[SceneSpec]) -> ExportReport:
+    """Write `scenes` of a data folder to `out`; those that are there already are skipped.
+
+    Args:
+        folder: Data folder.
+        out: Root of the tree; new, empty, or from an earlier export with the same options.
+        options: How.
+        scenes: What, from the folder's manifest (`select`).
+
+    Raises:
+        InputError: a missing or damaged shard, a foreign or differing tree in `out`, or a full disk. Scenes that were
+            finished stay; the lists that name them are written last.
+    """
+    folder, root, layout = Path(folder), Path(out), LAYOUTS[options.layout]
+    planned = read_manifest(folder)
+    _check_shards(folder, scenes)
+    record = options.settings() | {"manifest": file_hash(folder / MANIFEST), "versions": _versions()}
+    places = layout.places(planned)
+    chosen = {scene.id for scene in scenes}
+    there = [scene for scene in planned if scene.id in chosen or _marker(root, layout, places[scene.id], scene)]
+    _check_lights(folder, there, options)
+    claim(root, record)
+    written = 0
+    with progress_bar(scenes, unit="scene", desc=f"export {options.layout}") as bar:
+        for scene in bar:
+            place = places[scene.id]
+            if _marker(root, layout, place, scene) is None:
+                _write_scene(folder, root, scene, place, options)
+                written += 1
+    done = [(scene, places[scene.id]) for scene in planned]
+    markers = {scene.id: _marker(root, layout, place, scene) for scene, place in done}
+    done = [(scene, place) for scene, place in done if markers[scene.id]]
+    layout.lists(root, done)
+    found = {scene.id: _entry(layout, place, markers[scene.id]) for scene, place in done}
+    write_json(root / RECORD, record | {"scenes": found})
+    return ExportReport(written, len(scenes) - written, found)
+
+
+def select(
+    scenes: Sequence[SceneSpec], *, ids: Sequence[str] = (), split: str | None = None, limit: int | None = None
+) -> list[SceneSpec]:
+    """Choose scenes by id and split, then the first `limit` of them.
+
+    Raises:
+        InputError: an id that is not planned, or nothing left.
+    """
+    known = {scene.id for scene in scenes}
+    for name in ids:
+        if name not in known:
+            raise unknown("scene", name, known)
+    wanted = set(ids) or known
+    chosen = [scene for scene in scenes if scene.id in wanted and split in (None, scene.split)]
+    if limit is not None and limit < 1:
+        raise InputError(f"--limit must be at least 1, got {limit}")
+    if not chosen:
+        raise InputError(f"no scene of {len(scenes)} is left by --ids and --split; choose others")
+    return chosen[:limit]
+
+
+def _check_shards(folder: Path, scenes: Sequence[SceneSpec]) -> None:
+    """Refuse scenes without a shard before anything is written."""
+    missing = [scene.id for scene in scenes if not (folder / scene.file).is_file()]
+    if missing:
+        raise InputError(
+            f"{folder}: {len(missing)} of {len(scenes)} shards are missing, the first is {missing[0]!r}; finish the "
+            "folder with `sdps render-data` or pass --skip-missing"
+        )
+
+
+def _check_lights(folder: Path, scenes: Sequence[SceneSpec], options: ExportOptions) -> None:
+    """Refuse numbers of lights the layout cannot hold."""
+    counts = {len(scene.lights) for scene in scenes}
+    if options.layout == "diligent" and len(counts) > 1:
+        raise InputError(
+            f"{folder}: scenes have from {min(counts)} to {max(counts)} lights, but a DiLiGenT root has one names.txt "
+            "for all; export them to folders of their own with --ids"
+        )
+    if options.layout == "psfcn" and min(counts) < 2:
+        raise InputError(f"{folder}: a scene has one light, but PS-FCN's loaders need at least two")
+
+
+def scene_folder(root: Path, layout: Layout, place: Place) -> Path:
+    """Return the folder of a scene in the tree at `root`."""
+    return root / layout.base / layout.folder(place)
+
+
+def _marker(root: Path, layout: Layout, place: Place, scene: SceneSpec) -> dict[str, Any] | None:
+    """Return the record in a scene's folder, None where the scene is missing or from another manifest line."""
+    path = scene_folder(root, layout, place) / MARKER
+    if not path.is_file():
+        return None
+    marker = read_record(path)
+    return marker if marker.get("spec") == scene.digest() else None
+
+
+def _write_scene(folder: Path, root: Path, scene: SceneSpec, place: Place, options: ExportOptions) -> None:
+    """Write one scene's folder, its record with it."""
+    layout, source = LAYOUTS[options.layout], folder / scene.file
+    sample, facts = prepare(read_shard(source, scene), scene, options)
+    marker = {"id": scene.id, "shape": scene.shape, "material": scene.material, "split": scene.split} | facts
+    marker |= {"bits": options.settings()["bits"], "sha256": file_hash(source), "spec": scene.digest()}
+    if options.layout == "unips":
+        marker |= {
+            "light_directions": sample.directions.tolist(),
+            "light_intensities": sample.intensities.tolist(),
+        }
+    final = scene_folder(root, layout, place)
+    with atomic_folder(final) as temporary:
+        layout.write(temporary, final, place, sample)
+        (temporary / MARKER).write_text(json.dumps(marker) + "\n", encoding="utf-8")
+
+
+def _entry(layout: Layout, place: Place, marker: dict[str, Any]) -> dict[str, Any]:
+    """Return a scene's line in the record of the tree."""
+    folder = f"{layout.base}/{layout.folder(place)}".lstrip("/")
+    kept = ("shape", "material", "split", "exposure", "clipped", "black", "sha256", "spec")
+    return {"folder": folder} | {key: marker[key] for key in kept}
+
+
+def _versions() -> dict[str, str]:
+    """Return the versions of what wrote the tree."""
+    return {"sdps": metadata.version("sdps"), "numpy": np.__version__, "opencv": cv2.__version__}

@@ -1,0 +1,229 @@
+"""PS-FCN trees and DiLiGenT folders into a data folder that the trainer and the tools read like a rendered one.
+
+What the source does not tell is not made up: depth is zero, coverage is the mask, samples and seed are zero, and each
+shard's provenance says so. Radiance is per unit light intensity; its absolute scale is known only where our own export
+left a record.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from render.config import to_plain
+from render.errors import InputError, unknown
+from render.exchange import frame
+from render.exchange.diligent import diligent_sources
+from render.exchange.folders import read_record
+from render.exchange.names import legal_name, unique_names
+from render.exchange.psfcn import psfcn_sources
+from render.exchange.sources import Source, Truth
+from render.files import write_json
+from render.manifest import MANIFEST, SceneSpec, View, read_manifest, write_manifest
+from render.progress import progress_bar
+from render.shards import Shard, is_whole, to_half, write_shard
+
+RECORD = "import.json"
+READERS: Mapping[str, Callable[[Path], list[Source]]] = {"psfcn": psfcn_sources, "diligent": diligent_sources}
+SIZE_MULTIPLE = 4  # the normal networks halve the image twice
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """How a foreign tree becomes shards.
+
+    Attributes:
+        layout: A name of `READERS`.
+        split: Split of all scenes; None takes the lists' (PS-FCN) or `test` (DiLiGenT).
+        crop: Margin in pixels around the mask's bounding box, whose sides are rounded up to multiples of 4; None keeps
+            the whole image.
+        y_down: Normals and lights of the source have y pointing down; both are turned.
+        limit: Only the first so many samples.
+    """
+
+    layout: str
+    split: Literal["train", "val", "test"] | None = None
+    crop: int | None = None
+    y_down: bool = False
+    limit: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.layout not in READERS:
+            raise unknown("layout", self.layout, READERS)
+        if self.split not in (None, "train", "val", "test"):
+            raise unknown("split", str(self.split), ("train", "val", "test"))
+        if self.crop is not None and self.crop < 0:
+            raise InputError(f"crop must be a margin of 0 pixels or more, got {self.crop}")
+        if self.limit is not None and self.limit < 1:
+            raise InputError(f"limit must be at least 1, got {self.limit}")
+
+
+class Box(NamedTuple):
+    """Part of an image; it may reach beyond the lower and right border, where zeros are filled in."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+    def cut(self, array: np.ndarray, axis: int = 0) -> np.ndarray:
+        """Cut the box out of the rows and columns at `axis` and `axis + 1`."""
+        rows, columns = slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
+        part = array[(slice(None),) * axis + (rows, columns)]
+        pad = [(0, 0)] * array.ndim
+        pad[axis] = (0, self.height - part.shape[axis])
+        pad[axis + 1] = (0, self.width - part.shape[axis + 1])
+        return np.pad(part, pad)
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What an import did: shards written now, shards that were there, scenes, and suspicions by scene id."""
+
+    written: int
+    kept: int
+    scenes: list[SceneSpec]
+    suspicions: dict[str, list[str]]
+
+
+def ingest(tree: str | Path, out: str | Path, options: ImportOptions) -> ImportReport:
+    """Turn the samples of `tree` into shards and a manifest in `out`; whole shards that are there are kept.
+
+    Args:
+        tree: Root of the tree.
+        out: Data folder; new, empty, or from an earlier import of the same samples.
+        options: How.
+
+    Raises:
+        InputError: a malformed tree, another content in `out`, or a full disk. Finished shards stay.
+    """
+    tree, out = Path(tree), Path(out)
+    if not tree.is_dir():
+        raise InputError(f"{tree}: no such folder; give the root of a {options.layout} tree")
+    sources = READERS[options.layout](tree)[: options.limit]
+    boxes = [_box(source.truth().mask, options.crop) for source in sources]
+    scenes = _scenes(sources, boxes, options)
+    _claim(out, scenes)
+    written = 0
+    suspicions = read_record(out / RECORD).get("suspicions", {}) if (out / RECORD).is_file() else {}
+    items = list(zip(sources, boxes, scenes, strict=True))
+    with progress_bar(items, unit="scene", desc=f"import {options.layout}") as bar:
+        for source, box, scene in bar:
+            if is_whole(out / scene.file, scene):
+                continue
+            shard, found = _shard(source, box, scene, options)
+            write_shard(out / scene.file, shard)
+            written += 1
+            if found:
+                suspicions[scene.id] = found
+    record = to_plain(options) | {"source": tree.resolve().name, "scenes": len(scenes), "suspicions": suspicions}
+    write_json(out / RECORD, record)
+    return ImportReport(written, len(scenes) - written, scenes, suspicions)
+
+
+def _scenes(sources: Sequence[Source], boxes: Sequence[Box], options: ImportOptions) -> list[SceneSpec]:
+    """Describe each sample as a manifest line; fields only a renderer has are zero."""
+    scenes = []
+    ids = unique_names([_scene_id(source) for source in sources])
+    for name, source, box in zip(ids, sources, boxes, strict=True):
+        directions = _directions(source, options)
+        scenes.append(
+            SceneSpec(
+                id=name,
+                seed=0,
+                split=options.split or source.split,
+                shape=f"imported:{source.shape}",
+                material=f"imported:{source.material}",
+                view=View(),
+                lights=tuple(tuple(float(c) for c in row) for row in directions.round(8)),
+                size=box.height if box.height == box.width else (box.height, box.width),
+                spp=0,
+                bounces=0,
+            )
+        )
+    return scenes
+
+
+def _scene_id(source: Source) -> str:
+    """Name a scene after its sample; `_` parts shape and material."""
+    if source.material == source.shape:
+        return legal_name(source.shape)
+    return f"{legal_name(source.shape)}_{legal_name(source.material)}"
+
+
+def _directions(source: Source, options: ImportOptions) -> np.ndarray:  # (L, 3) float64
+    """Return unit directions in our frame."""
+    directions = source.directions * (1.0, -1.0 if options.y_down else 1.0, 1.0)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _box(mask: np.ndarray, margin: int | None) -> Box:
+    """Return the mask's bounding box with its margin, its sides rounded up to multiples of 4."""
+    height, width = mask.shape
+    if margin is None:
+        return Box(0, 0, height, width)
+    sides = []
+    for axis, extent in enumerate((height, width)):
+        places = np.nonzero(mask.any(1 - axis))[0]
+        low, high = max(int(places[0]) - margin, 0), min(int(places[-1]) + 1 + margin, extent)
+        length = -(-(high - low) // SIZE_MULTIPLE) * SIZE_MULTIPLE
+        sides.append((max(min(low, extent - length), 0), length))
+    return Box(sides[0][0], sides[1][0], sides[0][1], sides[1][1])
+
+
+def _shard(source: Source, box: Box, scene: SceneSpec, options: ImportOptions) -> tuple[Shard, list[str]]:
+    """Read one sample; also tell what looks flipped in it."""
+    truth = source.truth()
+    images, bits = source.stack(truth.mask.shape)
+    exposure = source.exposure()
+    images = box.cut(images, 1) / np.float32(exposure or 1.0)
+    normals, mask = box.cut(truth.normals), box.cut(truth.mask)
+    if options.y_down:
+        normals = normals * np.float32([1.0, -1.0, 1.0])
+    found = frame.faults(images, normals, mask, scene.light_directions())
+    provenance = _provenance(source, truth, box, scene, options, bits, exposure)
+    shard = Shard(
+        scene_id=scene.id,
+        images=to_half(images),
+        normals=normals,
+        depth=np.zeros(mask.shape, np.float32),
+        mask=mask,
+        coverage=mask.astype(np.float32),
+        light_directions=scene.light_directions(),
+        provenance=provenance | {"frame_check": "; ".join(found) or "passed"},
+    )
+    return shard, found
+
+
+def _provenance(
+    source: Source, truth: Truth, box: Box, scene: SceneSpec, options: ImportOptions, bits: int, exposure: float | None
+) -> dict[str, str | int | float]:
+    """Say where the scene comes from and what of it is unknown."""
+    return {
+        "spec": scene.digest(),
+        "shape": scene.shape,
+        "material": scene.material,
+        "imported_from": options.layout,
+        "source": source.where,
+        "source_sha256": source.digest(),
+        "source_bits": bits,
+        "irradiance": "relative: full scale / light intensity = 1" if exposure is None else "pi",
+        "frame": "x right, y up, z to the camera" + (" (source: y down)" if options.y_down else ""),
+        "normals": truth.origin.name,
+        "depth": "unknown, zeros",
+        "coverage": "unknown, the mask",
+        "crop": f"top {box.top}, left {box.left}, of {truth.mask.shape[0]}x{truth.mask.shape[1]}",
+    }
+
+
+def _claim(out: Path, scenes: Sequence[SceneSpec]) -> None:
+    """Start a data folder, or make sure that the one there holds the same scenes."""
+    if (out / MANIFEST).is_file():
+        if read_manifest(out) != list(scenes):
+            raise InputError(f"{out / MANIFEST}: holds other scenes; remove the folder or choose another --out")
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is not empty and has no {MANIFEST}; choose another --out")
+    else:
+        write_manifest(out, scenes)

@@ -1,0 +1,97 @@
+"""How a shard becomes pictures: random intensities, exposure, rounding."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from render.errors import InputError, unknown
+from render.exchange.images import quantise
+from render.exchange.layouts import LAYOUTS, Sample
+from render.manifest import SceneSpec
+from render.seeds import generator
+from render.shards import Shard
+
+INTENSITY_RANGE = (0.2, 2.0)
+"""Range of random intensities (SDPS-Net, section 5.1)."""
+
+_AUTO_CLIPPED = {8: 0.01, 16: 0.001}
+"""Share of the object's values `auto` lets clip; 16 bits have room below for more highlight."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """How shards become pictures.
+
+    Attributes:
+        layout: A name of `LAYOUTS`.
+        bits: 8 or 16 per channel; the layout's own by default.
+        exposure: Factor on radiance, 1 maps a white Lambertian surface that faces its light to full scale; `auto`
+            picks it per scene so that 1 % (8 bits) or 0.1 % (16 bits) of the object's values clip.
+        intensities: `unit`, or `seed`: one per image, uniform in [0.2, 2), drawn from the scene's own seed.
+    """
+
+    layout: str
+    bits: int | None = None
+    exposure: float | Literal["auto"] | None = None
+    intensities: Literal["unit", "seed"] = "unit"
+
+    def __post_init__(self) -> None:
+        if self.layout not in LAYOUTS:
+            raise unknown("layout", self.layout, LAYOUTS)
+        layout = LAYOUTS[self.layout]
+        if self.bits is not None and self.bits not in layout.bits:
+            allowed = " or ".join(map(str, layout.bits))
+            raise InputError(f"bits must be {allowed} for layout {self.layout}, got {self.bits}")
+        if isinstance(self.exposure, str) and self.exposure != "auto":
+            raise InputError(f"exposure must be a positive number or 'auto', got {self.exposure!r}")
+        if isinstance(self.exposure, int | float) and not 0 < self.exposure < float("inf"):
+            raise InputError(f"exposure must be a positive number or 'auto', got {self.exposure}")
+        if self.intensities not in ("unit", "seed"):
+            raise unknown("value for intensities:", str(self.intensities), ("unit", "seed"))
+        if self.intensities != "unit" and not layout.intensities:
+            raise InputError(f"layout {self.layout} has no file for intensities; leave them at 'unit'")
+
+    def settings(self) -> dict[str, Any]:
+        """Return the options with the layout's defaults filled in."""
+        layout = LAYOUTS[self.layout]
+        return {
+            "layout": self.layout,
+            "bits": self.bits or layout.bits[0],
+            "exposure": layout.exposure if self.exposure is None else self.exposure,
+            "intensities": self.intensities,
+        }
+
+
+def prepare(shard: Shard, scene: SceneSpec, options: ExportOptions) -> tuple[Sample, dict[str, Any]]:
+    """Apply intensities and exposure and round to integers.
+
+    Returns:
+        The sample; its exposure, the share of the object's values that clip, and of its positive ones that round to 0.
+    """
+    settings = options.settings()
+    count = len(shard.images)
+    intensities = np.ones(count)
+    if options.intensities == "seed":
+        intensities = generator(scene.seed, "export", scene.id, "intensities").uniform(*INTENSITY_RANGE, count).round(6)
+    values = shard.images.astype(np.float32) * intensities[:, None, None, None].astype(np.float32)
+    inside = values[:, shard.mask]
+    exposure = settings["exposure"]
+    if exposure == "auto":
+        level = (
+            float(np.quantile(inside, 1.0 - _AUTO_CLIPPED[settings["bits"]], method="higher")) if inside.size else 0.0
+        )
+        exposure = float(f"{1.0 / level:.6g}") if level > 0 else 1.0
+    step = 0.5 / (2 ** settings["bits"] - 1)  # what rounds to full scale, or to the first code, is not lost
+    exposed = inside * np.float32(exposure)
+    clipped, black = (
+        float(lost.mean()) if lost.size else 0.0 for lost in (exposed > 1.0 + step, exposed[inside > 0] < step)
+    )
+    sample = Sample(
+        pixels=quantise(values * np.float32(exposure), settings["bits"]),
+        normals=shard.normals,
+        mask=shard.mask,
+        directions=np.asarray(scene.lights, np.float64).reshape(-1, 3),
+        intensities=intensities,
+    )
+    return sample, {"exposure": exposure, "clipped": round(clipped, 6), "black": round(black, 6)}

@@ -1,0 +1,84 @@
+"""Surfaces by name: one material everywhere, or several in a seeded pattern.
+
+A spatially-varying surface is named `<pattern>:<seed>:<material>+<material>[+...]`, for instance
+`stripes:7:chrome+blue-fabric`. Its BRDF is sum_k w_k(x) f_k with weights w_k >= 0 that sum to 1 at every point x of the
+object, so the pattern turns with the object and takes part in interreflections.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from render.errors import InputError, unknown
+from render.materials import library
+
+PATTERNS = {
+    "patches": "cells around random points, sharp edges",
+    "stripes": "warped bands, sharp edges",
+    "noise": "smooth random regions that blend into each other",
+    "gradient": "a slow change from one material to the next along a direction",
+    "parts": "the separate pieces of a mesh, or large regions of one that is in one piece",
+}
+MOST_COMPONENTS = 8
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Where which material lies: kind, seed and number of materials."""
+
+    kind: str
+    seed: int
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What covers an object.
+
+    Attributes:
+        name: As given to `load`.
+        components: Materials of the pattern, or the only one.
+        pattern: None for a single material.
+    """
+
+    name: str
+    components: tuple[Any, ...]
+    pattern: Pattern | None = None
+
+    @property
+    def component_names(self) -> tuple[str, ...]:
+        """Names of the components, as `library.load` takes them."""
+        return split(self.name)[1]
+
+
+def split(name: str) -> tuple[Pattern | None, tuple[str, ...]]:
+    """Split a name into its pattern, if it has one, and the names of its materials; nothing is loaded.
+
+    Raises:
+        InputError: a malformed pattern, naming the part.
+    """
+    kind, _, rest = name.partition(":")
+    if kind not in PATTERNS:
+        head, separator, _ = rest.partition(":")
+        if separator and "+" in rest and head.isdigit():
+            raise unknown("pattern", kind, PATTERNS)
+        return None, (name,)
+    seed, separator, materials = rest.partition(":")
+    if not separator or not seed.isdigit():
+        raise InputError(f"surface {name!r}: expected {kind}:<seed>:<material>+<material>, e.g. {kind}:7:chrome+nylon")
+    names = tuple(part.strip() for part in materials.split("+"))
+    if not 2 <= len(names) <= MOST_COMPONENTS or not all(names):
+        raise InputError(f"surface {name!r}: name 2 to {MOST_COMPONENTS} materials joined by +, got {materials!r}")
+    return Pattern(kind, int(seed), len(names)), names
+
+
+def load(name: str) -> Surface:
+    """Load a surface.
+
+    Args:
+        name: Anything `library.load` takes, or `<pattern>:<seed>:<material>+<material>[+...]`.
+
+    Raises:
+        InputError: an unknown pattern or material (with the nearest), or a file that cannot be read.
+    """
+    pattern, names = split(str(name))
+    return Surface(str(name), tuple(library.load(part) for part in names), pattern)
