@@ -231,7 +231,9 @@ def _drawn(scene: Any, camera: Any, halves: Any, candidates: _Candidates, chosen
 
     A light's normals are a rotated Hammersley set of its own for every triangle.
     """
-    pair, number = chosen
+    # Gathered by an index it cannot see through, since Dr.Jit compiles plain loads by the alignment of NumPy's memory.
+    lane = dr.arange(mi.UInt32, dr.width(chosen[0])) + opaque(mi.UInt32(0))
+    pair, number = (dr.gather(mi.UInt32, value, lane) for value in chosen)
     prim, light = dr.gather(mi.UInt32, candidates.triangle, pair), dr.gather(mi.UInt32, candidates.light, pair)
     half = dr.gather(mi.Vector3f, halves, light)
     turn = mi.sample_tea_32(prim * mi.UInt32(0x9E3779B1) + light, seed)

@@ -202,6 +202,11 @@ def _segments(sample: Any, spp: int, pixel_count: int) -> tuple:
     dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), sample // opaque(mi.UInt32(spp)))
     starts = dr.prefix_sum(counts)
     pixels = dr.compress(counts > 0)
+    if len(pixels) == 1:  # for the reason given in `trace`: beside it, another pixel without vertices
+        only = int(pixels[0])
+        return (
+            mi.UInt32([only, (only + 1) % pixel_count]), mi.UInt32([0, 0]), mi.UInt32([dr.width(sample), 0])
+        )  # fmt: skip
     start, length = dr.gather(mi.UInt32, starts, pixels), dr.gather(mi.UInt32, counts, pixels)
     dr.eval(start, length)
     return pixels, start, length
