@@ -8,6 +8,7 @@ SHAPES ?= sphere,bunny
 MATERIALS ?= gold-metallic-paint,chrome,lambertian:0.5
 LIGHTS ?= merltest
 SET ?=
+MITSUBA ?=
 
 VENV := .venv
 SDPS := $(VENV)/bin/sdps
@@ -15,13 +16,15 @@ READY := $(VENV)/.ready
 ASSETS_READY := $(VENV)/.assets-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
-.PHONY: help setup doctor render-data train eval-merltest regenerate demo test test-slow lint bench clean
+.PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
+	regenerate demo test test-slow lint bench clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo | test | lint | bench | doctor"
 	@echo "make render-data | train | eval-merltest   PRESET=smoke|demo|small|paper OUT=folder SET='section.field=value ...'"
-	@echo "make regenerate   SHAPES=bunny MATERIALS=chrome,lambertian:0.5 LIGHTS=merltest OUT=folder"
+	@echo "make data-plan | data-status | data-validate | data-preview | data-card   PRESET=... OUT=folder"
+	@echo "make regenerate   SHAPES=bunny MATERIALS=chrome,lambertian:0.5 LIGHTS=merltest OUT=folder [MITSUBA=1]"
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -42,10 +45,16 @@ doctor: $(READY)
 render-data train eval-merltest: $(ASSETS_READY)
 	$(SDPS) $@ --preset $(PRESET) --out $(OUT) $(SETTINGS)
 
+data-plan: $(ASSETS_READY)
+	$(SDPS) data plan --preset $(PRESET) --out $(OUT) $(SETTINGS)
+
+data-status data-validate data-preview data-card: $(READY)
+	$(SDPS) data $(@:data-%=%) $(OUT)/data
+
 regenerate: OUT = out/regenerated
 regenerate: $(ASSETS_READY)
 	$(SDPS) regenerate --preset $(PRESET) --shapes '$(SHAPES)' --materials '$(MATERIALS)' --lights '$(LIGHTS)' \
-		--out $(OUT) $(SETTINGS)
+		--out $(OUT) $(if $(MITSUBA),--mitsuba) $(SETTINGS)
 
 demo: PRESET = demo
 demo: $(ASSETS_READY)

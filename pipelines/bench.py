@@ -1,7 +1,8 @@
-"""Time of the many-light renderer against its rays alone and against Mitsuba's `path`, one light at a time.
+"""`sdps bench`: the renderer's cost as ratios, all from one run in one process.
 
-All three run in one process on the same scene, so that their ratios hold on any machine. Renders that
-compile kernels or build acceleration structures are left out of the times.
+The many-light renderer is timed against its rays alone, against Mitsuba's `path` one light at a time, and against
+itself with more materials, lights and pixels; renders that compile kernels or build acceleration structures are left
+out. `pipelines.bench_data` adds what concerns whole runs: steady state, memory, processes, stages.
 """
 
 import argparse
@@ -14,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from pipelines import bench_data
 from render import lights as light_sets
 from render.config import to_plain
 from render.errors import InputError
-from render.files import write_json
+from render.files import write_json, write_text
 from render.manifest import View
 from render.progress import progress_bar
 from render.seeds import generator
@@ -32,6 +34,7 @@ class BenchConfig:
         scale: Radius of its bounding sphere, in half image widths.
         material: Name of the material.
         second: Material added to the first to see what another one costs.
+        mirror: Mirror-like material, whose highlights get samples of their own.
         size: Image side in pixels.
         lights: Number of lights.
         spp: Camera samples per pixel.
@@ -45,11 +48,12 @@ class BenchConfig:
     scale: float = 0.8
     material: str = "blue-acrylic"
     second: str = "gold-metallic-paint"
+    mirror: str = "chrome"
     size: int = 128
     lights: int = 64
-    spp: int = 16
+    spp: int = 64
     bounces: int = 2
-    repeats: int = 9
+    repeats: int = 7
     path_repeats: int = 3
     seed: int = 0
 
@@ -61,12 +65,34 @@ class BenchConfig:
             raise InputError(f"bounces must not be negative, got {self.bounces}")
 
 
+LABELS = {
+    "rays": "rays alone (camera, bounces, shadows), nothing shaded",
+    "rays, every sample": "the same with a shadow ray for every sample and light",
+    "one material": "all lights at once",
+    "two materials": "all lights at once, two materials",
+    "mirror-like": "all lights at once, a mirror-like material",
+    "twice the lights": "all lights at once, twice as many",
+    "twice the size": "all lights at once, twice the image side",
+    "path": "Mitsuba `path`, one light after another",
+}
+# name: (numerator, denominator, subtracted afterwards, target)
+RATIOS = {
+    "path / all lights": ("path", "one material", 0, "at least 8"),
+    "all lights / rays": ("one material", "rays", 0, "at most 1.25"),
+    "all lights / rays of every sample": ("one material", "rays, every sample", 0, ""),
+    "second material / first": ("two materials", "one material", 1, "at most 0.35"),
+    "128 / 64 lights": ("twice the lights", "one material", 0, "at most 2"),
+    "256x256 / 128x128": ("twice the size", "one material", 0, "at most 4.4"),
+    "mirror-like / plain material": ("mirror-like", "one material", 0, ""),
+}
+
+
 def run(config: BenchConfig) -> dict:
-    """Time the three ways of rendering the scene of `config`.
+    """Time the ways of rendering the scene of `config`.
 
     Returns:
-        `config`, `machine` (versions, variant, coverage), `seconds` (median per way), `spread` (fastest and slowest),
-        `ratios` and `kernels_compiled` in steady state; plain values, ready for JSON.
+        `config`, `machine` (versions, variant, coverage), `seconds` (median per way), `spread` (fastest and slowest)
+        and `ratios`; plain values, ready for JSON.
 
     Raises:
         InputError: unknown shape or material, or no usable Mitsuba variant.
@@ -76,39 +102,11 @@ def run(config: BenchConfig) -> dict:
     mi = variant.load()
     import drjit as dr
 
-    from render import many_lights, reference, scene, shapes
-    from render.materials import library
-    from render.materials.bsdf import PackedMaterials
-
-    mesh, view = shapes.load(config.shape), View(scale=config.scale)
-    lights = light_sets.draw("azimuth-elevation", config.lights, generator(config.seed, "bench", "lights"))
-    lights = lights.astype(np.float32)
-    built = scene.build(mesh)
-    one = PackedMaterials([library.load(config.material)])
-    two = PackedMaterials([library.load(config.material), library.load(config.second)])
-    settings = {"size": config.size, "spp": config.spp, "bounces": config.bounces, "seed": config.seed}
-    found = {}
-
-    def all_lights(materials: PackedMaterials = one) -> None:
-        found["truth"], images = many_lights.render(built, view, materials, lights, **settings)
-        found["means"] = [float(image[0].mean()) for _, image in images]
-
-    def rays_alone() -> None:
-        many_lights.trace(built, view, one, lights, **settings)
-        dr.sync_thread()
-
-    with progress_bar(total=3 * (config.repeats + 2) + config.path_repeats, unit="run", desc="bench") as bar:
-        ways = {"all_lights": all_lights, "rays_alone": rays_alone, "two_materials": lambda: all_lights(two)}
+    found: dict = {}
+    ways = _ways(config, found)
+    with progress_bar(total=len(ways) * (config.repeats + 2) + config.path_repeats, unit="run", desc="bench") as bar:
         times = _interleaved(ways, config.repeats, bar)
-        compiled = _compiled(all_lights)
-        times["path"], path_mean = [], 0.0
-        for _ in range(config.path_repeats):
-            # The first light is rendered twice: its first image loads the scene and compiles, and is not timed.
-            again = np.concatenate([lights[:1], lights])
-            images = reference.render_each_light(mesh, view, config.material, again, **settings)
-            path_mean = float(next(images).mean())
-            times["path"].append(_timed(lambda images=images: [image.shape for image in images]))
-            bar.update()
+        times["path"] = [_path(config, found, bar) for _ in range(config.path_repeats)]
     seconds = {name: float(np.median(values)) for name, values in times.items()}
     return {
         "config": to_plain(config),
@@ -117,18 +115,67 @@ def run(config: BenchConfig) -> dict:
             "drjit": dr.__version__,
             "variant": mi.variant(),
             "threads": dr.thread_count(),
-            "coverage": float(found["truth"].coverage.mean()),
+            "coverage": found["coverage"],
         },
         "seconds": seconds,
         "spread": {name: [min(values), max(values)] for name, values in times.items()},
-        "ratios": {
-            "path / all_lights": seconds["path"] / seconds["all_lights"],
-            "all_lights / rays_alone": seconds["all_lights"] / seconds["rays_alone"],
-            "second material / first": seconds["two_materials"] / seconds["all_lights"] - 1,
-        },
-        "kernels_compiled": compiled,
-        "first_light_mean": {"all_lights": found["means"][0], "path": path_mean},
+        "ratios": {name: seconds[a] / seconds[b] - less for name, (a, b, less, _) in RATIOS.items()},
+        "first_light_mean": {"all lights": found["mean"], "path": found["path_mean"]},
     }
+
+
+def _ways(config: BenchConfig, found: dict) -> dict[str, Callable[[], None]]:
+    """Return the ways of rendering that are timed in turn, but for `path`."""
+    import drjit as dr
+
+    from render import many_lights, paths, scene, shapes
+    from render.materials.packed import pack
+
+    view, built = View(scale=config.scale), scene.build(shapes.load(config.shape))
+    lights = _lights(config, 2 * config.lights)
+    one, two, mirror = pack([config.material]), pack([config.material, config.second]), pack([config.mirror])
+    settings = {"size": config.size, "spp": config.spp, "bounces": config.bounces, "seed": config.seed}
+
+    def all_lights(surfaces=one, count=config.lights, **changes: int) -> None:
+        truth, images = many_lights.render(built, view, surfaces, lights[:count], **settings | changes)
+        means = [float(image[0].mean()) for _, image in images]
+        if surfaces is one and not changes and count == config.lights:
+            found["coverage"], found["mean"] = float(truth.coverage.mean()), means[0]
+
+    def rays_alone(probe: bool = True) -> None:
+        paths.trace(built, view, one, lights[: config.lights], **settings, probe=probe)
+        dr.sync_thread()
+
+    return {
+        "rays": rays_alone,
+        "rays, every sample": lambda: rays_alone(False),
+        "one material": all_lights,
+        "two materials": lambda: all_lights(two),
+        "mirror-like": lambda: all_lights(mirror),
+        "twice the lights": lambda: all_lights(count=2 * config.lights),
+        "twice the size": lambda: all_lights(size=2 * config.size),
+    }
+
+
+def _lights(config: BenchConfig, count: int) -> np.ndarray:
+    drawn = light_sets.draw("azimuth-elevation", count, generator(config.seed, "bench", "lights"))
+    return drawn.astype(np.float32)
+
+
+def _path(config: BenchConfig, found: dict, bar: tqdm) -> float:
+    """Time Mitsuba's `path` over all lights of a scene loaded once."""
+    from render import reference, shapes
+
+    lights = _lights(config, 2 * config.lights)[: config.lights]
+    # The first light is rendered twice: its first image loads the scene and compiles, and is not timed.
+    images = reference.render_each_light(
+        shapes.load(config.shape), View(scale=config.scale), config.material, np.concatenate([lights[:1], lights]),
+        size=config.size, spp=config.spp, bounces=config.bounces, seed=config.seed,
+    )  # fmt: skip
+    found["path_mean"] = float(next(images).mean())
+    elapsed = _timed(lambda: [image.shape for image in images])
+    bar.update()
+    return elapsed
 
 
 def _interleaved(ways: dict[str, Callable[[], None]], repeats: int, bar: tqdm) -> dict[str, list[float]]:
@@ -149,26 +196,9 @@ def _timed(action: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def _compiled(action: Callable[[], None]) -> int:
-    """Return the number of kernels that `action` compiles."""
-    import drjit as dr
-
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        action()
-        history = dr.kernel_history([dr.KernelType.JIT])
-    return sum(not kernel["cache_hit"] for kernel in history)
-
-
 def table(result: dict) -> str:
-    """Format the result of `run` as a Markdown table with a line about the scene and the machine."""
+    """Format the result of `run` as Markdown tables with a line about the scene and the machine."""
     config, machine, seconds, spread = (result[key] for key in ("config", "machine", "seconds", "spread"))
-    labels = {
-        "rays_alone": "rays alone (camera, bounces, shadows), nothing shaded",
-        "all_lights": "all lights at once",
-        "two_materials": "all lights at once, two materials",
-        "path": "Mitsuba `path`, one light after another",
-    }
     lines = [
         f"{config['shape']} covering {machine['coverage']:.0%} of {config['size']}x{config['size']} pixels, "
         f"{config['lights']} lights, {config['spp']} spp, {config['bounces']} bounces, {config['material']}; "
@@ -177,26 +207,36 @@ def table(result: dict) -> str:
         "| way | seconds (median) | fastest - slowest |",
         "|---|---|---|",
     ]
-    for name, label in labels.items():
+    for name, label in LABELS.items():
         lines.append(f"| {label} | {seconds[name]:.3f} | {spread[name][0]:.3f} - {spread[name][1]:.3f} |")
-    lines += ["", "| ratio | |", "|---|---|"]
-    lines += [f"| {name.replace('_', ' ')} | {value:.2f} |" for name, value in result["ratios"].items()]
-    lines += [f"| kernels compiled in steady state | {result['kernels_compiled']} |", ""]
-    return "\n".join(lines)
+    lines += ["", "| ratio | measured | target |", "|---|---|---|"]
+    lines += [f"| {name} | {value:.2f} | {RATIOS[name][3]} |" for name, value in result["ratios"].items()]
+    return "\n".join(lines) + "\n"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add one flag per field of `BenchConfig`, and `--out`."""
+    """Add one flag per field of `BenchConfig`, and what to run."""
     for entry in fields(BenchConfig):
         flag = f"--{entry.name.replace('_', '-')}"
         parser.add_argument(flag, dest=entry.name, type=entry.type, default=entry.default, help="(default %(default)s)")
-    parser.add_argument("--out", type=Path, help="also write the result as JSON to this file")
+    parser.add_argument("--only", choices=("ratios", *bench_data.PARTS), help="run one part only")
+    parser.add_argument("--scenes", type=int, default=1000, help="scenes of the memory test (default %(default)s)")
+    parser.add_argument("--out", type=Path, help="folder for bench.md, bench.json and memory.png")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the benchmark, print its table and return the exit code."""
-    result = run(BenchConfig(**{entry.name: getattr(args, entry.name) for entry in fields(BenchConfig)}))
-    sys.stdout.write(table(result))
+    """Run the benchmark, print its tables and return the exit code."""
+    config = BenchConfig(**{entry.name: getattr(args, entry.name) for entry in fields(BenchConfig)})
+    result, text = {}, []
+    if args.only in (None, "ratios"):
+        result["ratios"] = run(config)
+        text.append(table(result["ratios"]))
+        sys.stdout.write(text[-1] + "\n")
+    for part in bench_data.PARTS if args.only is None else [args.only] if args.only in bench_data.PARTS else []:
+        result[part], lines = bench_data.run(part, args.scenes, args.out)
+        text.append(lines)
+        sys.stdout.write(lines + "\n")
     if args.out:
-        write_json(args.out, result)
+        write_json(args.out / "bench.json", result)
+        write_text(args.out / "bench.md", "\n".join(text))
     return 0

@@ -19,6 +19,7 @@ COMMANDS = {
     "fit-material": ("fit_material", "add_arguments", "main", "fit the built-in model to a MERL .binary table"),
     "materials": ("catalogue", "add_material_arguments", "materials_main", "list the built-in materials"),
     "shapes": ("catalogue", "add_shape_arguments", "shapes_main", "list the shape families"),
+    "noise": ("noise", "add_arguments", "main", "measure the renderer's noise against converged images"),
     "bench": ("bench", "add_arguments", "main", "measure the renderer against Mitsuba's path integrator"),
 }
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from render import estimate, ledger
 from render.errors import InputError
-from render.manifest import MANIFEST, read_manifest
+from render.manifest import MANIFEST, read_failed, read_manifest
 
 REASONS = 5  # most frequent reasons of failure that are shown
 QUIET = 300.0  # seconds without a finished scene after which a run is taken for stopped
@@ -43,7 +43,7 @@ def status(folder: Path, *, verify: bool = False) -> dict:
         InputError: not a data folder.
     """
     ids = scene_ids(folder)
-    runs, sizes, failures = ledger.read_runs(folder), ledger.shard_sizes(folder), ledger.read_failed(folder)
+    runs, sizes, failures = ledger.read_runs(folder), ledger.shard_sizes(folder), read_failed(folder)
     lines = ledger.latest(runs)
     if verify:
         done = ledger.survey(folder, read_manifest(folder), verify=True).done

@@ -10,8 +10,7 @@ from render import estimate
 from render.config import to_plain
 from render.errors import InputError
 from render.files import atomic_path
-from render.ledger import FAILED
-from render.manifest import MANIFEST, SceneSpec, read_manifest, write_manifest
+from render.manifest import FAILED, MANIFEST, SceneSpec, read_manifest, write_manifest
 from render.supervisor import RunOptions, RunSummary, render_supervised
 
 STAGES = {

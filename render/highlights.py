@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 
 from render import variant
-from render.sampling import opaque, stream, uniform
+from render.sampling import opaque, scrambled, stream, uniform, upload
 
 mi = variant.load()
 
@@ -104,33 +104,30 @@ def find(scene: Any, camera: Any, directions: Any, surfaces: Any, spp: int, seed
     found = []
     for chosen in _chunks(candidates):
         drawn = _drawn(scene, camera, halves, candidates, chosen, stream(seed, 77 + first))
-        drawn = drawn and _unhidden(scene, camera, directions, towards, drawn)
+        drawn = drawn and _unhidden(scene, camera, directions, towards, drawn, spp)
         if drawn:
             found.append(drawn)
     if not found:
         return None
-    joined = [_joined([values[k] for values in found]) for k in range(len(found[0]))]
-    point, normal, prim, light, spread, s, x, y = joined
-    factor = partition(spread, s, opaque(mi.UInt32(camera.size)), opaque(mi.UInt32(spp)))
-    dr.eval(factor)
-    # A coordinate just below 1 may round up to the edge.
+    # Joined by NumPy: the number of chunks would be in Dr.Jit's code.
+    joined = [np.concatenate(values) for values in zip(*found, strict=True)]
+    x, y, light = joined[:3]
     half, last = camera.size / 2, camera.size - 1
-    column, row = (np.minimum(((np.array(value) + 1) * half).astype(np.int64), last) for value in (x, -y))
-    target = np.array(light).astype(np.int64) * camera.size**2 + row * camera.size + column
+    # A coordinate just below 1 may round up to the edge.
+    column, row = (np.minimum(((value + 1) * half).astype(np.int64), last) for value in (x, -y))
+    target = light.astype(np.int64) * camera.size**2 + row * camera.size + column
+    prim, light = upload(mi.UInt32, joined[3]), upload(mi.UInt32, light)
+    floats = [upload(mi.Float, values) for values in joined[4:]]
+    point, normal, factor = mi.Point3f(*floats[:3]), mi.Vector3f(*floats[3:6]), floats[6]
     return Glints(normal, light, target, factor, surfaces.weights(point, prim), towards)
 
 
-def _joined(values: list) -> Any:
-    """Join arrays of points, vectors or numbers lane by lane."""
-    if len(values) == 1:
-        return values[0]
-    if dr.depth_v(values[0]) == 1:
-        return dr.concat(values)
-    return type(values[0])(*(dr.concat([value[c] for value in values]) for c in range(3)))
+def _unhidden(scene: Any, camera: Any, directions: Any, towards: Any, drawn: tuple, spp: int) -> list | None:
+    """Keep the points inside the frame that the camera and their light see.
 
-
-def _unhidden(scene: Any, camera: Any, directions: Any, towards: Any, drawn: tuple) -> tuple | None:
-    """Keep the points inside the frame that the camera and their light see; add their image coordinates."""
+    Returns:
+        Image coordinates x and y, light, triangle, point (3), normal (3) and weight as NumPy arrays.
+    """
     point, normal, facet, prim, light, spread, s = drawn
     start = dr.zeros(mi.SurfaceInteraction3f, dr.width(prim))
     start.p, start.n = point, mi.Normal3f(facet)
@@ -139,15 +136,16 @@ def _unhidden(scene: Any, camera: Any, directions: Any, towards: Any, drawn: tup
     seen = (dr.abs(x) < 1) & (dr.abs(y) < 1) & (dr.dot(normal, direction) > 0) & (spread > 0)
     seen &= ~scene.ray_test(start.spawn_ray(towards), False, seen)
     seen &= ~scene.ray_test(start.spawn_ray(direction), False, seen)
-    dr.eval(seen, x, y)
+    factor = partition(spread, s, opaque(mi.UInt32(camera.size)), opaque(mi.UInt32(spp)))
+    dr.eval(seen, x, y, factor)
     kept = dr.compress(seen)
     if len(kept) == 0:
         return None
-    values = (point, normal, prim, light, spread, s, x, y)
-    kinds = (mi.Point3f, mi.Vector3f, mi.UInt32, mi.UInt32, mi.Float, mi.Float, mi.Float, mi.Float)
-    kept_values = tuple(dr.gather(kind, kind(value), kept) for kind, value in zip(kinds, values, strict=True))
-    dr.eval(kept_values)
-    return kept_values
+    point = mi.Vector3f(point)
+    values = (x, y, light, prim, point.x, point.y, point.z, normal.x, normal.y, normal.z, factor)
+    gathered = [dr.gather(type(value), value, kept) for value in values]
+    dr.eval(gathered)
+    return [np.array(value) for value in gathered]
 
 
 class _Candidates(NamedTuple):
@@ -223,7 +221,8 @@ def _chunks(candidates: _Candidates | None) -> Iterator[tuple]:
         first = np.repeat(first, counts[pair:stop])
         pair = stop
         if len(pairs) > 1:
-            yield mi.UInt32(pairs.astype(np.uint32)), mi.UInt32((first + np.arange(len(pairs))).astype(np.uint32))
+            numbers = first + np.arange(len(pairs))
+            yield tuple(upload(mi.UInt32, values.astype(np.uint32)) for values in (pairs, numbers))
 
 
 def _drawn(scene: Any, camera: Any, halves: Any, candidates: _Candidates, chosen: tuple, seed: Any) -> tuple | None:
@@ -231,12 +230,10 @@ def _drawn(scene: Any, camera: Any, halves: Any, candidates: _Candidates, chosen
 
     A light's normals are a rotated Hammersley set of its own for every triangle.
     """
-    # Gathered by an index it cannot see through, since Dr.Jit compiles plain loads by the alignment of NumPy's memory.
-    lane = dr.arange(mi.UInt32, dr.width(chosen[0])) + opaque(mi.UInt32(0))
-    pair, number = (dr.gather(mi.UInt32, value, lane) for value in chosen)
+    pair, number = chosen
     prim, light = dr.gather(mi.UInt32, candidates.triangle, pair), dr.gather(mi.UInt32, candidates.light, pair)
     half = dr.gather(mi.Vector3f, halves, light)
-    turn = mi.sample_tea_32(prim * mi.UInt32(0x9E3779B1) + light, seed)
+    turn = scrambled(prim * mi.UInt32(0x9E3779B1) + light, seed)
     u = (mi.Float(number) + uniform(turn[0])) * (1 / NORMALS)
     s = _CORE * (dr.rcp(dr.square(1 - u * _TAIL)) - 1)
     sine = dr.sqrt(dr.maximum(s * (2 - s), 0))

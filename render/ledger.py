@@ -7,18 +7,17 @@ readers skip. Every run writes a ledger of its own; several machines may fill on
 import json
 import os
 import socket
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 
 from render.errors import InputError
-from render.manifest import SceneSpec
+from render.manifest import FAILED, SceneSpec, read_events, read_failed
 from render.shards import is_whole
 
 LOG = "log"
-FAILED = "failed.jsonl"
 SHARDS = "shards"
 
 
@@ -75,7 +74,7 @@ class Ledger:
 
 def read_runs(folder: Path) -> list[list[dict]]:
     """Return the ledger lines of every run that finished a shard."""
-    runs = (list(_lines(path)) for path in sorted((folder / LOG).glob("done-*.jsonl")))
+    runs = (list(read_events(path)) for path in sorted((folder / LOG).glob("done-*.jsonl")))
     return [lines for lines in runs if lines]
 
 
@@ -83,31 +82,6 @@ def latest(runs: Sequence[list[dict]]) -> dict[str, dict]:
     """Return the last line of every finished shard by id, in order of time."""
     lines = sorted((line for lines in runs for line in lines), key=lambda line: line["time"])
     return {line["id"]: line for line in lines}
-
-
-def read_failed(folder: Path) -> dict[str, list[dict]]:
-    """Return all recorded failures by scene id, oldest first; some of these scenes may be done by now."""
-    failures: dict[str, list[dict]] = {}
-    for line in _lines(folder / FAILED):
-        failures.setdefault(line["id"], []).append(line)
-    return failures
-
-
-def _lines(path: Path) -> Iterator[dict]:
-    """Read the whole lines of a file that may be missing, and may be appended to at this moment."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    for line in text.splitlines():
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            continue  # torn by a crash; its shard is found by its hash, its failure happens again
-        if isinstance(row, dict) and {"id", "time"} <= row.keys():
-            yield row
 
 
 def shard_sizes(folder: Path) -> dict[str, int]:

@@ -2,9 +2,11 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from render.errors import InputError
 from render.files import read_jsonl, write_jsonl
 
 MANIFEST = "manifest.jsonl"
+FAILED = "failed.jsonl"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +85,9 @@ class SceneSpec:
 
     def digest(self) -> str:
         """Return the SHA-256 of the whole line, which its shard carries."""
-        return hashlib.sha256(json.dumps(to_plain(self), sort_keys=True).encode()).hexdigest()
+        # Not `to_plain` as a whole: it would copy every light, and JSON writes tuples as lists anyway.
+        row = {field.name: getattr(self, field.name) for field in fields(self)} | {"view": to_plain(self.view)}
+        return hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()
 
     def light_directions(self) -> np.ndarray:  # (L, 3) float32
         """Return the light directions as an array."""
@@ -103,8 +108,67 @@ def read_manifest(folder: str | Path, split: str | None = None) -> list[SceneSpe
     path = Path(folder) / MANIFEST
     if not path.is_file():
         raise InputError(f"{folder}: no {MANIFEST} there; render it with `sdps render-data --out {folder}`")
-    scenes = [build(SceneSpec, row, f"{path}: line {number}") for number, row in enumerate(read_jsonl(path), start=1)]
-    chosen = [scene for scene in scenes if split in (None, scene.split)]
+    chosen = [scene for scene in _scenes(path) if split in (None, scene.split)]
     if not chosen:
         raise InputError(f"{path}: no scene{f' of split {split!r}' if split else ''}; plan more scenes")
     return chosen
+
+
+def read_events(path: Path) -> Iterator[dict]:
+    """Yield the whole lines of a ledger, which may be missing, and may be appended to at this moment.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    for line in text.splitlines():
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            continue  # torn by a crash; its shard is found by its hash, its failure happens again
+        if isinstance(row, dict) and {"id", "time"} <= row.keys():
+            yield row
+
+
+def read_failed(folder: Path) -> dict[str, list[dict]]:
+    """Return all recorded failures by scene id, oldest first; some of these scenes may be done by now."""
+    failures: dict[str, list[dict]] = {}
+    for line in read_events(folder / FAILED):
+        failures.setdefault(line["id"], []).append(line)
+    return failures
+
+
+def _scenes(path: Path) -> Iterator[SceneSpec]:
+    """Yield the scenes of a manifest; those of one view, which differ in id and material only, share its values."""
+    last, scene = None, None
+    for number, row in enumerate(read_jsonl(path), start=1):
+        own = {key: row.get(key) for key in ("id", "material")} if isinstance(row, dict) else {}
+        if scene is not None and {type(value) for value in own.values()} == {str} and row == last | own:
+            scene = replace(scene, **own)
+        else:
+            scene = _scene(row, f"{path}: line {number}")
+        last = row
+        yield scene
+
+
+def _scene(row: Any, where: str) -> SceneSpec:
+    """Build a scene from a line; its lights, which are most of it, are not read number by number if all are sound."""
+    lights = row.get("lights") if isinstance(row, dict) else None
+    if not _is_vectors(lights):
+        return build(SceneSpec, row, where)
+    return replace(build(SceneSpec, row | {"lights": ()}, where), lights=tuple(map(tuple, lights)))
+
+
+def _is_vectors(value: Any) -> bool:
+    """Tell whether a JSON value is a list of lists of three floats, which needs no conversion but to tuples."""
+    return (
+        isinstance(value, list)
+        and {type(row) for row in value} == {list}
+        and {len(row) for row in value} == {3}
+        and {type(number) for number in chain.from_iterable(value)} == {float}
+    )

@@ -10,7 +10,6 @@ import shutil
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ import trimesh
 
 from render import pattern_mesh, shapes
 from render.errors import InputError
-from render.manifest import SceneSpec, View
+from render.manifest import SceneSpec
 from render.materials import merl, model, rgl, surfaces
 from render.shapes.mesh import TriangleMesh
 
@@ -82,7 +81,7 @@ def save(folder: str | Path, spec: SceneSpec, mesh: TriangleMesh | None = None) 
         mesh, shares = pattern_mesh.cut(mesh, _weights(surface.pattern, mesh), quarter_pixel)
     with _atomic_folder(Path(folder)) as temporary:
         bsdfs = [_material(temporary, number, material) for number, material in enumerate(surface.components)]
-        _write_mesh(temporary / MESH, posed(mesh, spec.view), shares)
+        _write_mesh(temporary / MESH, mesh.posed(spec.view), shares)
         tree = ET.ElementTree(_scene(spec, _blend(bsdfs)))
         ET.indent(tree, space="    ")
         tree.write(temporary / SCENE, encoding="utf-8", xml_declaration=True)
@@ -91,12 +90,6 @@ def save(folder: str | Path, spec: SceneSpec, mesh: TriangleMesh | None = None) 
         (temporary / LIGHTS).write_text(rows, encoding="utf-8")
         (temporary / README).write_text(_readme(spec, surface.components), encoding="utf-8")
     return Path(folder) / SCENE
-
-
-def posed(mesh: TriangleMesh, view: View) -> TriangleMesh:
-    """Return `mesh` rotated, scaled and moved into the camera frame (units: half image widths)."""
-    turned = mesh.rotated(view.matrix())
-    return replace(turned, vertices=turned.vertices * view.scale + np.array([*view.offset, 0.0]))
 
 
 def evaluator(material: Any) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 from render import highlights, variant
 from render.manifest import View
 from render.materials.packed import PackedSurfaces
-from render.sampling import bounce_variates, opaque, pixel_position, random_variates, stream
+from render.sampling import bounce_variates, opaque, pixel_position, random_variates, stream, upload
 from render.visibility import probe_count, probed_visibility, visibility
 
 mi = variant.load()

@@ -17,7 +17,7 @@ from render.materials import library
 from render.shards import read_shard
 
 PACKAGES = ("sdps", "mitsuba", "drjit", "OpenEXR", "numpy")
-HEADERS = ("mitsuba", "drjit", "variant", "imported_from", "irradiance", "frame", "normals", "depth", "coverage")
+HEADERS = (*PACKAGES, "commit", "variant", "imported_from", "irradiance", "frame", "normals", "depth", "coverage")
 READ = 16  # shards whose headers are read
 _OWN = "made by the seeded generators of this package (`render.shapes`); no third-party data"
 MESHES = {

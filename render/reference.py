@@ -16,14 +16,6 @@ from render.shapes.mesh import TriangleMesh
 mi = variant.load()
 
 
-def posed(mesh: TriangleMesh, view: View) -> TriangleMesh:
-    """Return `mesh` rotated, scaled and moved into the camera frame (units: half image widths)."""
-    rotation = view.matrix()
-    vertices = mesh.vertices @ rotation.T * view.scale + np.array([*view.offset, 0.0])
-    normals = (mesh.normals @ rotation.T).astype(np.float32)
-    return TriangleMesh(vertices=vertices.astype(np.float32), faces=mesh.faces, normals=normals)
-
-
 def scene_dict(
     mesh: TriangleMesh, view: View, material: str, size: int, spp: int, bounces: int, shape: str | None = None
 ) -> dict:
@@ -55,7 +47,7 @@ def scene_dict(
             },
             "sampler": {"type": "independent", "sample_count": spp},
         },
-        "object": build_mesh(posed(mesh, view), bsdf),
+        "object": build_mesh(mesh.posed(view), bsdf),
         "light": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": np.pi}},
     }
 

@@ -15,6 +15,7 @@ mi = variant.load()
 # Powers of 1 / g with g^4 = g + 1, the three-dimensional additive recurrence of least discrepancy (Roberts 2018), times
 # 2^32: integers wrap around exactly, so that a million samples are as well spread as the first.
 _STEPS = (3518319155, 2882110345, 2360945575)
+_ROUNDS = 8  # with Mitsuba's default, 4, the words of neighbouring lanes still correlate, by 0.5
 
 
 def opaque(value: Any) -> Any:
@@ -23,9 +24,26 @@ def opaque(value: Any) -> Any:
     return value
 
 
+def upload(kind: type, values: np.ndarray) -> Any:
+    """Copy a NumPy array into memory of Dr.Jit's own.
+
+    On the CPU Dr.Jit uses NumPy's memory as it is, and compiles loads by its alignment, which is a matter of luck. The
+    copy is gathered by an index the kernel cannot see through, for which alignment does not matter.
+    """
+    source = kind(np.ascontiguousarray(values))
+    copy = dr.gather(kind, source, dr.arange(mi.UInt32, dr.width(source)) + opaque(mi.UInt32(0)))
+    dr.eval(copy)
+    return copy
+
+
 def stream(seed: int, stage: int) -> "mi.UInt32":
     """Return an opaque 32-bit seed of its own for each (seed, stage)."""
     return opaque(mi.UInt32(int(np.random.SeedSequence([seed, stage]).generate_state(1)[0])))
+
+
+def scrambled(first: "mi.UInt32", second: "mi.UInt32") -> tuple:
+    """Return two words for each pair of words, independent of those of any other pair (TEA: Zafar et al. 2010)."""
+    return mi.sample_tea_32(first, second, _ROUNDS)
 
 
 def pixel_position(pixel: "mi.UInt32", number: "mi.UInt32", seed: "mi.UInt32") -> "mi.Point2f":
@@ -33,14 +51,14 @@ def pixel_position(pixel: "mi.UInt32", number: "mi.UInt32", seed: "mi.UInt32") -
 
     Every run of 2^k samples that starts at a multiple of 2^k is stratified in itself.
     """
-    scramble = mi.sample_tea_32(pixel, seed)
+    scramble = scrambled(pixel, seed)
     return mi.Point2f(mi.radical_inverse_2(number, scramble[0]), mi.sobol_2(number, scramble[1]))
 
 
 def bounce_variates(pixel: "mi.UInt32", number: "mi.UInt32", seed: "mi.UInt32") -> tuple:
     """Return three variates for the bounce of sample `number` of a pixel: a Kronecker sequence, rotated by pixel."""
-    first, second = mi.sample_tea_32(pixel, seed)
-    third, _ = mi.sample_tea_32(first, second)
+    first, second = scrambled(pixel, seed)
+    third, _ = scrambled(first, second)
     return tuple(
         uniform(shift + number * mi.UInt32(step)) for shift, step in zip((first, second, third), _STEPS, strict=True)
     )
@@ -48,8 +66,8 @@ def bounce_variates(pixel: "mi.UInt32", number: "mi.UInt32", seed: "mi.UInt32") 
 
 def random_variates(sample: "mi.UInt32", seed: "mi.UInt32") -> tuple:
     """Return three independent variates per lane, for bounces beyond the first."""
-    first, second = mi.sample_tea_32(sample, seed)
-    third, _ = mi.sample_tea_32(first, second)
+    first, second = scrambled(sample, seed)
+    third, _ = scrambled(first, second)
     return uniform(first), uniform(second), uniform(third)
 
 

@@ -7,12 +7,13 @@ processes of their own, and goes on after failures.
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 
 import drjit as dr
 
-from render import many_lights, variant
+from render import many_lights, provenance, variant
 from render.chunks import GROUP_SIZE, view_groups
 from render.errors import InputError
 from render.manifest import SceneSpec
@@ -153,7 +154,7 @@ def render_group(
             light_directions=scene.light_directions(),
             weights=truth.weights[number],
             materials=surface_names.split(scene.material)[1] if truth.weights[number] is not None else (),
-            provenance=_provenance(scene),
+            provenance=_describe(scene),
         )
         with stages.time("write"):
             _write(folder / scene.file, shard)
@@ -175,7 +176,7 @@ def _write(path: Path, shard: Shard) -> None:
         raise
 
 
-def _provenance(scene: SceneSpec) -> dict[str, str | int | float]:
+def _describe(scene: SceneSpec) -> dict[str, str | int | float]:
     """Describe how the scene was rendered, for the shard's header."""
     return {
         "spec": scene.digest(),
@@ -186,7 +187,14 @@ def _provenance(scene: SceneSpec) -> dict[str, str | int | float]:
         "bounces": scene.bounces,
         "irradiance": "pi",
         "frame": "x right, y up, z to the camera",
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
         "variant": mi.variant(),
+        **_software(),
     }
+
+
+@cache
+def _software() -> dict[str, str]:
+    """Return the versions of this package and of those a shard depends on, and the commit in a checkout."""
+    versions = {name: version for name, version in provenance.versions().items() if name in provenance.PACKAGES}
+    commit = provenance.commit()
+    return versions | ({"commit": commit} if commit else {})

@@ -4,6 +4,7 @@ The position in an endless stream of samples determines everything about a sampl
 augmentation, crop. So a run is resumed exactly by one integer, and no two workers share a random stream.
 """
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +17,13 @@ from torch.nn import functional
 from torch.utils.data import Dataset
 
 from render.errors import InputError
-from render.manifest import SceneSpec, read_manifest
+from render.manifest import FAILED, SceneSpec, read_failed, read_manifest
 from render.seeds import generator
 from sdps.augment import Augmentation, apply_symmetry, augment
 from sdps.scene_store import SceneStore
 
 _CROP_DRAWS = 8
+_log = logging.getLogger(__name__)
 
 
 class Batch(NamedTuple):
@@ -76,7 +78,8 @@ class SceneDataset(Dataset):
         split: `train`, `val` or `test`; the split also names the random stream.
         options: How samples are made.
         cache: Keep decoded scenes in `<folder>/cache`.
-        skip_missing: Leave out planned scenes that have no shard instead of refusing.
+        skip_missing: Leave out planned scenes that have no shard instead of refusing. Scenes that could not be
+            rendered (`failed.jsonl`) are left out in any case, with a warning.
 
     Raises:
         InputError: no manifest, no scene of the split, or missing shards.
@@ -94,14 +97,7 @@ class SceneDataset(Dataset):
         self.split = split
         self.options = options
         self.store = SceneStore(Path(folder), cache=cache)
-        planned = read_manifest(folder, split)
-        self.scenes = [scene for scene in planned if (Path(folder) / scene.file).is_file()]
-        missing = len(planned) - len(self.scenes)
-        if not self.scenes or (missing and not skip_missing):
-            raise InputError(
-                f"{folder}: {missing} of {len(planned)} shards of split {split!r} are missing; finish it with "
-                "`sdps render-data` or set skip_missing"
-            )
+        self.scenes = _rendered(Path(folder), split, skip_missing)
         _check_counts(folder, self.scenes, options.images)
 
     def __len__(self) -> int:
@@ -179,6 +175,23 @@ class SampleStream:
                     yield keys
                     keys = []
             epoch, position = epoch + 1, 0
+
+
+def _rendered(folder: Path, split: str, skip_missing: bool) -> list[SceneSpec]:
+    """Return the scenes of a split that have a shard, or refuse a folder whose rendering is not finished."""
+    planned = read_manifest(folder, split)
+    scenes = [scene for scene in planned if (folder / scene.file).is_file()]
+    missing = {scene.id for scene in planned} - {scene.id for scene in scenes}
+    failed = missing & read_failed(folder).keys() if missing and not skip_missing else set()
+    if not scenes or (missing - failed and not skip_missing):
+        raise InputError(
+            f"{folder}: {len(missing)} of {len(planned)} shards of split {split!r} are missing; finish it with "
+            "`sdps render-data` or set skip_missing"
+        )
+    if failed:
+        about = "%s: %d of %d scenes of split %r could not be rendered (%s) and are left out"
+        _log.warning(about, folder, len(failed), len(planned), split, FAILED)
+    return scenes
 
 
 def _check_counts(folder: str | Path, scenes: list[SceneSpec], images: int) -> None:

@@ -1,11 +1,12 @@
 """Small meshes and one-call renders for the renderer's tests."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 
-from render import many_lights, scene
+from render import many_lights, scene, shapes
 from render.manifest import View
 from render.materials.packed import PackedSurfaces, pack
 from render.shapes import TriangleMesh
@@ -38,6 +39,51 @@ def bowl(steps: int = 40, depth: float = 1.3) -> TriangleMesh:
     )
 
 
+def cap(angle: float = 75.0, rings: int = 40, segments: int = 96) -> TriangleMesh:
+    """Return the part of the unit sphere within `angle` degrees of -z, seen from inside, with exact inward normals.
+
+    Open towards the camera. Between any two patches of a sphere the form factor is the same, so that interreflections
+    in it are known in closed form.
+    """
+    theta = np.radians(angle) * np.arange(1, rings + 1) / rings
+    phi = 2 * np.pi * np.arange(segments) / segments
+    ring = np.stack([np.outer(np.sin(theta), np.cos(phi)), np.outer(np.sin(theta), np.sin(phi)),
+                     np.repeat(-np.cos(theta)[:, None], segments, 1)], axis=2)  # fmt: skip
+    vertices = np.concatenate([[[0, 0, -1]], ring.reshape(-1, 3)])
+    this, other = np.arange(segments), (np.arange(segments) + 1) % segments
+    faces = [np.stack([np.zeros_like(this), 1 + this, 1 + other], axis=1)]
+    for inner in range(1, 1 + (rings - 1) * segments, segments):
+        outer = inner + segments
+        faces.append(np.stack([inner + this, outer + this, outer + other], axis=1))
+        faces.append(np.stack([inner + this, outer + other, inner + other], axis=1))
+    return TriangleMesh(vertices=vertices, faces=np.concatenate(faces).astype(np.uint32), normals=-vertices)
+
+
+def joined(*meshes: TriangleMesh) -> TriangleMesh:
+    """Return several meshes as one."""
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces.astype(np.int64) + start for mesh, start in zip(meshes, first[:-1], strict=True)]
+    return TriangleMesh(
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        faces=np.concatenate(faces),
+        normals=np.concatenate([mesh.normals for mesh in meshes]),
+    )
+
+
+def ball(radius: float, centre: Sequence[float]) -> TriangleMesh:
+    """Return a sphere."""
+    sphere = shapes.load("sphere")
+    return replace(sphere, vertices=sphere.vertices * radius + np.array(centre, np.float32))
+
+
+def spread(count: int, lowest: float = -1.0) -> np.ndarray:
+    """Return (count, 3) float32 directions spread evenly, each for the same solid angle, over heights z > `lowest`."""
+    z = 1 - (np.arange(count) + 0.5) / count * (1 - lowest)
+    phi = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    sine = np.sqrt(1 - z**2)
+    return np.stack([sine * np.cos(phi), sine * np.sin(phi), z], axis=1).astype(np.float32)
+
+
 def unit(*vectors: Sequence[float]) -> np.ndarray:
     """Return the rows as unit vectors (L, 3) float32."""
     rows = np.array(vectors, np.float64)
@@ -50,7 +96,7 @@ def render(
 ) -> tuple[many_lights.GroundTruth, dict[int, np.ndarray]]:  # fmt: skip
     """Render a mesh with the named materials; return the ground truth and the images by material number."""
     truth, images = many_lights.render(
-        scene.build(mesh), view or View(), packed(*names), lights, size=size, spp=spp, bounces=bounces, seed=seed
+        scene.build(mesh), view or View(), pack(names, mesh), lights, size=size, spp=spp, bounces=bounces, seed=seed
     )
     return truth, dict(images)
 

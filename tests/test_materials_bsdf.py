@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from render.errors import InputError
-from render.materials import bsdf, library, model, spheres
+from render.materials import bsdf, library, lobes, model, spheres
 
 mi = bsdf.mi
 NAMES = ("chrome", "steel", "pink-fabric", "specular-orange-phenolic", "lambertian:0.8/0.3/0.1")
@@ -173,10 +173,10 @@ def test_plugin_exposes_its_tables_and_names_itself():
 
 def test_lobe_distribution_is_a_distribution():
     for name in ("chrome", "pink-felt"):
-        table = bsdf.lobe_distribution(library.load(name))
+        table = lobes.lobe_distribution(library.load(name))
         assert 0 <= table[0] <= 0.9 and table[1] == 0 and table[-1] == pytest.approx(1)
         assert (np.diff(table[1:]) >= 0).all()
-    assert bsdf.lobe_distribution(library.load("lambertian:0.5"))[0] == 0
+    assert lobes.lobe_distribution(library.load("lambertian:0.5"))[0] == 0
 
 
 def test_nothing_to_pack_is_an_error():

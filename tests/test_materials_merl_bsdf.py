@@ -6,7 +6,7 @@ import pytest
 from merl_support import of_library, values
 
 from render.errors import InputError
-from render.materials import bsdf, library, merl, merl_bsdf, model, spheres
+from render.materials import bsdf, library, lobes, merl, merl_bsdf, model, spheres
 
 mi = merl_bsdf.mi
 NAMES = ("chrome", "glossy", "lambertian:1")
@@ -208,7 +208,7 @@ def test_plugin_exposes_its_table_and_names_itself(plugin):
 def test_the_coarse_form_gives_a_lobe_where_there_is_a_highlight(tables, packed):
     own = bsdf.PackedMaterials([library.load("chrome")])
     np.testing.assert_allclose(packed.highlight[[0, 2]], [own.highlight[0], 0], atol=0.05)
-    probability = [bsdf.lobe_distribution(merl_bsdf.coarse_form(table))[0] for table in tables]
+    probability = [lobes.lobe_distribution(merl_bsdf.coarse_form(table))[0] for table in tables]
     assert probability[0] > 0.5 > probability[1] > 0.05 and probability[2] == 0
 
 

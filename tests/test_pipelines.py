@@ -147,12 +147,33 @@ def test_regenerate_writes_scenes_and_reuses_them(capsys, tmp_path):
     assert [scene.id for scene in manifest] == ["sphere-chrome", "sphere-grey", "sphere-lambertian-0.5"]
     shards = [read_shard(out / scene.file, scene) for scene in manifest]
     np.testing.assert_array_equal(shards[1].images, shards[2].images)  # a YAML of lambertian:0.5 is lambertian:0.5
+    assert {"sdps", "mitsuba", "drjit", "numpy", "OpenEXR", "variant"} <= shards[0].provenance.keys()
     assert (out / "preview.png").stat().st_size > 1000
     hashes = [file_hash(out / scene.file) for scene in manifest]
     assert main(argv) == 0
     assert "0 rendered now" in capsys.readouterr().out
     assert [file_hash(out / scene.file) for scene in manifest] == hashes
     assert "holds another plan" in fails(capsys, *argv, "--set", "test.seed=1")
+
+
+def test_regenerate_saves_scenes_for_stock_mitsuba(capsys, tmp_path):
+    argv = ["regenerate", "--shapes", "sphere", "--materials", "stripes:3:lambertian:0.9+chrome,lambertian:0.5",
+            "--lights", "near-uniform:2", "--out", str(tmp_path), *TINY]  # fmt: skip
+    assert main(argv) == 0
+    assert not (tmp_path / "mitsuba").exists()
+    assert main([*argv, "--mitsuba"]) == 0
+    assert "0 rendered now" in (text := capsys.readouterr().out) and "2 scenes for stock Mitsuba" in text
+    saved = tmp_path / "mitsuba"
+    ids = [scene.id for scene in read_manifest(tmp_path)]
+    assert sorted(path.name for path in saved.iterdir()) == sorted(ids)
+    files = {id: sorted(path.name for path in (saved / id).iterdir()) for id in ids}
+    plain = ["README.txt", "lights.txt", "object.ply", "scene.xml"]
+    assert files == {
+        "sphere-stripes-3-lambertian-0.9--chrome": sorted([*plain, "material1.bsdf"]),
+        "sphere-lambertian-0.5": plain,
+    }
+    (saved / ids[0] / "scene.xml").unlink()
+    assert "holds other files" in fails(capsys, *argv, "--mitsuba")
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """From shards to batches: augmentation in its order, streams of random numbers, cache, and refusals."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -229,6 +230,25 @@ def test_truncated_and_missing_shards_are_refused(tmp_path: Path) -> None:
     assert len(SceneDataset(tmp_path, "train", options(size=16), skip_missing=True)) == 2
     with pytest.raises(InputError, match="no scene of split 'val'"):
         SceneDataset(tmp_path, "val", options(size=16))
+
+
+def test_scenes_that_could_not_be_rendered_are_left_out_with_one_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scenes = write_data(tmp_path, ("train",) * 4 + ("val",), lights=4, size=16)
+    for scene in scenes[:2]:
+        (tmp_path / scene.file).unlink()
+    failure = {"id": scenes[0].id, "time": "2024-01-01T00:00:00+00:00", "reason": "outside the frame"}
+    (tmp_path / "failed.jsonl").write_text(json.dumps(failure) + "\n")
+    with pytest.raises(InputError, match="2 of 4 shards"):  # one of them is still to be rendered
+        SceneDataset(tmp_path, "train", options(size=16))
+    with open(tmp_path / "failed.jsonl", "a") as handle:
+        handle.write(json.dumps(failure | {"id": scenes[1].id}) + "\n")
+    assert len(SceneDataset(tmp_path, "train", options(size=16))) == 2
+    (record,) = caplog.records
+    assert "2 of 4 scenes of split 'train' could not be rendered" in record.getMessage()
+    SceneDataset(tmp_path, "val", options(size=16))
+    assert len(caplog.records) == 1
 
 
 def test_augmentation_fields_are_checked() -> None:

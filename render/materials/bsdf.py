@@ -4,7 +4,6 @@ Importing this module loads mitsuba. The numpy form, slow and plain, is `render.
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -12,14 +11,15 @@ import numpy as np
 
 from render import variant
 from render.errors import InputError
-from render.materials import highlight, model
+from render.materials import model, plugin
 from render.materials.library import load
+from render.materials.lobes import HalfVectorLobes, cell, half_cell, upload
 from render.materials.model import Material
+from render.materials.plugin import FamilyBSDF
 
 mi = variant.load()
 
 _ROWS, _COLUMNS, _SHADOW = model.HALF_KNOTS, model.DIFFERENCE_KNOTS, model.SHADOWING_KNOTS
-_LOBE = model.HALF_KNOTS + 1  # lobe probability, then the cumulative distribution at the knots of theta_h
 
 
 class Coordinates(NamedTuple):
@@ -34,7 +34,7 @@ class Coordinates(NamedTuple):
     active: Any  # Bool
 
 
-class PackedMaterials:
+class PackedMaterials(HalfVectorLobes):
     """K materials as flat float32 arrays, for kernels that index them by number.
 
     Number and values are opaque: exchanging materials, or their number, compiles nothing again. All methods work inside
@@ -50,14 +50,9 @@ class PackedMaterials:
     def __init__(self, materials: Sequence[Material]) -> None:
         if not materials:
             raise InputError("materials: at least one is needed")
-        self.names = tuple(material.name for material in materials)
-        self.highlight = np.array([narrow_share(material) for material in materials])
+        super().__init__(tuple(material.name for material in materials), list(materials))
         self.tables = upload(np.stack([_packed_tables(material) for material in materials]))
         self.shadowing = upload(np.stack([_packed_shadowing(material) for material in materials]))
-        self.lobes = upload(np.stack([lobe_distribution(material) for material in materials]))
-
-    def __len__(self) -> int:
-        return len(self.names)
 
     @staticmethod
     def prepare(wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True) -> Coordinates:
@@ -86,8 +81,8 @@ class PackedMaterials:
             zero = load_rgb(self.tables, base + 2 * offset, at.active)
             one = load_rgb(self.tables, base + 2 * offset + 1, at.active)
             value += weight * dr.fma(at.azimuth, one - zero, zero)
-        for cell in (at.shadow_i, at.shadow_o):
-            value *= self.shadow(index, cell, at.active)
+        for place in (at.shadow_i, at.shadow_o):
+            value *= self.shadow(index, place, at.active)
         return value * at.cos_o
 
     def shadow(self, index: "mi.UInt32", cell: tuple, active: "mi.Bool | bool" = True) -> "mi.Color3f":
@@ -143,78 +138,10 @@ class PackedMaterials:
         values = [dr.gather(mi.Float, entry, cell[0]) for entry in row]
         return mi.Color3f(*(dr.fma(cell[1], values[c + 3], values[c]) for c in range(3)))
 
-    def eval(
-        self, index: "mi.UInt32", wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True
-    ) -> "mi.Color3f":
-        """Evaluate f cos(theta_o), zero where either direction is below the horizon.
-
-        Args:
-            index: Material numbers.
-            wi: Unit vectors to the camera (or the previous vertex).
-            wo: Unit vectors to the light, which carries the cosine.
-            active: Lanes to evaluate.
-        """
-        return self.eval_at(index, self.prepare(wi, wo, active))
-
-    def sample_lobe(
-        self,
-        index: "mi.UInt32",
-        wi: "mi.Vector3f",
-        sample1: "mi.Float",
-        sample2: "mi.Point2f",
-        active: "mi.Bool | bool" = True,
-    ) -> "mi.Vector3f":
-        """Draw `wo` from the material's mixture of a cosine lobe and a tabulated lobe of half vectors.
-
-        Directions drawn below the horizon are returned as they are: `eval` and `pdf` are zero there.
-
-        Args:
-            index: Material numbers.
-            wi: Unit vectors to the camera.
-            sample1: Uniform variate, chooses the lobe.
-            sample2: Two uniform variates, choose the direction.
-            active: Lanes to sample.
-        """
-        active = mi.Bool(active)
-        start = index * _LOBE
-        probability = dr.gather(mi.Float, self.lobes, start, active)
-        cell = dr.binary_search(
-            0, _ROWS - 2, lambda k: dr.gather(mi.Float, self.lobes, start + 2 + k, active) <= sample2.x
-        )
-        low = dr.gather(mi.Float, self.lobes, start + 1 + cell, active)
-        high = dr.gather(mi.Float, self.lobes, start + 2 + cell, active)
-        fraction = dr.clip((sample2.x - low) / dr.maximum(high - low, 1e-12), 0, 1)
-        height = dr.lerp(_knot(cell), _knot(cell + 1), fraction)  # 1 - cos(theta_h)
-        sine, cosine = dr.sincos(dr.two_pi * sample2.y)
-        sin_h = dr.sqrt(dr.maximum(height * (2 - height), 0))
-        half = mi.Vector3f(sin_h * cosine, sin_h * sine, 1 - height)
-        reflected = dr.normalize(2 * dr.dot(wi, half) * half - wi)
-        return dr.select(sample1 < probability, reflected, mi.warp.square_to_cosine_hemisphere(sample2))
-
-    def pdf(
-        self, index: "mi.UInt32", wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True
-    ) -> "mi.Float":
-        """Return the density per solid angle with which `sample_lobe` draws `wo`; zero below the horizon."""
-        active = mi.Bool(active) & (wi.z > 0) & (wo.z > 0)
-        half = dr.normalize(wi + wo)
-        cell, _ = half_cell(dr.fma(half.x, half.x, half.y * half.y), half.z)
-        start = index * _LOBE
-        probability = dr.gather(mi.Float, self.lobes, start, active)
-        low = dr.gather(mi.Float, self.lobes, start + 1 + cell, active)
-        high = dr.gather(mi.Float, self.lobes, start + 2 + cell, active)
-        lobe = (high - low) / (dr.two_pi * (_knot(cell + 1) - _knot(cell)) * 4 * dr.maximum(dr.dot(wi, half), 1e-8))
-        return dr.select(active, dr.lerp(wo.z * dr.inv_pi, lobe, probability), 0)
-
-
-def half_cell(sin2_h: "mi.Float", cos_h: "mi.Float") -> tuple:
-    """Return the cell and fraction of theta_h; its sine is what float32 keeps exact near zero."""
-    root = dr.sqrt(dr.sqrt(dr.minimum(sin2_h / (1 + dr.maximum(cos_h, 0)), 1)))
-    return _cell(2 * root / (1 + root), _ROWS)
-
 
 def shadow_cell(cosine: "mi.Float") -> tuple:
     """Return the cell and fraction of an elevation for the factor S."""
-    return _cell(1 - cosine, _SHADOW)
+    return cell(1 - cosine, _SHADOW)
 
 
 def azimuth(cos_i: "mi.Float", cos_o: "mi.Float", sin2_h: "mi.Float", cos_d: "mi.Float") -> "mi.Float":
@@ -224,7 +151,7 @@ def azimuth(cos_i: "mi.Float", cos_o: "mi.Float", sin2_h: "mi.Float", cos_d: "mi
 
 
 def _difference_cell(cos_d: "mi.Float") -> tuple:
-    return _cell(dr.sqrt(dr.maximum(1 - cos_d, 0)), _COLUMNS)
+    return cell(dr.sqrt(dr.maximum(1 - cos_d, 0)), _COLUMNS)
 
 
 def load_rgb(source: "mi.Float", entry: "mi.UInt32", active: "mi.Bool") -> "mi.Color3f":
@@ -239,82 +166,17 @@ def load_rgb(source: "mi.Float", entry: "mi.UInt32", active: "mi.Bool") -> "mi.C
     return mi.Color3f(*(dr.gather(mi.Float, source, 4 * entry + channel, active) for channel in range(3)))
 
 
-def lobe_distribution(material: Material) -> np.ndarray:
-    """Return the (33,) sampling table: probability of the half-vector lobe, then its distribution at the 32 knots.
-
-    The lobe is the luminance of T at small theta_d over its floor at moderate theta_h, constant per solid angle inside
-    a cell; its probability is its share of an estimate of the albedo, and zero for a material without a highlight.
-    """
-    luminance = np.array([0.2126, 0.7152, 0.0722]) @ material.bivariate[:, :, :4].mean(2)  # (32,)
-    height = model.half_knots()
-    floor = luminance[height < 0.5].min()
-    excess = np.maximum(luminance - floor, 0)
-    mass = (excess[:-1] + excess[1:]) / 2 * (np.diff(height) - np.diff(height**2) / 2)  # over cos(theta_h) d(cos)
-    lobe = 8 * np.pi * mass.sum()
-    probability = lobe / max(lobe + np.pi * floor, 1e-12)
-    if probability < 0.01:
-        return np.concatenate([[0.0], np.linspace(0, 1, len(height))])
-    return np.concatenate([[min(probability, 0.9)], [0.0], np.cumsum(mass) / mass.sum()])
-
-
-def narrow_share(material: Material) -> float:
-    """Return the share of its light that a narrow highlight reflects (see `highlight.share`)."""
-    luminance = np.array([0.2126, 0.7152, 0.0722]) @ material.bivariate[:, :, :4].mean(2)
-    return highlight.share(np.arccos(1 - model.half_knots()), luminance)
-
-
 def register() -> None:
     """Register the Mitsuba BSDF plugin `ps_material` (property `material`: a library name or a YAML path), once."""
-    _plugin()
+    plugin.register("ps_material", MERLFitBSDF)
 
 
-@cache
-def _plugin() -> type:
-    mi.register_bsdf("ps_material", MERLFitBSDF)
-    return MERLFitBSDF
-
-
-class MERLFitBSDF(mi.BSDF):
+class MERLFitBSDF(FamilyBSDF):
     """One-sided Mitsuba BSDF of one `Material`, e.g. `{'type': 'ps_material', 'material': 'chrome'}`."""
 
     def __init__(self, props: "mi.Properties") -> None:
-        mi.BSDF.__init__(self, props)
         self.material = load(props["material"])
-        self.packed = PackedMaterials([self.material])
-        flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
-        self.m_components = [flags]
-        self.m_flags = flags
-
-    def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple:
-        """Draw a direction; the weight is f cos / pdf (Mitsuba's `BSDF.sample`)."""
-        active &= mi.Frame3f.cos_theta(si.wi) > 0
-        wo = self.packed.sample_lobe(mi.UInt32(0), si.wi, sample1, sample2, active)
-        value, density = self.eval_pdf(ctx, si, wo, active)
-        valid = active & (density > 0)
-        sample = dr.zeros(mi.BSDFSample3f, dr.width(density))
-        sample.wo = wo
-        sample.pdf = dr.select(valid, density, 0)
-        sample.eta = 1.0
-        sample.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-        sample.sampled_component = mi.UInt32(0)
-        return sample, dr.select(valid, value / density, 0)
-
-    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        """Return f cos(theta_o)."""
-        return self.packed.eval(mi.UInt32(0), si.wi, wo, active)
-
-    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        """Return the density of `sample` per solid angle."""
-        return self.packed.pdf(mi.UInt32(0), si.wi, wo, active)
-
-    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple:
-        """Return both `eval` and `pdf`."""
-        return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
-    def traverse(self, callback: Any) -> None:
-        """Expose the packed tables."""
-        for name in ("tables", "shadowing", "lobes"):
-            callback.put(name, getattr(self.packed, name), mi.ParamFlags.NonDifferentiable)
+        super().__init__(props, [PackedMaterials([self.material])])
 
     def to_string(self) -> str:
         """Name the material."""
@@ -331,24 +193,3 @@ def _packed_shadowing(material: Material) -> np.ndarray:
     """Return (8, 2, 4): per cell RGB at its start and the change over it, padded to four floats each."""
     knots = material.shadowing.T  # (9, 3)
     return np.pad(np.stack([knots[:-1], np.diff(knots, axis=0)], 1), ((0, 0), (0, 0), (0, 1)))
-
-
-def upload(values: np.ndarray) -> "mi.Float":
-    """Upload as a flat float32 array that kernels see as data, not as a literal."""
-    array = mi.Float(np.ascontiguousarray(values, np.float32).ravel())
-    dr.make_opaque(array)
-    return array
-
-
-def _cell(coordinate: "mi.Float", knots: int) -> tuple:
-    """Return the cell of `coordinate` in [0, 1] among uniform knots, and the fraction inside it."""
-    position = dr.clip(coordinate, 0, 1) * (knots - 1)
-    index = dr.minimum(mi.UInt32(position), knots - 2)
-    return index, position - mi.Float(index)
-
-
-def _knot(index: "mi.UInt32") -> "mi.Float":
-    """Return 1 - cos(theta_h) at a knot, as `model.half_knots`."""
-    x = mi.Float(index) / (_ROWS - 1)
-    root = x / (2 - x)
-    return dr.square(dr.square(root))

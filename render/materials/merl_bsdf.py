@@ -4,7 +4,6 @@ Importing this module loads mitsuba. The numpy form, slow and plain, is `render.
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -12,10 +11,13 @@ import numpy as np
 
 from render import variant
 from render.errors import InputError
-from render.materials import merl, model
-from render.materials.bsdf import MERLFitBSDF, PackedMaterials, load_rgb, lobe_distribution, narrow_share, upload
+from render.materials import merl, model, plugin
+from render.materials.bsdf import load_rgb
+from render.materials.library import load
+from render.materials.lobes import HalfVectorLobes, upload
 from render.materials.merl import MerlTable
 from render.materials.model import Material
+from render.materials.plugin import FamilyBSDF
 
 mi = variant.load()
 
@@ -36,7 +38,7 @@ class MerlCoordinates(NamedTuple):
     active: Any  # Bool
 
 
-class PackedMerl:
+class PackedMerl(HalfVectorLobes):
     """K MERL tables as one flat float32 array, for kernels that index them by number.
 
     Number and values are opaque: exchanging tables, or their number, compiles nothing again. The methods are used as
@@ -53,20 +55,11 @@ class PackedMerl:
     def __init__(self, tables: Sequence[MerlTable]) -> None:
         if not 0 < len(tables) <= MOST_TABLES:
             raise InputError(f"materials: 1 to {MOST_TABLES} MERL tables can be packed together, got {len(tables)}")
-        self.names = tuple(table.name for table in tables)
+        super().__init__(tuple(table.name for table in tables), [coarse_form(table) for table in tables])
         packed = np.zeros((len(tables), _ENTRIES, 4), np.float32)
         for slot, table in zip(packed, tables, strict=True):
             slot[:, :3] = merl.knots(table.values).reshape(3, -1).T
         self.tables = upload(packed)
-        coarse = [coarse_form(table) for table in tables]
-        self.lobes = upload(np.stack([lobe_distribution(material) for material in coarse]))
-        self.highlight = np.array([narrow_share(material) for material in coarse])
-
-    # These need `lobes`, `names` and the methods below alone; not inherited, since not all of `PackedMaterials` holds.
-    __len__ = PackedMaterials.__len__
-    eval = PackedMaterials.eval
-    sample_lobe = PackedMaterials.sample_lobe
-    pdf = PackedMaterials.pdf
 
     @staticmethod
     def prepare(wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True) -> MerlCoordinates:
@@ -120,37 +113,21 @@ def coarse_form(table: MerlTable) -> Material:
 
 def register() -> None:
     """Register the Mitsuba BSDF plugin `merl` (property `filename`: a MERL `.binary` file), once."""
-    _plugin()
+    plugin.register("merl", MerlBSDF)
 
 
-@cache
-def _plugin() -> type:
-    mi.register_bsdf("merl", MerlBSDF)
-    return MerlBSDF
-
-
-class MerlBSDF(MERLFitBSDF):
+class MerlBSDF(FamilyBSDF):
     """One-sided Mitsuba BSDF of one MERL table, e.g. `{'type': 'merl', 'filename': 'chrome.binary'}`."""
 
     def __init__(self, props: "mi.Properties") -> None:
-        from render.materials.library import load
-
-        mi.BSDF.__init__(self, props)
-        self.material = load(props["filename"])
-        if not isinstance(self.material, MerlTable):
+        self.table = load(props["filename"])
+        if not isinstance(self.table, MerlTable):
             raise InputError(f"{props['filename']}: the plugin `merl` reads MERL tables, files ending in .binary")
-        self.packed = PackedMerl([self.material])
-        self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide]
-        self.m_flags = self.m_components[0]
-
-    def traverse(self, callback: Any) -> None:
-        """Expose the packed table."""
-        for name in ("tables", "lobes"):
-            callback.put(name, getattr(self.packed, name), mi.ParamFlags.NonDifferentiable)
+        super().__init__(props, [PackedMerl([self.table])])
 
     def to_string(self) -> str:
         """Name the file."""
-        return f"MerlBSDF[filename={self.material.path}]"
+        return f"MerlBSDF[filename={self.table.path}]"
 
 
 def _cell(coordinate: "mi.Float", cells: int) -> tuple:

@@ -59,11 +59,11 @@ def split(name: str) -> tuple[Pattern | None, tuple[str, ...]]:
     kind, _, rest = name.partition(":")
     if kind not in PATTERNS:
         head, separator, _ = rest.partition(":")
-        if separator and "+" in rest and head.isdigit():
+        if separator and "+" in rest and head.isdecimal():
             raise unknown("pattern", kind, PATTERNS)
         return None, (name,)
     seed, separator, materials = rest.partition(":")
-    if not separator or not seed.isdigit():
+    if not separator or not seed.isdecimal():
         raise InputError(f"surface {name!r}: expected {kind}:<seed>:<material>+<material>, e.g. {kind}:7:chrome+nylon")
     names = tuple(part.strip() for part in materials.split("+"))
     if not 2 <= len(names) <= MOST_COMPONENTS or not all(names):

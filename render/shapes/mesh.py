@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 
 from render.errors import InputError
+from render.manifest import View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +69,11 @@ class TriangleMesh:
             raise InputError("rotation: it mirrors (determinant -1), which turns the surface inside out")
         turn = rotation.T.astype(np.float32)
         return replace(self, vertices=self.vertices @ turn, normals=unit(self.normals @ turn))
+
+    def posed(self, view: View) -> "TriangleMesh":
+        """Rotate, scale and move the mesh into the camera frame (units: half image widths)."""
+        turned = self.rotated(view.matrix())
+        return replace(turned, vertices=turned.vertices * view.scale + np.array([*view.offset, 0.0]))
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -1,0 +1,157 @@
+"""The parts of `sdps bench` that concern whole runs: steady state, memory, processes and stages."""
+
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipelines import presets
+from render import estimate
+from render.files import atomic_path
+from render.plan import plan
+from render.supervisor import RunOptions, RunSummary, render_supervised
+
+_WARM_UP = 12  # views, after which every kernel a run needs has been met
+_VIEWS = 40
+_PAPER_SCENES = 85_212
+
+
+def run(part: str, scenes: int, out: Path | None) -> tuple[dict, str]:
+    """Run one part.
+
+    Args:
+        part: A key of `PARTS`.
+        scenes: Scenes of the memory test.
+        out: Folder for pictures, or None.
+
+    Returns:
+        Plain values, and Markdown lines about them.
+    """
+    return PARTS[part](scenes, out)
+
+
+def steady_state(_: int, __: Path | None) -> tuple[dict, str]:
+    """Count the kernels compiled while shapes, views, materials and lights change."""
+    from render import variant
+
+    variant.load()
+    import drjit as dr
+
+    from render import many_lights, scene, shapes
+    from render.materials.packed import pack
+
+    config = presets.load("small").data
+    config = replace(config, families={"blobby": 8, "sculpture": 18}, views=2, spatially_varying=0.0, spp=16)
+    planned = plan(config)[: 2 * (_WARM_UP + _VIEWS)]
+
+    def render(first: int) -> None:
+        pair = planned[first : first + 2]
+        built = scene.build(shapes.load(pair[0].shape))
+        _, images = many_lights.render(
+            built, pair[0].view, pack([one.material for one in pair], built.mesh), pair[0].light_directions(),
+            size=config.size, spp=config.spp, bounces=config.bounces, seed=pair[0].seed,
+        )  # fmt: skip
+        for _ in images:
+            pass
+
+    for number in range(_WARM_UP):
+        render(2 * number)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for number in range(_WARM_UP, _WARM_UP + _VIEWS):
+            render(2 * number)
+        history = dr.kernel_history([dr.KernelType.JIT])
+    compiled = sum(not kernel["cache_hit"] or bool(kernel["cache_disk"]) for kernel in history)
+    values = {"views": _VIEWS, "launches": len(history), "kernels_compiled": compiled}
+    return values, (
+        f"Steady state: {_VIEWS} views of {len({s.shape for s in planned})} shapes with other poses, materials and "
+        f"lights, {len(history):,} kernel launches, {compiled} kernels compiled.\n"
+    )
+
+
+def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
+    """Render many small scenes in this process and follow its memory."""
+    from render import worker
+
+    config = presets.load("small").data
+    shapes = -(-scenes // 8)
+    config = replace(config, families={"blobby": shapes // 2, "sculpture": shapes - shapes // 2}, views=4, size=64,
+                     spp=16, light_count=32, spatially_varying=0.1)  # fmt: skip
+    sizes = []
+    with tempfile.TemporaryDirectory() as folder:
+        planned = plan(config)[:scenes]
+
+        def record(scene: object) -> None:
+            sizes.append(_resident())
+            (Path(folder) / scene.file).unlink()
+
+        worker.render_scenes(planned, folder, on_shard=record)
+    megabytes = np.array(sizes) / 1e6
+    quarter = max(1, len(megabytes) // 4)
+    growth = 1000 * np.polyfit(np.arange(len(megabytes))[quarter:], megabytes[quarter:], 1)[0]
+    values = {"scenes": len(megabytes), "start_mb": float(megabytes[quarter]), "end_mb": float(megabytes[-1]),
+              "peak_mb": float(megabytes.max()), "growth_mb_per_1000": float(growth)}  # fmt: skip
+    if out:
+        _plot(megabytes, out / "memory.png")
+    return values, (
+        f"Memory over {len(megabytes):,} scenes in one process: {values['start_mb']:.0f} MB after a quarter of them, "
+        f"{values['end_mb']:.0f} MB at the end, peak {values['peak_mb']:.0f} MB; trend of the last three quarters "
+        f"{growth:+.0f} MB per 1,000 scenes.\n"
+    )
+
+
+def workers(_: int, __: Path | None) -> tuple[dict, str]:
+    """Render the same part of the `paper` preset with one process and with one per core; profile its stages."""
+    base = presets.load("paper").data
+    config = replace(base, families={"blobby": 2, "sculpture": 4}, views=9, validation=0.0)
+    planned = plan(config)
+    counts = [1] if estimate.cores() == 1 else [1, estimate.cores()]
+    runs = {count: _run(planned, count) for count in counts}
+    rates = {count: len(summary.lines) / summary.seconds * 3600 for count, summary in runs.items()}
+    shares = runs[counts[-1]].stage_shares()
+    inside = sum(share for stage, share in shares.items() if stage != "other")
+    best = max(rates.values())
+    values = {"scenes": len(planned), "scenes_per_hour": rates, "stages": shares,
+              "render_share_of_work": shares.get("render", 0.0) / max(inside, 1e-9),
+              "paper_hours": _PAPER_SCENES / best}  # fmt: skip
+    lines = [f"`render-data` on {len(planned)} scenes of the `paper` preset (start of the processes included):", ""]
+    lines += [f"- {count} process{'es' * (count > 1)}: {rate:,.0f} scenes/hour" for count, rate in rates.items()]
+    if len(counts) > 1:
+        lines.append(f"- {counts[-1]} processes / 1: {rates[counts[-1]] / rates[1]:.2f}")
+    lines.append("- stages: " + ", ".join(f"{stage} {share:.0%}" for stage, share in shares.items()))
+    lines.append(f"- rendering is {values['render_share_of_work']:.0%} of the work (target: at least 70 %)")
+    lines.append(f"- projected for all {_PAPER_SCENES:,} samples: {values['paper_hours']:.1f} h")
+    return values, "\n".join(lines) + "\n"
+
+
+def _run(planned: list, count: int) -> RunSummary:
+    with tempfile.TemporaryDirectory() as folder:
+        return render_supervised(planned, Path(folder), RunOptions(workers=count))
+
+
+def _resident() -> int:
+    """Return the resident memory of this process in bytes."""
+    with open("/proc/self/statm", encoding="ascii") as handle:
+        return int(handle.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _plot(megabytes: np.ndarray, path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 2.6), dpi=110, layout="tight")
+    axes = figure.add_subplot()
+    axes.plot(np.arange(1, len(megabytes) + 1), megabytes, lw=0.8)
+    axes.set(xlabel="scenes rendered", ylabel="resident memory, MB", ylim=(0, None))
+    axes.grid(alpha=0.3)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary)
+
+
+PARTS: dict[str, Callable[[int, Path | None], tuple[dict, str]]] = {
+    "steady": steady_state,
+    "memory": memory,
+    "workers": workers,
+}
