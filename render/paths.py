@@ -101,10 +101,9 @@ def trace(
 ) -> Paths:  # fmt: skip
     """Follow the camera paths of samples `first` to `first + spp - 1` of every pixel; see `many_lights.render`."""
     camera = Camera.of(view, size)
-    rows = np.ascontiguousarray(
-        lights.T, dtype=np.float32
-    )  # uploaded one by one: a conversion of the whole has L in its code
-    directions = opaque(camera.to_object(*(mi.Float(row) for row in rows)))
+    # Row by row, since a conversion of the whole would have the number of lights in its code.
+    rows = np.asarray(lights, np.float32).T
+    directions = opaque(camera.to_object(*(upload(mi.Float, row) for row in rows)))
     ray, sample = _camera_rays(camera, spp, seed, first)
     glossy, pixel_count = any(surfaces.glossy), size * size
     depths: list[Vertices] = []
