@@ -40,11 +40,11 @@ class NoiseConfig:
         seed: Seed of lights and sampler; the reference uses the next one.
     """
 
-    shapes: tuple[str, ...] = ("sphere", "bunny")
+    shapes: tuple[str, ...] = ("bunny",)
     materials: tuple[str, ...] = ("all",)
-    spp: tuple[int, ...] = (16, 64)
+    spp: tuple[int, ...] = (64, 128)
     reference: int = 4096
-    lights: int = 8
+    lights: int = 4
     size: int = 128
     bounces: int = 2
     scale: float = 0.95
@@ -142,7 +142,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     default = NoiseConfig()
     parser.add_argument("--shapes", action="append", help=f"commas or repeat (default: {','.join(default.shapes)})")
     parser.add_argument("--materials", action="append", help="names, categories, files (default: all)")
-    parser.add_argument("--spp", action="append", help="sample counts to judge (default: 16,64)")
+    parser.add_argument("--spp", action="append", help="sample counts to judge (default: 64,128)")
     for name in ("reference", "lights", "size", "bounces", "seed"):
         parser.add_argument(f"--{name}", type=int, default=getattr(default, name), help="(default %(default)s)")
     parser.add_argument("--out", type=Path, help="also write noise.md and noise.json into this folder")

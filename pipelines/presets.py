@@ -41,7 +41,7 @@ class TestConfig:
     materials: tuple[str, ...] = ("all",)
     lights: str = "merltest"
     size: int = 128
-    spp: int = 64
+    spp: int = 128
     bounces: int = 2
     scale: float = 0.95
     seed: int = 0

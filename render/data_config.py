@@ -53,7 +53,7 @@ class DataConfig:
     lights: str = "azimuth-elevation"
     light_count: int = 64
     size: int = 128
-    spp: int = 64
+    spp: int = 128
     bounces: int = 2
     scale: tuple[float, float] = (0.75, 1.25)
     upright_scale: tuple[float, float] = (0.95, 2.0)

@@ -23,7 +23,7 @@ from render.sampling import opaque, scrambled, stream, uniform, upload
 
 mi = variant.load()
 
-NORMALS = 512  # per light and point of the surface that mirrors it
+_NORMALS_PER_SAMPLE, _FEWEST, _MOST = 8, 256, 2048
 # s = 1 - cos(theta) around h is drawn with density ~ (1 + s / _CORE)^(-3/2) up to _RIM, which falls with the cube of
 # the angle from a tenth of a degree on, as the peaks of mirror-like metals do.
 _CORE = 1 - math.cos(math.radians(0.1))
@@ -44,13 +44,18 @@ class Glints(NamedTuple):
     wi: Any  # Vector3f (1), to the camera
 
 
+def normals(spp: int) -> int:
+    """Return how many normals are drawn for a light, per point of the surface that mirrors it, beside `spp` samples."""
+    return min(max(_NORMALS_PER_SAMPLE * spp, _FEWEST), _MOST)
+
+
 def density(s: Any) -> Any:
     """Return the density per solid angle of the drawn normals at s = 1 - cos(theta) from h."""
     falloff = dr.rsqrt(1 + s * (1 / _CORE))
     return dr.select(s < _RIM, dr.square(falloff) * falloff * (1 / (4 * math.pi * _CORE * _TAIL)), 0)
 
 
-def partition(spread: Any, s: Any, size: Any, spp: Any) -> Any:
+def partition(spread: Any, s: Any, size: int, spp: int) -> Any:
     """Return the weight of a sample, of either strategy, in units of a camera sample: spp / (spp + A p).
 
     Args:
@@ -59,8 +64,8 @@ def partition(spread: Any, s: Any, size: Any, spp: Any) -> Any:
         size: Image side in pixels.
         spp: Camera samples per pixel.
     """
-    area = dr.square(2 / mi.Float(size))
-    return dr.rcp(dr.fma(NORMALS * area / mi.Float(spp) * spread, density(s), 1))
+    ratio = opaque(mi.Float(normals(spp) / spp * (2 / size) ** 2))
+    return dr.rcp(dr.fma(ratio * spread, density(s), 1))
 
 
 def one_minus_cos(normal: Any, half: Any) -> Any:
@@ -100,10 +105,10 @@ def find(scene: Any, camera: Any, directions: Any, surfaces: Any, spp: int, seed
     towards = camera.to_object(0, 0, 1)
     halves = dr.normalize(directions + towards)
     dr.eval(towards, halves)
-    candidates = _candidates(scene, towards, halves)
+    candidates = _candidates(scene, towards, halves, normals(spp))
     found = []
     for chosen in _chunks(candidates):
-        drawn = _drawn(scene, camera, halves, candidates, chosen, stream(seed, 77 + first))
+        drawn = _drawn(scene, camera, halves, candidates, chosen, normals(spp), stream(seed, 77 + first))
         drawn = drawn and _unhidden(scene, camera, directions, towards, drawn, spp)
         if drawn:
             found.append(drawn)
@@ -136,7 +141,7 @@ def _unhidden(scene: Any, camera: Any, directions: Any, towards: Any, drawn: tup
     seen = (dr.abs(x) < 1) & (dr.abs(y) < 1) & (dr.dot(normal, direction) > 0) & (spread > 0)
     seen &= ~scene.ray_test(start.spawn_ray(towards), False, seen)
     seen &= ~scene.ray_test(start.spawn_ray(direction), False, seen)
-    factor = partition(spread, s, opaque(mi.UInt32(camera.size)), opaque(mi.UInt32(spp)))
+    factor = partition(spread, s, camera.size, spp)
     dr.eval(seen, x, y, factor)
     kept = dr.compress(seen)
     if len(kept) == 0:
@@ -157,7 +162,7 @@ class _Candidates(NamedTuple):
     end: np.ndarray  # (C,) one past the last
 
 
-def _candidates(scene: Any, towards: Any, halves: Any) -> _Candidates | None:
+def _candidates(scene: Any, towards: Any, halves: Any, count: int) -> _Candidates | None:
     """Find, by the bounding cone of each triangle's normals, which of a light's drawn normals it may have.
 
     The normals of a light are numbered by their distance from the half vector, so these are a run.
@@ -190,19 +195,19 @@ def _candidates(scene: Any, towards: Any, halves: Any) -> _Candidates | None:
     half, axis = dr.gather(mi.Vector3f, halves, light), dr.gather(mi.Vector3f, axis, local)
     away = 2 * dr.asin(dr.minimum(dr.norm(axis - half) * 0.5, 1))  # exact for small angles, unlike acos
     cone = dr.gather(mi.Float, cone, local)
-    ends = [_number(1 - dr.cos(angle)) for angle in (dr.maximum(away - cone, 0), dr.minimum(away + cone, math.pi))]
+    ends = [_share(1 - dr.cos(angle)) for angle in (dr.maximum(away - cone, 0), dr.minimum(away + cone, math.pi))]
     triangle = dr.gather(mi.UInt32, shown, local)
     dr.eval(triangle, light, ends)
-    begin, end = (np.array(value, np.float64) for value in ends)
+    begin, end = (count * np.array(value, np.float64) for value in ends)
     return _Candidates(
         triangle, light, np.maximum(np.floor(begin) - 1, 0).astype(np.int64),
-        np.minimum(np.ceil(end) + 1, NORMALS).astype(np.int64),
+        np.minimum(np.ceil(end) + 1, count).astype(np.int64),
     )  # fmt: skip
 
 
-def _number(s: Any) -> Any:
-    """Return how many of a light's normals lie within s = 1 - cos(theta) of its half vector, a real number."""
-    return (1 - dr.rsqrt(1 + dr.minimum(s, _RIM) * (1 / _CORE))) * (NORMALS / _TAIL)
+def _share(s: Any) -> Any:
+    """Return the share of a light's normals within s = 1 - cos(theta) of its half vector."""
+    return (1 - dr.rsqrt(1 + dr.minimum(s, _RIM) * (1 / _CORE))) * (1 / _TAIL)
 
 
 def _chunks(candidates: _Candidates | None) -> Iterator[tuple]:
@@ -225,7 +230,9 @@ def _chunks(candidates: _Candidates | None) -> Iterator[tuple]:
             yield tuple(upload(mi.UInt32, values.astype(np.uint32)) for values in (pairs, numbers))
 
 
-def _drawn(scene: Any, camera: Any, halves: Any, candidates: _Candidates, chosen: tuple, seed: Any) -> tuple | None:
+def _drawn(
+    scene: Any, camera: Any, halves: Any, candidates: _Candidates, chosen: tuple, count: int, seed: Any
+) -> tuple | None:
     """Draw normals around half vectors; return those that their triangle has, and where.
 
     A light's normals are a rotated Hammersley set of its own for every triangle.
@@ -234,7 +241,7 @@ def _drawn(scene: Any, camera: Any, halves: Any, candidates: _Candidates, chosen
     prim, light = dr.gather(mi.UInt32, candidates.triangle, pair), dr.gather(mi.UInt32, candidates.light, pair)
     half = dr.gather(mi.Vector3f, halves, light)
     turn = scrambled(prim * mi.UInt32(0x9E3779B1) + light, seed)
-    u = (mi.Float(number) + uniform(turn[0])) * (1 / NORMALS)
+    u = (mi.Float(number) + uniform(turn[0])) * opaque(mi.Float(1 / count))
     s = _CORE * (dr.rcp(dr.square(1 - u * _TAIL)) - 1)
     sine = dr.sqrt(dr.maximum(s * (2 - s), 0))
     sin_phi, cos_phi = dr.sincos(dr.two_pi * mi.radical_inverse_2(number, turn[1]))

@@ -144,11 +144,10 @@ def _partition(paths: Paths, vertices: Vertices, lanes: _Lanes, surfaces: Packed
     if vertices.spread is None or not surfaces.glossy[number]:
         return lambda at, normal: mi.Float(1)
     half = dr.normalize(mi.Vector3f(vertices.wi) + lanes.direction)
-    size, spp = opaque(mi.UInt32(paths.size)), opaque(mi.UInt32(paths.spp))
 
     def weigh(at: Any, normal: Any) -> Any:
         spread = dr.gather(mi.Float, vertices.spread, at)
-        return highlights.partition(spread, highlights.one_minus_cos(normal, half), size, spp)
+        return highlights.partition(spread, highlights.one_minus_cos(normal, half), paths.size, paths.spp)
 
     return weigh
 

@@ -8,7 +8,7 @@ import render_support as support
 
 from render import shapes
 from render.errors import InputError
-from render.materials import library, merl, merl_bsdf, packed, surface_bsdf
+from render.materials import merl, merl_bsdf, packed, surface_bsdf
 from render.materials.bsdf import PackedMaterials
 from render.materials.merl_bsdf import PackedMerl
 from render.materials.packed import Part, pack
@@ -176,4 +176,3 @@ def test_the_plugin_is_black_from_below():
     value, density = plugin.eval_pdf(mi.BSDFContext(), si, wo, True)
     assert not np.array(value)[:, :2].any() and not np.array(density)[:2].any()
     assert np.array(value)[:, 2].all() and np.array(density)[2] > 0
-    assert library.load("chrome").name == "chrome"

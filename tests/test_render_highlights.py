@@ -39,6 +39,9 @@ def halves(lights=LIGHTS, view: View = VIEW) -> np.ndarray:
     return half / np.linalg.norm(half, axis=1, keepdims=True) @ view.matrix()
 
 
+NORMALS = highlights.normals(SPP)
+
+
 def heights(values: np.ndarray) -> np.ndarray:
     return np.array(highlights.density(mi.Float(values.astype(np.float32))), np.float64)
 
@@ -53,14 +56,14 @@ def test_density_is_a_density():
 
 
 def test_numbers_of_normals_count_the_density():
-    """`_number` inverts the mapping that normals are drawn by, and is the distribution of `density`."""
+    """`_share` inverts the mapping that normals are drawn by, and is the distribution of `density`."""
     u = np.linspace(0, 1, 300)
     s = highlights._CORE * ((1 - u * highlights._TAIL) ** -2 - 1)
-    number = np.array(highlights._number(mi.Float(s.astype(np.float32))))
-    np.testing.assert_allclose(number, u * highlights.NORMALS, atol=0.01)
+    number = NORMALS * np.array(highlights._share(mi.Float(s.astype(np.float32))))
+    np.testing.assert_allclose(number, u * NORMALS, atol=0.01)
     fine = np.linspace(0, s[150], 20001)
     below = 2 * np.pi * heights((fine[1:] + fine[:-1]) / 2).sum() * (fine[1] - fine[0])
-    assert below == pytest.approx(number[150] / highlights.NORMALS, rel=1e-3)
+    assert below == pytest.approx(number[150] / NORMALS, rel=1e-3)
 
 
 def test_points_lie_on_the_mesh_where_the_normal_is_the_one_drawn():
@@ -104,10 +107,10 @@ def test_as_many_points_as_were_drawn_where_nothing_hides_them():
     glints, _ = found(shapes.load("sphere"), view=View(scale=0.9))
     light = np.array(glints.light)
     counts = np.bincount(light, minlength=len(LIGHTS))
-    assert abs(counts - highlights.NORMALS).max() < 0.15 * highlights.NORMALS
+    assert abs(counts - NORMALS).max() < 0.15 * NORMALS
     normal = np.array(glints.normal).T.astype(np.float64)
     s = 1 - (normal * halves(view=View())[light]).sum(1)
-    share = np.array(highlights._number(mi.Float(s.astype(np.float32)))) / highlights.NORMALS
+    share = np.array(highlights._share(mi.Float(s.astype(np.float32))))
     near = share > 0.1  # of smaller ones float32 normals do not tell the angle
     assert stats.kstest((share[near] - 0.1) / 0.9, "uniform").pvalue > 1e-3
     azimuth = np.cross(normal, halves(view=View())[light])
@@ -119,9 +122,9 @@ def test_weights_are_shares_of_a_camera_sample():
     factor = np.array(glints.factor)
     assert factor.min() > 0 and factor.max() <= 1
     spread, s = mi.Float([0.0, 1.0, 10.0]), mi.Float([0.0, 1e-5, 1e-4])
-    weight = np.array(highlights.partition(spread, s, mi.UInt32(SIZE), mi.UInt32(SPP)), np.float64)
+    weight = np.array(highlights.partition(spread, s, SIZE, SPP), np.float64)
     area = (2 / SIZE) ** 2  # of a pixel
-    density = highlights.NORMALS * np.array(highlights.density(s), np.float64) * np.array(spread)  # over image area
+    density = NORMALS * np.array(highlights.density(s), np.float64) * np.array(spread)  # over image area
     np.testing.assert_allclose(weight, SPP / (SPP + area * density), rtol=1e-5)
 
 

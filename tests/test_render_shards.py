@@ -217,3 +217,76 @@ def test_half_precision_saturates():
     assert rounded.dtype == np.float16
     np.testing.assert_array_equal(rounded[1:4], np.float16(65504))
     assert np.isnan(rounded[4])
+
+
+# ---- Spatially-varying scenes -----------------------------------------------------------------------
+
+
+@pytest.fixture
+def varying(shard) -> Shard:
+    """Return a shard of three materials."""
+    weights = np.random.default_rng(6).random((3, SIZE, SIZE)).astype(np.float32)
+    weights = np.where(shard.mask, weights / weights.sum(0), 0).astype(np.float32)
+    return replace(shard, weights=weights, materials=("chrome", "lambertian:0.8/0.3/0.1", "folder/mine.binary"))
+
+
+def test_material_weights_make_the_round_trip(varying, tmp_path):
+    path = tmp_path / "a.exr"
+    write_shard(path, varying)
+    read = read_shard(path)
+    assert read.materials == varying.materials
+    assert read.weights.dtype == np.float32 and read.weights.tobytes() == varying.weights.tobytes()
+    for name in ("images", "normals", "depth", "mask", "coverage", "light_directions"):
+        assert getattr(read, name).tobytes() == getattr(varying, name).tobytes(), name
+    parts = OpenEXR.File(str(path), separate_channels=True).parts
+    assert [part.name() for part in parts] == ["gt", "materials", "L000", "L001", "L002"]
+    assert set(parts[1].channels) == {"w0", "w1", "w2"}
+    assert parts[1].header["ps:materials"] == "chrome+lambertian:0.8/0.3/0.1+folder/mine.binary"
+
+
+def test_more_weights_than_a_digit_keep_their_order(varying, tmp_path):
+    """OpenEXR sorts channels by name, where w10 comes before w2."""
+    weights = np.arange(12, dtype=np.float32)[:, None, None] + np.zeros((SIZE, SIZE), np.float32)
+    many = replace(varying, weights=weights, materials=tuple(f"lambertian:0.{k + 10}" for k in range(12)))
+    write_shard(tmp_path / "a.exr", many)
+    np.testing.assert_array_equal(read_shard(tmp_path / "a.exr").weights, weights)
+
+
+def test_a_shard_of_one_material_has_no_weights(path):
+    read = read_shard(path)
+    assert read.weights is None and read.materials == ()
+    assert b"ps:materials" not in path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"materials": ("chrome",)}, {"materials": ()}, {"weights": None},
+        {"weights": np.zeros((3, SIZE, SIZE - 1), np.float32)}, {"weights": np.zeros((3, SIZE, SIZE))},
+        {"weights": np.zeros((2, SIZE, SIZE), np.float32)}, {"weights": np.zeros((3, SIZE, SIZE, 1), np.float32)},
+    ],
+)  # fmt: skip
+def test_weights_that_do_not_fit_are_refused(varying, change):
+    with pytest.raises(InputError, match=r"weights must be float32 of shape \(\d, 16, 16\)"):
+        replace(varying, **change)
+
+
+def test_weights_that_are_not_finite_are_refused(varying, tmp_path):
+    weights = varying.weights.copy()
+    weights[1, 2, 3] = np.nan
+    with pytest.raises(InputError, match=r"materials\.w1: .*infinite or NaN"):
+        write_shard(tmp_path / "a.exr", replace(varying, weights=weights))
+    assert files(tmp_path) == []
+
+
+def test_damaged_weights_are_refused(varying, tmp_path):
+    path = tmp_path / "a.exr"
+    write_shard(path, varying)
+    data = path.read_bytes()
+    start = data.index(b"ps:materials")
+    for position in [*range(start, start + 80), *range(len(data) // 4, len(data), len(data) // 40)]:
+        altered = bytearray(data)
+        altered[position] ^= 0x01
+        path.write_bytes(altered)
+        with pytest.raises(InputError, match="altered"):
+            read_shard(path)

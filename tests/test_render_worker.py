@@ -12,7 +12,7 @@ from render.chunks import Chunk, view_groups
 from render.errors import InputError
 from render.manifest import SceneSpec, View
 from render.plan import DataConfig, plan
-from render.shards import file_hash, is_whole, read_shard
+from render.shards import Shard, file_hash, is_whole, read_shard
 
 CONFIG = DataConfig(
     families={"blobby": 2}, views=2, materials_per_view=3, materials=("fabric", "chrome"), light_count=6, size=24, spp=4
@@ -115,6 +115,74 @@ def test_object_outside_the_frame_is_told(scenes, tmp_path):
     with pytest.raises(InputError, match=r"outside the frame; check view\.scale"):
         worker.render_scenes([lost], tmp_path)
     assert not (tmp_path / "shards").exists() or not any((tmp_path / "shards").iterdir())
+
+
+# ---- Spatially-varying scenes -----------------------------------------------------------------------
+
+COMPONENTS = ("lambertian:0.9/0.5/0.1", "pink-felt")
+
+
+def varying(kind: str, folder: Path, **changes) -> tuple[Shard, list[Shard]]:
+    """Render a surface of a pattern in direct light, and its materials alone; return their shards."""
+    names = (f"{kind}:7:{'+'.join(COMPONENTS)}", *COMPONENTS)
+    spec = SceneSpec(
+        id="0", seed=3, split="test", shape="blobby:1", material="", view=View(scale=0.9), size=32, spp=16, bounces=0,
+        lights=((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (-0.28, 0.6, 0.7493998)),
+    )  # fmt: skip
+    scenes = [replace(spec, id=str(number), material=name, **changes) for number, name in enumerate(names)]
+    assert worker.render_scenes(scenes, folder) == 3
+    first, *others = (read_shard(folder / scene.file, scene) for scene in scenes)
+    return first, others
+
+
+@pytest.mark.parametrize("kind", ["stripes", "noise", "parts"])
+def test_a_varying_surface_is_the_mixture_of_its_materials(tmp_path, kind):
+    """In direct light, where a pixel's samples have the same weights: the same paths serve all three."""
+    mixed, alone = varying(kind, tmp_path)
+    assert mixed.materials == COMPONENTS and mixed.provenance["material"].startswith(f"{kind}:7:")
+    assert all(shard.weights is None and shard.materials == () for shard in alone)
+    assert mixed.weights.shape == (2, 32, 32) and mixed.weights.min() >= 0
+    np.testing.assert_allclose(mixed.weights.sum(0)[mixed.mask], 1, atol=1e-6)
+    assert not mixed.weights[:, ~mixed.mask].any()
+    assert (mixed.weights.max((1, 2)) > 0.9).all()
+    images = [shard.images.astype(np.float32) for shard in alone]
+    expected = sum(weight[..., None] * image for weight, image in zip(mixed.weights, images, strict=True))
+    error = np.abs(mixed.images.astype(np.float32) - expected).max((0, 3))
+    sharp = mixed.mask & (mixed.weights.max(0) == 1) & (mixed.coverage == 1)
+    smooth = mixed.mask & (mixed.coverage == 1)
+    if kind != "noise":
+        assert sharp.sum() > 100 and error[sharp].max() < 2e-3  # half precision
+    assert np.median(error[smooth]) < 5e-3 and error[smooth].max() < 0.25
+    for plain, image in zip(alone, images, strict=True):  # and each is another picture
+        assert np.abs(image - mixed.images.astype(np.float32)).max() > 0.05
+        np.testing.assert_array_equal(plain.normals, mixed.normals)
+
+
+def test_a_pattern_of_one_material_twice_is_that_material(tmp_path):
+    spec = SceneSpec(
+        id="a", seed=3, split="test", shape="blobby:1", material="stripes:1:pink-felt+pink-felt", view=View(), size=24,
+        spp=8, bounces=2, lights=((0.0, 0.0, 1.0), (0.6, 0.0, 0.8)),
+    )  # fmt: skip
+    plain = replace(spec, id="b", material="pink-felt")
+    for scene in (spec, plain):
+        worker.render_scenes([scene], tmp_path)
+    twice, once = (read_shard(tmp_path / scene.file, scene) for scene in (spec, plain))
+    assert twice.materials == ("pink-felt", "pink-felt")
+    np.testing.assert_allclose(twice.images.astype(np.float32), once.images.astype(np.float32), rtol=5e-3, atol=2e-3)
+
+
+def test_bounces_add_light_to_a_varying_surface(tmp_path):
+    """Interreflections only brighten, and leave the weights alone."""
+    direct, _ = varying("stripes", tmp_path / "direct", shape="sculpture:5")
+    bounced, _ = varying("stripes", tmp_path / "bounced", shape="sculpture:5", bounces=2)
+    gain = (bounced.images.astype(np.float32) - direct.images.astype(np.float32))[:, direct.coverage == 1]
+    assert gain.mean() > 0.002 and gain.min() > -2e-3
+    np.testing.assert_array_equal(bounced.weights, direct.weights)
+
+
+def test_an_unknown_part_of_a_pattern_is_told(scenes, tmp_path):
+    with pytest.raises(InputError, match="did you mean 'chrome'"):
+        worker.render_scenes([replace(scenes[0], material="stripes:1:crome+nylon")], tmp_path)
 
 
 # ---- One process's work, isolated ------------------------------------------------------------------
