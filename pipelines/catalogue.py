@@ -93,8 +93,14 @@ def _material_sheet(names: list[str]) -> pictures.Image.Image:
         part = names[first : first + 16]
         packed = pack(part, built.mesh)
         _, images = many_lights.render(built, View(scale=0.95), packed, _LIGHTS, size=120, spp=64, bounces=0, seed=0)
-        tiles += [(name[:21], pictures.tone_map(stack[0], 1.2)) for name, (_, stack) in zip(part, images, strict=True)]
+        shown = (pictures.tone_map(stack[0], 1.2) for _, stack in images)
+        tiles += zip(map(_label, part), shown, strict=True)
     return pictures.contact_sheet(tiles, columns=min(10, len(tiles)))
+
+
+def _label(name: str) -> str:
+    """Name a material in at most 21 letters, a file without its folders."""
+    return "+".join(part.rsplit("/", 1)[-1] for part in name.split("+"))[:21]
 
 
 def _shape_sheet() -> pictures.Image.Image:

@@ -22,9 +22,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     width = max(map(len, COMMANDS))
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = "commands:\n" + "".join(f"  {name:<{width}}  {about}\n" for name, (_, about) in COMMANDS.items())
-    parser.add_argument("data_command", metavar="COMMAND", help="see below; `sdps data COMMAND --help` lists its flags")
+    parser.add_argument("data_command", nargs="?", metavar="COMMAND",
+                        help="see below; `sdps data COMMAND --help` lists its flags")  # fmt: skip
     parser.add_argument("rest", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
-    parser.set_defaults(parser_class=type(parser))
+    parser.set_defaults(parser_class=type(parser), print_help=parser.print_help)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -33,6 +34,9 @@ def main(args: argparse.Namespace) -> int:
     Raises:
         InputError: no such subcommand, or its own complaints.
     """
+    if args.data_command is None:
+        args.print_help()
+        return 0
     if args.data_command not in COMMANDS:
         raise unknown("data command", args.data_command, COMMANDS)
     name, about = COMMANDS[args.data_command]

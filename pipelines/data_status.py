@@ -10,8 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from render import estimate, ledger
-from render.errors import InputError
-from render.manifest import MANIFEST, read_failed, read_manifest
+from render.manifest import MANIFEST, no_manifest, read_failed, read_manifest
 
 REASONS = 5  # most frequent reasons of failure that are shown
 QUIET = 300.0  # seconds without a finished scene after which a run is taken for stopped
@@ -83,9 +82,7 @@ def scene_ids(folder: Path) -> list[str]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(
-            f"{folder}: no {MANIFEST} there ({error.strerror}); plan it with `sdps data plan`, or name its data folder"
-        ) from error
+        raise no_manifest(folder) from error
     found = [name.decode() for name in _ID.findall(data)]
     if len(found) == data.count(b"\n"):
         return found

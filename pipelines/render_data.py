@@ -77,9 +77,11 @@ def planned_scenes(preset: presets.Preset, folder: Path) -> list[SceneSpec]:
     """Return the plan of a data folder, written there with the configuration if it has none yet.
 
     Raises:
-        InputError: the folder holds another plan.
+        InputError: the folder holds another plan, or stands inside of a data folder.
     """
     saved = folder / "config.yaml"
+    if (folder.parent / MANIFEST).is_file() and not folder.exists():
+        raise InputError(f"{folder.parent}: is a data folder itself; --out names the folder above it")
     if (folder / MANIFEST).exists() and saved.is_file():
         _require_same_data(preset, saved)
         return read_manifest(folder)

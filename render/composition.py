@@ -1,6 +1,5 @@
 """What a manifest is made of: counts of shapes, views, materials and categories, and the light directions."""
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,10 +9,9 @@ import numpy as np
 
 from render.errors import InputError
 from render.manifest import SceneSpec
-from render.materials import library
+from render.materials import library, surfaces
 
 IMPORTED = "imported"  # family of shapes, and prefix of materials, that came with another data set
-_VARYING = re.compile(r"(?:patches|stripes|noise|gradient|parts):\d+:(.+)")
 
 
 @dataclass(frozen=True)
@@ -57,8 +55,10 @@ def family(shape: str) -> str:
 
 def components(material: str) -> tuple[str, ...]:
     """Return the plain materials of a name; several for a spatially-varying one (`stripes:7:chrome+steel`)."""
-    match = _VARYING.fullmatch(material)
-    return tuple(match.group(1).split("+")) if match else (material,)
+    try:
+        return surfaces.split(material)[1]
+    except InputError:
+        return (material,)
 
 
 def category(material: str) -> str:

@@ -107,11 +107,22 @@ def read_manifest(folder: str | Path, split: str | None = None) -> list[SceneSpe
     """
     path = Path(folder) / MANIFEST
     if not path.is_file():
-        raise InputError(f"{folder}: no {MANIFEST} there; render it with `sdps render-data --out {folder}`")
+        raise no_manifest(Path(folder))
     chosen = [scene for scene in _scenes(path) if split in (None, scene.split)]
     if not chosen:
         raise InputError(f"{path}: no scene{f' of split {split!r}' if split else ''}; plan more scenes")
     return chosen
+
+
+def no_manifest(folder: Path) -> InputError:
+    """Build the error for a folder that is not a data folder, naming the one inside it where there is one."""
+    inner = folder / "data"
+    if (inner / MANIFEST).is_file():
+        return InputError(f"{folder}: no {MANIFEST} there; name its data folder, {inner}")
+    return InputError(
+        f"{folder}: no {MANIFEST} there; name a data folder such as out/small/data, or make one with `sdps data plan` "
+        "or `sdps render-data`"
+    )
 
 
 def read_events(path: Path) -> Iterator[dict]:

@@ -2,8 +2,8 @@
 
 Neither the camera path nor the shadow rays depend on the BRDF, and the path does not depend on the
 light. So `render.paths` follows the camera paths once, keeps their vertices, and records one bit per (vertex, light):
-lit or not. `render.shading` then sums BRDF x visibility over the vertices of each pixel, for one surface at a
-time, without a single ray. Many lights, and many materials per view, share all rays.
+lit or not. `render.shading` then sums BRDF x visibility over the vertices of each pixel, surface by
+surface, without a single ray. Many lights, and many materials per view, share all rays.
 
 The sum over a pixel runs in one lane in a fixed order, so the same seed gives the same bytes whatever the
 number of threads. Noise is correlated between the lights and materials of a view, which share paths.
@@ -63,11 +63,11 @@ def render(
         spp: Camera samples per pixel.
         bounces: Interreflection bounces after the first hit.
         seed: Sampler seed (32 bits).
-        only: Surface numbers to shade; all by default. The bytes do not depend on it.
+        only: Surface numbers to shade, in any order; all by default. The bytes do not depend on it.
         probe: Let the samples of a pixel share what its first samples agree on of a light (`render.visibility`).
 
     Returns:
-        The ground truth, and an iterator over (surface number, images) with images (L, size, size, 3) float32,
+        The ground truth, and an iterator over (surface number, images), numbers rising, with images (L, size, size, 3) float32,
         linear radiance under irradiance pi. Passes over many samples are averaged.
     """
     wanted = range(len(surfaces)) if only is None else only
@@ -79,15 +79,15 @@ def render(
     )  # fmt: skip
     first_pass = next(passes)
     if per_pass >= spp:  # shaded one by one as they are asked for, so that a hundred materials need no more memory
-        images = ((index, _averaged(shade(first_pass, surfaces, index), spp)) for index in wanted)
+        images = ((index, _averaged(stack, spp)) for index, stack in shade(first_pass, surfaces, wanted))
         return _ground_truth([first_pass], size, spp), images
-    stacks = {index: shade(first_pass, surfaces, index) for index in wanted}
+    stacks = dict(shade(first_pass, surfaces, wanted))
     truths = [_without_paths(first_pass)]
     del first_pass
     for paths in passes:
         truths.append(_without_paths(paths))
-        for index in wanted:
-            stacks[index] += shade(paths, surfaces, index)
+        for index, stack in shade(paths, surfaces, wanted):
+            stacks[index] += stack
     images = ((index, _averaged(stacks.pop(index), spp)) for index in wanted)
     return _ground_truth(truths, size, spp), images
 

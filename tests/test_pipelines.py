@@ -106,6 +106,19 @@ def test_train_and_evaluate_without_data_or_weights_say_what_to_run(capsys, tmp_
     assert not (tmp_path / "none" / "merltest").exists()
 
 
+def test_data_commands_name_the_folder_that_was_meant(capsys, tmp_path):
+    assert main(["data"]) == 0
+    assert "validate" in capsys.readouterr().out
+    assert "did you mean 'status'" in fails(capsys, "data", "stauts")
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "manifest.jsonl").write_text("")
+    for command in ("status", "validate", "preview", "card"):
+        assert f"name its data folder, {tmp_path / 'data'}" in fails(capsys, "data", command, str(tmp_path))
+        assert "no manifest.jsonl there" in fails(capsys, "data", command, str(tmp_path / "none"))
+    line = fails(capsys, "render-data", "--preset", "smoke", "--out", str(tmp_path / "data"))
+    assert "--out names the folder above" in line and not (tmp_path / "data" / "data").exists()
+
+
 def test_materials_and_shapes_list_what_there_is(capsys):
     assert main(["materials"]) == 0
     assert "100 materials" in (listing := capsys.readouterr().out) and "gold-metallic-paint" in listing
