@@ -77,7 +77,7 @@ lint: $(READY)
 
 bench: OUT = out/bench
 bench: $(ASSETS_READY)
-	$(SDPS) bench --out $(OUT)/bench.json
+	$(SDPS) bench --out $(OUT)
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipelines import presets
 from render import estimate
+from render.errors import InputError
 from render.files import atomic_path
 from render.plan import plan
 from render.supervisor import RunOptions, RunSummary, render_supervised
@@ -133,9 +134,16 @@ def _run(planned: list, count: int) -> RunSummary:
 
 
 def _resident() -> int:
-    """Return the resident memory of this process in bytes."""
-    with open("/proc/self/statm", encoding="ascii") as handle:
-        return int(handle.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    """Return the resident memory of this process in bytes.
+
+    Raises:
+        InputError: not on Linux.
+    """
+    try:
+        with open("/proc/self/statm", encoding="ascii") as handle:
+            return int(handle.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError as error:
+        raise InputError("bench --only memory: reads /proc, so it needs Linux; run the other parts by --only") from error
 
 
 def _plot(megabytes: np.ndarray, path: Path) -> None:

@@ -67,8 +67,8 @@ def render(
         probe: Let the samples of a pixel share what its first samples agree on of a light (`render.visibility`).
 
     Returns:
-        The ground truth, and an iterator over (surface number, images), numbers rising, with images (L, size, size, 3) float32,
-        linear radiance under irradiance pi. Passes over many samples are averaged.
+        The ground truth, and an iterator over (surface number, images), numbers rising, with images
+        (L, size, size, 3) float32, linear radiance under irradiance pi. Passes over many samples are averaged.
     """
     wanted = range(len(surfaces)) if only is None else only
     per_pass = 1 << max(0, (SAMPLES_PER_PASS // size**2).bit_length() - 1)  # so that every pass is stratified
