@@ -78,12 +78,15 @@ def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
     from render import worker
 
     config = presets.load("small").data
-    shapes = -(-scenes // 8)
-    config = replace(config, families={"blobby": shapes // 2, "sculpture": shapes - shapes // 2}, views=4, size=64,
-                     spp=16, light_count=32, spatially_varying=0.1)  # fmt: skip
+    shapes = -(-scenes // 16)
+    config = replace(config, families={"blobby": shapes, "sculpture": shapes}, views=4, size=64, spp=16,
+                     light_count=32, spatially_varying=0.1)  # fmt: skip
     sizes = []
     with tempfile.TemporaryDirectory() as folder:
-        planned = plan(config)[:scenes]
+        planned = plan(config)
+        half = len(planned) // 2  # blobs, then as many sculptures: interleaved by shape, or a trend would be theirs
+        pairs = zip(range(0, half, 8), range(half, len(planned), 8), strict=False)
+        planned = [scene for pair in pairs for first in pair for scene in planned[first : first + 8]][:scenes]
 
         def record(scene: object) -> None:
             sizes.append(_resident())
@@ -105,32 +108,40 @@ def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
 
 
 def workers(_: int, __: Path | None) -> tuple[dict, str]:
-    """Render the same part of the `paper` preset with one process and with one per core; profile its stages."""
+    """Render the same part of the `paper` preset on one core and on all; profile its stages."""
     base = presets.load("paper").data
-    config = replace(base, families={"blobby": 2, "sculpture": 4}, views=9, validation=0.0)
-    planned = plan(config)
-    counts = [1] if estimate.cores() == 1 else [1, estimate.cores()]
-    runs = {count: _run(planned, count) for count in counts}
-    rates = {count: len(summary.lines) / summary.seconds * 3600 for count, summary in runs.items()}
-    shares = runs[counts[-1]].stage_shares()
+    planned = plan(replace(base, families={"blobby": 1, "sculpture": 2}, views=9, validation=0.0))
+    cores = estimate.cores()
+    ways = {"1 process on 1 core": (1, 1), f"1 process on {cores} cores": (1, cores)}
+    ways[f"{cores} processes on {cores} cores"] = (cores, cores)
+    runs = {name: _run(planned, *way) for name, way in ways.items()}
+    rates = {name: len(summary.lines) / summary.seconds * 3600 for name, summary in runs.items()}
+    names, shares = list(rates), list(runs.values())[-1].stage_shares()
     inside = sum(share for stage, share in shares.items() if stage != "other")
-    best = max(rates.values())
     values = {"scenes": len(planned), "scenes_per_hour": rates, "stages": shares,
+              "scaling": rates[names[-1]] / rates[names[0]],
               "render_share_of_work": shares.get("render", 0.0) / max(inside, 1e-9),
-              "paper_hours": _PAPER_SCENES / best}  # fmt: skip
+              "paper_hours": _PAPER_SCENES / max(rates.values())}  # fmt: skip
     lines = [f"`render-data` on {len(planned)} scenes of the `paper` preset (start of the processes included):", ""]
-    lines += [f"- {count} process{'es' * (count > 1)}: {rate:,.0f} scenes/hour" for count, rate in rates.items()]
-    if len(counts) > 1:
-        lines.append(f"- {counts[-1]} processes / 1: {rates[counts[-1]] / rates[1]:.2f}")
-    lines.append("- stages: " + ", ".join(f"{stage} {share:.0%}" for stage, share in shares.items()))
-    lines.append(f"- rendering is {values['render_share_of_work']:.0%} of the work (target: at least 70 %)")
-    lines.append(f"- projected for all {_PAPER_SCENES:,} samples: {values['paper_hours']:.1f} h")
+    lines += [f"- {name}: {rate:,.0f} scenes/hour" for name, rate in rates.items()]
+    lines += [
+        f"- {names[-1]} against {names[0]}: {values['scaling']:.2f}",
+        "- stages: " + ", ".join(f"{stage} {share:.0%}" for stage, share in shares.items()),
+        f"- rendering is {values['render_share_of_work']:.0%} of the work (target: at least 70 %)",
+        f"- projected for all {_PAPER_SCENES:,} samples: {values['paper_hours']:.1f} h",
+    ]
     return values, "\n".join(lines) + "\n"
 
 
-def _run(planned: list, count: int) -> RunSummary:
-    with tempfile.TemporaryDirectory() as folder:
-        return render_supervised(planned, Path(folder), RunOptions(workers=count))
+def _run(planned: list, processes: int, cores: int) -> RunSummary:
+    """Render a plan into a temporary folder on the first `cores` of this machine's cores."""
+    allowed = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, set(allowed[:cores]))
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            return render_supervised(planned, Path(folder), RunOptions(workers=processes))
+    finally:
+        os.sched_setaffinity(0, set(allowed))
 
 
 def _resident() -> int:
@@ -143,7 +154,7 @@ def _resident() -> int:
         with open("/proc/self/statm", encoding="ascii") as handle:
             return int(handle.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError as error:
-        raise InputError("bench --only memory: reads /proc, so it needs Linux; run the other parts by --only") from error
+        raise InputError("bench: the memory part reads /proc, so it needs Linux; choose others by --only") from error
 
 
 def _plot(megabytes: np.ndarray, path: Path) -> None:
