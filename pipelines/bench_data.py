@@ -17,7 +17,6 @@ from render.supervisor import RunOptions, RunSummary, render_supervised
 
 _WARM_UP = 12  # views, after which every kernel a run needs has been met
 _VIEWS = 40
-_PAPER_SCENES = 85_212
 
 
 def run(part: str, scenes: int, out: Path | None) -> tuple[dict, str]:
@@ -110,6 +109,7 @@ def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
 def workers(_: int, __: Path | None) -> tuple[dict, str]:
     """Render the same part of the `paper` preset on one core and on all; profile its stages."""
     base = presets.load("paper").data
+    whole = sum(base.families.values()) * base.views * base.materials_per_view
     planned = plan(replace(base, families={"blobby": 1, "sculpture": 2}, views=9, validation=0.0))
     cores = estimate.cores()
     ways = {"1 process on 1 core": (1, 1), f"1 process on {cores} cores": (1, cores)}
@@ -121,14 +121,14 @@ def workers(_: int, __: Path | None) -> tuple[dict, str]:
     values = {"scenes": len(planned), "scenes_per_hour": rates, "stages": shares,
               "scaling": rates[names[-1]] / rates[names[0]],
               "render_share_of_work": shares.get("render", 0.0) / max(inside, 1e-9),
-              "paper_hours": _PAPER_SCENES / max(rates.values())}  # fmt: skip
+              "paper_hours": whole / max(rates.values())}  # fmt: skip
     lines = [f"`render-data` on {len(planned)} scenes of the `paper` preset (start of the processes included):", ""]
     lines += [f"- {name}: {rate:,.0f} scenes/hour" for name, rate in rates.items()]
     lines += [
         f"- {names[-1]} against {names[0]}: {values['scaling']:.2f}",
         "- stages: " + ", ".join(f"{stage} {share:.0%}" for stage, share in shares.items()),
         f"- rendering is {values['render_share_of_work']:.0%} of the work (target: at least 70 %)",
-        f"- projected for all {_PAPER_SCENES:,} samples: {values['paper_hours']:.1f} h",
+        f"- projected for all {whole:,} samples: {values['paper_hours']:.1f} h",
     ]
     return values, "\n".join(lines) + "\n"
 

@@ -15,13 +15,12 @@ import numpy as np
 
 from pipelines.regenerate import split_list
 from render import lights as light_sets
+from render.chunks import GROUP_SIZE
 from render.errors import InputError
 from render.files import write_json, write_text
 from render.manifest import View
 from render.progress import progress_bar
 from render.seeds import generator
-
-GROUP = 16  # materials that share rays, as in `render.worker`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +81,8 @@ def measure(config: NoiseConfig) -> Iterator[Row]:
     with progress_bar(total=len(names) * len(config.shapes), unit="material", desc="noise") as bar:
         for shape in config.shapes:
             built = scene.build(shapes.load(shape))
-            for first in range(0, len(names), GROUP):
-                part = names[first : first + GROUP]
+            for first in range(0, len(names), GROUP_SIZE):
+                part = names[first : first + GROUP_SIZE]
                 packed = pack(part, built.mesh)
 
                 def images(spp: int, seed: int, probe: bool, packed=packed, built=built) -> tuple:

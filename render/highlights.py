@@ -19,7 +19,8 @@ import drjit as dr
 import numpy as np
 
 from render import variant
-from render.sampling import opaque, scrambled, stream, uniform, upload
+from render.arrays import opaque, upload
+from render.sampling import scrambled, stream, uniform
 
 mi = variant.load()
 

@@ -5,11 +5,9 @@ Nothing of this project is needed to render them: Lambertian materials become `d
 of a mesh that is cut along the edges of the pattern (`render.pattern_mesh`).
 """
 
-import os
 import shutil
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ import trimesh
 
 from render import pattern_mesh, shapes
 from render.errors import InputError
+from render.files import atomic_folder
 from render.manifest import SceneSpec
 from render.materials import merl, model, rgl, surfaces
 from render.shapes.mesh import TriangleMesh
@@ -79,7 +78,10 @@ def save(folder: str | Path, spec: SceneSpec, mesh: TriangleMesh | None = None) 
     if surface.pattern:
         quarter_pixel = 0.5 / (spec.size * spec.view.scale)
         mesh, shares = pattern_mesh.cut(mesh, _weights(surface.pattern, mesh), quarter_pixel)
-    with _atomic_folder(Path(folder)) as temporary:
+    folder = Path(folder)
+    if folder.exists() and not (folder / SCENE).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: holds other files; choose a new folder for the Mitsuba scene")
+    with atomic_folder(folder) as temporary:
         bsdfs = [_material(temporary, number, material) for number, material in enumerate(surface.components)]
         _write_mesh(temporary / MESH, mesh.posed(spec.view), shares)
         tree = ET.ElementTree(_scene(spec, _blend(bsdfs)))
@@ -225,28 +227,3 @@ def _readme(spec: SceneSpec, materials: Sequence[Any]) -> str:
         y=y,
         z=z,
     )
-
-
-@contextmanager
-def _atomic_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `folder`; rename it on success, remove it on failure.
-
-    Raises:
-        InputError: `folder` holds something that is not a scene, or cannot be written.
-    """
-    if folder.exists() and not (folder / SCENE).is_file() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: holds other files; choose a new folder for the Mitsuba scene")
-    temporary, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{kind}") for kind in ("tmp", "old"))
-    try:
-        temporary.mkdir(parents=True)
-        yield temporary
-        if folder.exists():
-            os.replace(folder, old)
-        os.replace(temporary, folder)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot be written ({error.strerror or error}); free space or choose another folder"
-        ) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)

@@ -8,9 +8,10 @@ import drjit as dr
 import numpy as np
 
 from render import highlights, variant
+from render.arrays import opaque, upload
 from render.manifest import View
 from render.materials.packed import PackedSurfaces
-from render.sampling import bounce_variates, opaque, pixel_position, random_variates, stream, upload
+from render.sampling import bounce_variates, pixel_position, random_variates, stream
 from render.visibility import probe_count, probed_visibility, visibility
 
 mi = variant.load()

@@ -3,12 +3,10 @@
 All functions take lanes and return lanes; seeds and counts are opaque, so that other values compile no other kernel.
 """
 
-from typing import Any
-
-import drjit as dr
 import numpy as np
 
 from render import variant
+from render.arrays import opaque
 
 mi = variant.load()
 
@@ -16,24 +14,6 @@ mi = variant.load()
 # 2^32: integers wrap around exactly, so that a million samples are as well spread as the first.
 _STEPS = (3518319155, 2882110345, 2360945575)
 _ROUNDS = 8  # with Mitsuba's default, 4, the words of neighbouring lanes still correlate, by 0.5
-
-
-def opaque(value: Any) -> Any:
-    """Hide a value from the kernel's code, so that another value does not compile another kernel."""
-    dr.make_opaque(value)
-    return value
-
-
-def upload(kind: type, values: np.ndarray) -> Any:
-    """Copy a NumPy array into memory of Dr.Jit's own.
-
-    On the CPU Dr.Jit uses NumPy's memory as it is, and compiles loads by its alignment, which is a matter of luck. The
-    copy is gathered by an index the kernel cannot see through, for which alignment does not matter.
-    """
-    source = kind(np.ascontiguousarray(values))
-    copy = dr.gather(kind, source, dr.arange(mi.UInt32, dr.width(source)) + opaque(mi.UInt32(0)))
-    dr.eval(copy)
-    return copy
 
 
 def stream(seed: int, stage: int) -> "mi.UInt32":

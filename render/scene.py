@@ -6,14 +6,14 @@ import drjit as dr
 import numpy as np
 
 from render import variant
-from render.sampling import opaque
+from render.arrays import integers, table
 from render.shapes.mesh import TriangleMesh
 
 mi = variant.load()
 
 
 class Triangles(NamedTuple):
-    """Corners of N triangles: positions and unnormalised-interpolation normals, object frame."""
+    """Corners of N triangles: positions and vertex normals, object frame."""
 
     positions: tuple  # 3 Point3f (N)
     normals: tuple  # 3 Vector3f (N)
@@ -43,9 +43,7 @@ class Scene:
     def triangles(self, prim: "mi.UInt32") -> Triangles:
         """Return the triangles of the given numbers."""
         if self._corners is None:
-            arrays = (self.mesh.vertices, self.mesh.normals)
-            floats = tuple(opaque(mi.Float(np.ascontiguousarray(a, np.float32).ravel())) for a in arrays)
-            self._corners = (*floats, opaque(mi.UInt32(np.ascontiguousarray(self.mesh.faces, np.uint32).ravel())))
+            self._corners = (table(self.mesh.vertices), table(self.mesh.normals), integers(self.mesh.faces))
         vertices, normals, faces = self._corners
         corners = [dr.gather(mi.UInt32, faces, 3 * prim + k) for k in range(3)]
         return Triangles(

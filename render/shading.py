@@ -12,11 +12,11 @@ import drjit as dr
 import numpy as np
 
 from render import highlights, variant
+from render.arrays import opaque
 from render.materials import bsdf
 from render.materials.bsdf import PackedMaterials
 from render.materials.packed import PackedSurfaces
 from render.paths import Paths, Vertices, take
-from render.sampling import opaque
 from render.visibility import WORD
 
 mi = variant.load()

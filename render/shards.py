@@ -21,7 +21,7 @@ import numpy as np
 import OpenEXR
 
 from render.errors import InputError
-from render.files import atomic_path
+from render.files import atomic_path, read_bytes
 from render.manifest import SceneSpec
 
 SCHEMA = 1
@@ -224,12 +224,7 @@ def _read_sealed(path: str | Path) -> bytes:
 
     This comes before OpenEXR opens a file, because OpenEXR skips over what is damaged, telling so only on stderr.
     """
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such shard; run `sdps render-data` to finish the folder") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    data = read_bytes(path, "no such shard; run `sdps render-data` to finish the folder")
     match = _DIGEST.search(data)
     if match is None:
         raise InputError(f"{path}: not a shard of schema {SCHEMA}, or truncated; delete the file and render it again")

@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 
 from render import variant
-from render.sampling import opaque
+from render.arrays import opaque
 
 mi = variant.load()
 

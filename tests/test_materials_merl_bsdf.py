@@ -3,6 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
+from brdf_support import directions, vector
 from merl_support import of_library, values
 
 from render.errors import InputError
@@ -37,22 +38,6 @@ def plugin(files):
     """Return a function that loads the plugin with one of the tables."""
     merl_bsdf.register()
     return lambda name: mi.load_dict({"type": "merl", "filename": str(files[name])})
-
-
-def directions(count: int = 4000) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of float32 directions, half of them within a degree of mirror reflection, some below the horizon."""
-    rng = np.random.default_rng(11)
-    wi, wo = rng.normal(size=(2, count, 3))
-    wi[:, 2] = np.abs(wi[:, 2])
-    wi /= np.linalg.norm(wi, axis=1, keepdims=True)
-    near = np.arange(count) % 2 == 0
-    wo[near] = wi[near] * [-1, -1, 1] + rng.normal(scale=0.01, size=(near.sum(), 3))
-    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
-    return wi.astype(np.float32), wo.astype(np.float32)
-
-
-def vector(array: np.ndarray) -> "mi.Vector3f":
-    return mi.Vector3f(np.ascontiguousarray(array.T))
 
 
 @pytest.mark.parametrize("index", range(len(NAMES)))

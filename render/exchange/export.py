@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 
 from render.errors import InputError, unknown
-from render.exchange.folders import MARKER, RECORD, atomic_folder, claim, read_record
+from render.exchange.folders import MARKER, RECORD, claim, read_record
 from render.exchange.layouts import LAYOUTS, Layout
 from render.exchange.names import Place
 from render.exchange.samples import ExportOptions, prepare
-from render.files import write_json
+from render.files import atomic_folder, write_json
 from render.manifest import MANIFEST, SceneSpec, read_manifest
 from render.progress import progress_bar
 from render.shards import file_hash, read_shard

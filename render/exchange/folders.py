@@ -1,10 +1,6 @@
 """Folders of an exported tree: whole or absent, and marked as ours."""
 
 import json
-import os
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,31 +9,6 @@ from render.files import read_text, write_json
 
 RECORD = "export.json"
 MARKER = "scene.json"
-
-
-@contextmanager
-def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty folder beside `path` and rename it to `path` on success; on failure nothing of it is left.
-
-    Raises:
-        InputError: the disk is full or the parent cannot be written.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for stale in path.parent.glob(f".{path.name}.*.tmp"):  # of a run that was killed
-            shutil.rmtree(stale, ignore_errors=True)
-        temporary.mkdir()
-        yield temporary
-        if path.exists():  # of another version of the scene; a whole one is never written again
-            shutil.rmtree(path)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror or error}); free space or choose another --out"
-        ) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def claim(root: Path, record: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from render.errors import InputError
+from render.files import read_bytes
 
 MASK_THRESHOLD = 0.01
 """A pixel belongs to the object where the squared length of its decoded normal exceeds this (PS-FCN's rule)."""
@@ -34,12 +35,7 @@ def read_image(path: str | Path, *, channels: int | None = 3) -> np.ndarray:
     Raises:
         InputError: missing, damaged, another number of channels, or neither 8 nor 16 bits.
     """
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such picture; copy it there or drop it from the list that names it") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    data = read_bytes(path, "no such picture; copy it there or drop it from the list that names it")
     try:
         with Image.open(io.BytesIO(data)) as picture:
             picture.verify()

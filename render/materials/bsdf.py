@@ -10,10 +10,11 @@ import drjit as dr
 import numpy as np
 
 from render import variant
+from render.arrays import table
 from render.errors import InputError
 from render.materials import model, plugin
 from render.materials.library import load
-from render.materials.lobes import HalfVectorLobes, cell, half_cell, upload
+from render.materials.lobes import HalfVectorLobes, cell, half_cell
 from render.materials.model import Material
 from render.materials.plugin import FamilyBSDF
 
@@ -51,8 +52,8 @@ class PackedMaterials(HalfVectorLobes):
         if not materials:
             raise InputError("materials: at least one is needed")
         super().__init__(tuple(material.name for material in materials), list(materials))
-        self.tables = upload(np.stack([_packed_tables(material) for material in materials]))
-        self.shadowing = upload(np.stack([_packed_shadowing(material) for material in materials]))
+        self.tables = table(np.stack([_packed_tables(material) for material in materials]))
+        self.shadowing = table(np.stack([_packed_shadowing(material) for material in materials]))
 
     @staticmethod
     def prepare(wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True) -> Coordinates:

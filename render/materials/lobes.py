@@ -4,12 +4,11 @@ Every material mixes a cosine lobe with a lobe of half vectors, whose distributi
 material at the knots of the project's model (`model.half_knots`).
 """
 
-from typing import Any
-
 import drjit as dr
 import numpy as np
 
 from render import variant
+from render.arrays import table
 from render.materials import highlight, model
 from render.materials.model import Material
 
@@ -17,7 +16,6 @@ mi = variant.load()
 
 _KNOTS = model.HALF_KNOTS
 _ENTRIES = _KNOTS + 1  # lobe probability, then the cumulative distribution at the knots of theta_h
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 class HalfVectorLobes:
@@ -38,7 +36,7 @@ class HalfVectorLobes:
 
     def __init__(self, names: tuple[str, ...], materials: list[Material]) -> None:
         self.names = names
-        self.lobes = upload(np.stack([lobe_distribution(material) for material in materials]))
+        self.lobes = table(np.stack([lobe_distribution(material) for material in materials]))
         self.highlight = np.array([narrow_share(material) for material in materials])
 
     def __len__(self) -> int:
@@ -144,16 +142,9 @@ def cell(coordinate: "mi.Float", knots: int) -> tuple:
     return index, position - mi.Float(index)
 
 
-def upload(values: Any) -> "mi.Float":
-    """Upload as a flat float32 array that kernels see as data, not as a literal."""
-    array = mi.Float(np.ascontiguousarray(values, np.float32).ravel())
-    dr.make_opaque(array)
-    return array
-
-
 def _profile(material: Material) -> np.ndarray:
     """Return the luminance of T at small theta_d, (32,) over theta_h."""
-    return _LUMINANCE @ material.bivariate[:, :, :4].mean(2)
+    return model.LUMINANCE @ material.bivariate[:, :, :4].mean(2)
 
 
 def _knot(index: "mi.UInt32") -> "mi.Float":

@@ -10,11 +10,12 @@ import drjit as dr
 import numpy as np
 
 from render import variant
+from render.arrays import table
 from render.errors import InputError
 from render.materials import merl, model, plugin
 from render.materials.bsdf import load_rgb
 from render.materials.library import load
-from render.materials.lobes import HalfVectorLobes, upload
+from render.materials.lobes import HalfVectorLobes
 from render.materials.merl import MerlTable
 from render.materials.model import Material
 from render.materials.plugin import FamilyBSDF
@@ -55,11 +56,11 @@ class PackedMerl(HalfVectorLobes):
     def __init__(self, tables: Sequence[MerlTable]) -> None:
         if not 0 < len(tables) <= MOST_TABLES:
             raise InputError(f"materials: 1 to {MOST_TABLES} MERL tables can be packed together, got {len(tables)}")
-        super().__init__(tuple(table.name for table in tables), [coarse_form(table) for table in tables])
+        super().__init__(tuple(one.name for one in tables), [coarse_form(one) for one in tables])
         packed = np.zeros((len(tables), _ENTRIES, 4), np.float32)
-        for slot, table in zip(packed, tables, strict=True):
-            slot[:, :3] = merl.knots(table.values).reshape(3, -1).T
-        self.tables = upload(packed)
+        for slot, merl_table in zip(packed, tables, strict=True):
+            slot[:, :3] = merl.knots(merl_table.values).reshape(3, -1).T
+        self.tables = table(packed)
 
     @staticmethod
     def prepare(wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True) -> MerlCoordinates:

@@ -17,6 +17,7 @@ import numpy as np
 from render.errors import InputError
 
 VERSION = 1
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear RGB, ITU-R BT.709
 HALF_KNOTS = 32
 DIFFERENCE_KNOTS = 6
 SHADOWING_KNOTS = 9

@@ -11,13 +11,13 @@ import drjit as dr
 import numpy as np
 
 from render import variant
+from render.arrays import opaque
 from render.errors import InputError
 from render.materials import surfaces as surface_names
 from render.materials.bsdf import PackedMaterials
 from render.materials.model import Material
 from render.materials.patterns import Evaluator
 from render.materials.surfaces import Surface
-from render.sampling import opaque
 from render.shapes.mesh import TriangleMesh
 
 mi = variant.load()
@@ -105,29 +105,23 @@ class PackedSurfaces:
         lanes = dr.width(chosen)
         shares = [self._shares(number, weights, lanes) for number in range(len(self.families))]
         wo, reached = mi.Vector3f(0, 0, 1), mi.Float(0)
-        for family, (share, varies) in zip(self.families, shares, strict=True):
-            total, lane = opaque(mi.UInt32(len(family))), dr.arange(mi.UInt32, lanes)
-            width = opaque(mi.UInt32(lanes if varies else 1))
 
-            def walk(k: Any, edge: Any, index: Any, mine: Any, share=share, lane=lane, width=width, varies=varies):
-                weight = dr.gather(mi.Float, share, dr.fma(k, width, lane) if varies else k)
-                hit = (chosen >= edge) & (weight > 0)
-                return k + 1, edge + weight, dr.select(hit, k, index), mine | hit
+        def walk(k: Any, weight: Any, edge: Any, index: Any, mine: Any) -> tuple:
+            hit = (chosen >= edge) & (weight > 0)
+            return edge + weight, dr.select(hit, k, index), mine | hit
 
-            state = (mi.UInt32(0), mi.Float(reached), mi.UInt32(0), mi.Bool(False))
-            _, reached, index, mine = dr.while_loop(state, lambda k, *_, total=total: k < total, walk)
+        for family, share in zip(self.families, shares, strict=True):
+            state = (mi.Float(reached), mi.UInt32(0), mi.Bool(False))
+            reached, index, mine = _over_materials(len(family), share, lanes, state, walk)
             wo = dr.select(mine, family.sample_lobe(index, wi, lobe, point, mine), wo)
         dr.eval(wo)
         density = mi.Float(0)
-        for family, (share, varies) in zip(self.families, shares, strict=True):
-            total, lane = opaque(mi.UInt32(len(family))), dr.arange(mi.UInt32, lanes)
-            width = opaque(mi.UInt32(lanes if varies else 1))
+        for family, share in zip(self.families, shares, strict=True):
 
-            def add(k: Any, sum_: Any, family=family, share=share, lane=lane, width=width, varies=varies) -> tuple:
-                weight = dr.gather(mi.Float, share, dr.fma(k, width, lane) if varies else k)
-                return k + 1, dr.fma(weight, family.pdf(k, wi, wo), sum_)
+            def add(k: Any, weight: Any, total: Any, family=family) -> tuple:
+                return (dr.fma(weight, family.pdf(k, wi, wo), total),)
 
-            _, density = dr.while_loop((mi.UInt32(0), density), lambda k, _, total=total: k < total, add)
+            (density,) = _over_materials(len(family), share, lanes, (density,), add)
         return wo, density
 
     def _shares(self, family: int, weights: tuple, lanes: int) -> tuple:
@@ -151,6 +145,19 @@ class PackedSurfaces:
             dr.scatter(flat, share, lane + opaque(mi.UInt32(index * lanes)))
         dr.eval(flat)
         return flat, True
+
+
+def _over_materials(count: int, share: tuple, lanes: int, state: tuple, step: Any) -> tuple:
+    """Loop over the materials of a family: `state = step(k, weight, *state)`, the weight from `_shares`."""
+    weights, varies = share
+    total, lane = opaque(mi.UInt32(count)), dr.arange(mi.UInt32, lanes)
+    width = opaque(mi.UInt32(lanes if varies else 1))
+
+    def body(k: Any, *values: Any) -> tuple:
+        return k + 1, *step(k, dr.gather(mi.Float, weights, dr.fma(k, width, lane) if varies else k), *values)
+
+    _, *state = dr.while_loop((mi.UInt32(0), *state), lambda k, *_: k < total, body)
+    return tuple(state)
 
 
 def pack(names: Sequence[str], mesh: TriangleMesh | None = None) -> PackedSurfaces:

@@ -9,9 +9,9 @@ import drjit as dr
 import numpy as np
 
 from render import variant
+from render.arrays import integers, opaque, table
 from render.errors import InputError
 from render.materials.surfaces import Pattern
-from render.sampling import opaque
 from render.seeds import generator
 from render.shapes.mesh import TriangleMesh
 
@@ -38,7 +38,7 @@ class Evaluator:
         if pattern.kind == "parts":
             if mesh is None:
                 raise InputError(f"pattern {pattern.kind}: needs the mesh it covers")
-            self._labels = _integers(part_labels(mesh, pattern))
+            self._labels = integers(part_labels(mesh, pattern))
         else:
             self._parameters = getattr(self, f"_draw_{pattern.kind}")(rng)
 
@@ -62,7 +62,7 @@ class Evaluator:
         centres = rng.normal(size=(number, 3))
         centres *= (rng.uniform(size=(number, 1)) ** (1 / 3)) / np.linalg.norm(centres, axis=1, keepdims=True)
         labels = rng.permutation(np.arange(number) % self.count)
-        return _floats(centres=centres, warp=_warp(rng, 0.08)) | {"labels": _integers(labels)}
+        return _floats(centres=centres, warp=_warp(rng, 0.08)) | {"labels": integers(labels)}
 
     def _patches(self, position: Any, _: Any) -> list:
         centres, labels = self._parameters["centres"], self._parameters["labels"]
@@ -175,11 +175,7 @@ def _warped(position: Any, warp: Any) -> Any:
 
 
 def _floats(**values: Any) -> dict:
-    return {name: opaque(mi.Float(np.ascontiguousarray(value, np.float32).ravel())) for name, value in values.items()}
-
-
-def _integers(values: np.ndarray) -> "mi.UInt32":
-    return opaque(mi.UInt32(np.ascontiguousarray(values, np.uint32)))
+    return {name: table(value) for name, value in values.items()}
 
 
 def _scalar(values: Any, index: int) -> Any:

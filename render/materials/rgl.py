@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from render.errors import InputError
-from render.files import atomic_path
+from render.files import atomic_path, read_bytes
+from render.materials import model
 
 _MAGIC = b"tensor_file\0"
 _VERSION = (1, 0)
@@ -29,7 +30,6 @@ SLICES = 31  # incident angles of a written file: every three degrees
 SIDE = 94  # three table rows per cell of the analytic model's 32 knots in theta_h
 _STEEPEST = math.radians(89.9)
 _WARP_KNOTS = 257
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 @dataclass(frozen=True)
@@ -117,12 +117,7 @@ def read_fields(path: str | Path) -> dict[str, np.ndarray]:
     Raises:
         InputError: missing, unreadable, another kind of file, or cut short.
     """
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    data = read_bytes(path)
     if data[: len(_MAGIC)] != _MAGIC:
         raise InputError(f"{path}: not an RGL material (it does not begin with 'tensor_file'); {_REMEDY}")
     try:
@@ -262,7 +257,7 @@ def _slice(brdf: Callable, theta: float, side: int) -> tuple[np.ndarray, np.ndar
     value[above] = brdf(np.broadcast_to(wi, (above.sum(), 3)), wo[above]) * cosine[above, None]
     # Solid angle of wo per area of the square; see `measured`, whose density this inverts.
     measure = 4 * np.maximum(projection, 0) * np.tile(2 * np.pi**2 * u * np.sin(angle) / _warp_density(u), side)
-    return value.T.reshape(3, side, side), (value @ _LUMINANCE * measure).reshape(side, side)
+    return value.T.reshape(3, side, side), (value @ model.LUMINANCE * measure).reshape(side, side)
 
 
 def _polar(theta: np.ndarray, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,12 +11,11 @@ import numpy as np
 
 from render import variant
 from render.errors import InputError
-from render.materials import highlight
+from render.materials import highlight, model
 from render.materials.rgl import RglMaterial
 
 mi = variant.load()
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _HALF_ANGLES = np.radians(np.concatenate([[0.0], np.geomspace(0.02, 4, 60), np.linspace(4.5, 80, 152)]))
 
 
@@ -125,7 +124,7 @@ class PackedRgl:
             mi.Float(np.sin(_HALF_ANGLES).astype(np.float32)), 0, mi.Float(np.cos(_HALF_ANGLES).astype(np.float32))
         )
         value = np.array(self._plugins[number].eval(self._context, _interaction(direction), direction, True))
-        return float(highlight.share(_HALF_ANGLES, _LUMINANCE @ value / np.cos(_HALF_ANGLES)))
+        return float(highlight.share(_HALF_ANGLES, model.LUMINANCE @ value / np.cos(_HALF_ANGLES)))
 
 
 def _plugin(material: RglMaterial) -> "mi.BSDF":
