@@ -9,6 +9,8 @@ MATERIALS ?= gold-metallic-paint,chrome,lambertian:0.5
 LIGHTS ?= merltest
 SET ?=
 MITSUBA ?=
+MODELS ?=
+STREAM ?=
 
 VENV := .venv
 SDPS := $(VENV)/bin/sdps
@@ -17,12 +19,14 @@ ASSETS_READY := $(VENV)/.assets-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate demo test test-slow lint bench clean
+	regenerate models study demo test test-slow lint bench bench-train clean
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo | test | lint | bench | doctor"
-	@echo "make render-data | train | eval-merltest   PRESET=smoke|demo|small|paper OUT=folder SET='section.field=value ...'"
+	@echo "make demo | test | lint | bench | bench-train | models | doctor"
+	@echo "make render-data | train | eval-merltest   PRESET=smoke|demo|small|study|paper OUT=folder SET='section.field=value ...'"
+	@echo "make train MODELS=lcnet,nenet,sdps-plus   also STREAM=1: render while training, store nothing"
+	@echo "make study   every model of the paper on equal data and steps, then tables A and B"
 	@echo "make data-plan | data-status | data-validate | data-preview | data-card   PRESET=... OUT=folder"
 	@echo "make regenerate   SHAPES=bunny MATERIALS=chrome,lambertian:0.5 LIGHTS=merltest OUT=folder [MITSUBA=1]"
 
@@ -42,8 +46,21 @@ setup: $(ASSETS_READY)
 doctor: $(READY)
 	$(SDPS) doctor
 
-render-data train eval-merltest: $(ASSETS_READY)
+render-data eval-merltest: $(ASSETS_READY)
 	$(SDPS) $@ --preset $(PRESET) --out $(OUT) $(SETTINGS)
+
+train: $(ASSETS_READY)
+	$(SDPS) train --preset $(PRESET) --out $(OUT) $(if $(MODELS),--models '$(MODELS)') $(if $(STREAM),--stream) $(SETTINGS)
+
+models: $(READY)
+	$(SDPS) models
+
+# The ablation study of docs/models.md: every model, the same data and steps.
+study: PRESET = study
+study: $(ASSETS_READY)
+	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
+	$(SDPS) train --preset $(PRESET) --out $(OUT) --models '$(or $(MODELS),all)' $(SETTINGS)
+	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
 
 data-plan: $(ASSETS_READY)
 	$(SDPS) data plan --preset $(PRESET) --out $(OUT) $(SETTINGS)
@@ -78,6 +95,10 @@ lint: $(READY)
 bench: OUT = out/bench
 bench: $(ASSETS_READY)
 	$(SDPS) bench --out $(OUT)
+
+bench-train: OUT = out/bench-train
+bench-train: $(READY)
+	$(SDPS) bench-train --out $(OUT)
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

@@ -13,13 +13,15 @@ COMMANDS = {
     "doctor": ("doctor", "add_arguments", "main", "show what this machine has and what is missing"),
     "render-data": ("render_data", "add_arguments", "main", "render the training scenes of a preset"),
     "data": ("data", "add_arguments", "main", "plan, check, preview, describe, export and import data folders"),
-    "train": ("train", "add_arguments", "main", "train LCNet, then NENet"),
+    "models": ("models", "add_arguments", "main", "list the learned models"),
+    "train": ("train", "add_arguments", "main", "train models, by default LCNet, then NENet"),
     "eval-merltest": ("eval_merltest", "add_arguments", "main", "render and score MERL-Test scenes"),
     "regenerate": ("regenerate", "add_arguments", "main", "render test scenes of chosen shapes and materials"),
     "fit-material": ("fit_material", "add_arguments", "main", "fit the built-in model to a MERL .binary table"),
     "materials": ("catalogue", "add_material_arguments", "materials_main", "list the built-in materials"),
     "shapes": ("catalogue", "add_shape_arguments", "shapes_main", "list the shape families"),
     "noise": ("noise", "add_arguments", "main", "measure the renderer's noise against converged images"),
+    "bench-train": ("bench_train", "add_arguments", "main", "measure training against a plain float32 loop"),
     "bench": ("bench", "add_arguments", "main", "measure the renderer against Mitsuba's path integrator"),
 }
 

@@ -4,17 +4,19 @@ import argparse
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import yaml
 
+from pipelines.stream import StreamConfig
 from render import lights as light_sets
 from render.config import build, read_yaml, to_yaml
 from render.errors import InputError, unknown
 from render.files import write_text
 from render.plan import DataConfig
-from sdps.config import LightingTraining, NormalTraining
+from sdps import recipes
 from sdps.lighting import ReadOut
+from sdps.models.registry import MODELS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +36,7 @@ class TestConfig:
         repeats: Draws of random intensities per scene; scores are averaged over them.
         pictures: Scenes shown in the report, per shape.
         read_out: How LCNet's classes become lights: `centre` (the paper's) or `expectation`.
+        rotations: Rotations about the view axis that pixel networks average over.
         precision: Arithmetic of the networks, `float32` or `bfloat16`.
     """
 
@@ -49,10 +52,11 @@ class TestConfig:
     repeats: int = 1
     pictures: int = 5
     read_out: ReadOut = "centre"
+    rotations: int = 10
     precision: Literal["float32", "bfloat16"] = "bfloat16"
 
     def __post_init__(self) -> None:
-        for name in ("spp", "repeats", "pictures"):
+        for name in ("spp", "repeats", "pictures", "rotations"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.size < 16 or self.size % 4:
@@ -74,17 +78,40 @@ class Preset:
         name: Name of the preset.
         description: One line.
         data: Training and validation scenes.
-        lighting: Training of LCNet.
-        normals: Training of NENet.
+        train: Models and combinations that `train` trains when none are named.
+        lighting: Settings of lighting models, over each model's published recipe.
+        normals: Settings of normal models.
+        pixels: Settings of models that see one pixel at a time.
+        joint: Settings of joint fine-tuning, over those of `normals`.
+        stream: How scenes are rendered while training (`train --stream`).
+        runs: Settings of single runs, by name; a run that is not called as its model names it in `base`.
         test: The MERL-Test scenes.
     """
 
     name: str
     description: str
     data: DataConfig = field(default_factory=DataConfig)
-    lighting: LightingTraining = field(default_factory=LightingTraining)
-    normals: NormalTraining = field(default_factory=NormalTraining)
+    train: tuple[str, ...] = ("lcnet", "nenet")
+    lighting: dict[str, Any] = field(default_factory=dict)
+    normals: dict[str, Any] = field(default_factory=dict)
+    pixels: dict[str, Any] = field(default_factory=dict)
+    joint: dict[str, Any] = field(default_factory=dict)
+    stream: StreamConfig = field(default_factory=StreamConfig)
+    runs: dict[str, dict[str, Any]] = field(default_factory=dict)
     test: TestConfig = field(default_factory=TestConfig)
+
+    def __post_init__(self) -> None:
+        for name in [*MODELS, recipes.JOINT, *self.runs]:
+            self.run(name)
+        recipes.expand(list(self.train), self.runs)
+
+    def run(self, name: str) -> recipes.Run:
+        """Return the resolved settings of a run.
+
+        Raises:
+            InputError: an unknown name, key or value.
+        """
+        return recipes.run(name, {part: getattr(self, part) for part in recipes.SECTIONS}, self.runs)
 
 
 def names() -> list[str]:

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from pipelines.eval_merltest import SceneResult
 
 CURVES = (
-    ("lighting", "LCNet", (("val_direction_mae", "light direction, degrees"), ("loss", "training loss"))),
-    ("normals", "NENet", (("val_normal_mae", "normals, degrees"), ("loss", "training loss"))),
+    ("val_direction_mae", "light direction, degrees"),
+    ("val_normal_mae", "normals, degrees"),
+    ("loss", "training loss"),
 )
 ERROR_LIMIT = 45.0
 
@@ -60,8 +61,13 @@ def choose(results: list["SceneResult"], count: int) -> list["SceneResult"]:
     return chosen
 
 
+def _main(result: "SceneResult") -> str:
+    """Return the method whose pictures are shown first."""
+    return next(iter(result.normals))
+
+
 def _error(result: "SceneResult") -> float:
-    return result.scores["LCNet + NENet"]["normal_mae"]
+    return result.scores[_main(result)]["normal_mae"]
 
 
 def _table(title: str, header: list[str], rows: list[list[str]]) -> str:
@@ -78,22 +84,24 @@ def _table(title: str, header: list[str], rows: list[list[str]]) -> str:
 
 
 def _scene(result: "SceneResult") -> str:
-    """Render the pictures of one scene: input, truth, estimate, error, least squares' error, lights."""
+    """Render the pictures of one scene: input, truth, normals and errors of the methods shown, lights."""
     from sdps.metrics import normal_error_map
 
     mask = result.mask
     exposure = pictures.auto_exposure(result.picture[None], mask)
-    ours = normal_error_map(result.normals["LCNet + NENet"], result.truth, mask)
-    classical = normal_error_map(result.normals["least squares, true lights"], result.truth, mask)
-    scores = result.scores["LCNet + NENet"]
     tiles = [
         ("input", pictures.tone_map(result.picture, exposure)),
         ("true normals", pictures.normal_map(result.truth, mask)),
-        ("estimated normals", pictures.normal_map(result.normals["LCNet + NENet"], mask)),
-        (f"error, {np.nanmean(ours):.1f}°", pictures.error_map(ours, ERROR_LIMIT)),
-        (f"least squares' error, {np.nanmean(classical):.1f}°", pictures.error_map(classical, ERROR_LIMIT)),
-        (f"lights, {scores['direction_mae']:.1f}°", pictures.light_plot(result.true_lights, result.lights)),
     ]
+    for name, normals in result.normals.items():
+        errors = normal_error_map(normals, result.truth, mask)
+        tiles += [
+            (f"normals, {name}", pictures.normal_map(normals, mask)),
+            (f"error, {np.nanmean(errors):.1f}°", pictures.error_map(errors, ERROR_LIMIT)),
+        ]
+    if len(result.lights):
+        text = f"lights, {result.scores[_main(result)]['direction_mae']:.1f}°"
+        tiles.append((text, pictures.light_plot(result.true_lights, result.lights)))
     figures = "".join(
         f'<figure><img src="{pictures.data_uri(picture)}" alt="{html.escape(text)}">'
         f"<figcaption>{html.escape(text)}</figcaption></figure>"
@@ -105,35 +113,43 @@ def _scene(result: "SceneResult") -> str:
 
 def _per_material(results: list["SceneResult"]) -> str:
     """Render one line per scene, worst first."""
+    names = list(results[0].normals)
+    wanted = [
+        (name, metric, digits)
+        for name in names
+        for metric, digits in (("normal_mae", 2), ("direction_mae", 2), ("intensity_error", 3))
+        if metric in results[0].scores[name]
+    ]
     rows = [
-        [r.scene.shape, r.scene.material]
-        + [f"{r.scores['LCNet + NENet'][key]:.{digits}f}"
-           for key, digits in (("normal_mae", 2), ("direction_mae", 2), ("intensity_error", 3))]
-        + [f"{r.scores['least squares, true lights']['normal_mae']:.2f}"]
+        [r.scene.shape, r.scene.material, *(f"{r.scores[name][metric]:.{digits}f}" for name, metric, digits in wanted)]
         for r in sorted(results, key=_error, reverse=True)
-    ]  # fmt: skip
-    header = ["shape", "material", "normals", "directions", "intensities", "least squares, true lights"]
+    ]
+    about = {"normal_mae": "normals", "direction_mae": "directions", "intensity_error": "intensities"}
+    header = ["shape", "material", *(f"{name}: {about[metric]}" for name, metric, _ in wanted)]
     return _table("Per scene, worst first", header, rows)
 
 
 def _curves(out: Path) -> str:
     """Plot the training curves found in the run's folders."""
-    figures = []
-    for folder, name, keys in CURVES:
-        path = out / folder / "metrics.jsonl"
-        if not path.is_file():
-            continue
+    series: dict[str, list] = {key: [] for key, _ in CURVES}
+    for path in sorted((out / "models").glob("*/metrics.jsonl")):
         rows, minutes = [], 0.0
         for row in read_jsonl(path):
             minutes = row.get("seconds", minutes * 60) / 60
             rows.append((minutes, row))
-        for key, label in keys:
+        for key in series:
             points = [(when, row[key]) for when, row in rows if key in row]
             if points:
-                x, y = np.array(points).T
-                plot = pictures.curve_plot([(name, x, y)], f"{name}: {label}")
-                alt = html.escape(f"{name} {label} over training")
-                figures.append(f'<figure><img src="{pictures.data_uri(plot)}" alt="{alt}"></figure>')
+                series[key].append((path.parent.name, *np.array(points).T))
+    figures = []
+    for key, text in CURVES:
+        # Losses of different models are different quantities: a plot each.
+        groups = [series[key]] if key != "loss" else [[one] for one in series[key]]
+        for group in groups:
+            if group:
+                title = text if len(group) > 1 else f"{group[0][0]}: {text}"
+                source = pictures.data_uri(pictures.curve_plot(group, title))
+                figures.append(f'<figure><img src="{source}" alt="{html.escape(title)} over training"></figure>')
     return f'<div class="strip">{"".join(figures)}</div>' if figures else "<p>No training logs in this folder.</p>"
 
 

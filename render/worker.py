@@ -123,13 +123,25 @@ def render_scenes(
 def render_group(
     built: Scene, group: list[SceneSpec], folder: Path, missing: set[str], stages: Stages
 ) -> Iterator[SceneSpec]:
-    """Render the missing scenes of one view, always from the whole group's rays, and write their shards.
-
-    Yields each scene, in the order of the group, after its shard is written.
+    """Render the missing scenes of one view and write their shards; yield each scene when its shard is written.
 
     Raises:
         InputError: an unusable material, an object outside the frame, or images that are not finite.
         Unwritable: a full disk or an unwritable folder.
+    """
+    for scene, shard in group_shards(built, group, missing, stages):
+        with stages.time("write"):
+            _write(folder / scene.file, shard)
+        yield scene
+
+
+def group_shards(
+    built: Scene, group: list[SceneSpec], missing: set[str], stages: Stages
+) -> Iterator[tuple[SceneSpec, Shard]]:
+    """Render the missing scenes of one view, always from the whole group's rays, in the order of the group.
+
+    Raises:
+        InputError: an unusable material or an object outside the frame.
     """
     stages.view_traced = False
     first, only = group[0], [number for number, scene in enumerate(group) if scene.id in missing]
@@ -156,9 +168,7 @@ def render_group(
             materials=surface_names.split(scene.material)[1] if truth.weights[number] is not None else (),
             provenance=_describe(scene),
         )
-        with stages.time("write"):
-            _write(folder / scene.file, shard)
-        yield scene
+        yield scene, shard
 
 
 def _write(path: Path, shard: Shard) -> None:

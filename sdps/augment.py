@@ -11,7 +11,7 @@ The paper instead starts from 8-bit images. Two exposure modes bridge that:
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -108,6 +108,31 @@ def exposure_scale(values: np.ndarray, level: float, clip: float) -> np.float32:
     return np.float32(scale)
 
 
+class Exposure(NamedTuple):
+    """What brings test images to the exposure of training."""
+
+    scale: float  # multiplies the images
+    clip: float  # where they saturate afterwards
+
+    def apply(self, images: np.ndarray) -> np.ndarray:
+        """Return exposed images, float32, of images of any shape."""
+        return np.minimum(images * np.float32(self.scale), np.float32(self.clip))
+
+
+def measure_exposure(values: np.ndarray, config: Augmentation) -> Exposure:
+    """Return the exposure of test images.
+
+    Args:
+        values: Radiance inside the mask, of all images and channels or a fair sample of them; any shape and scale.
+        config: The augmentation the network was trained with.
+    """
+    if config.exposure == "mean":
+        return Exposure(float(exposure_scale(values, config.mean_level, config.clip)), config.clip)
+    mean = float(values.mean()) if values.size else 0.0
+    lift = PAPER_TEST_FLOOR / mean if 0.0 < mean < PAPER_TEST_FLOOR else 1.0
+    return Exposure(lift * PAPER_TEST_GAIN, PAPER_TEST_CLIP)
+
+
 def normalise_exposure(images: np.ndarray, mask: np.ndarray, config: Augmentation) -> tuple[np.ndarray, float]:
     """Bring test images to the exposure of training, and black out everything but the object.
 
@@ -120,14 +145,8 @@ def normalise_exposure(images: np.ndarray, mask: np.ndarray, config: Augmentatio
         (L, H, W, 3) float32 images, and the factor they were multiplied by before the clip.
     """
     images = images.astype(np.float32) * mask[None, :, :, None]
-    inside = images[:, mask]
-    if config.exposure == "mean":
-        scale, clip = float(exposure_scale(inside, config.mean_level, config.clip)), config.clip
-    else:
-        mean = float(inside.mean()) if inside.size else 0.0
-        lift = PAPER_TEST_FLOOR / mean if 0.0 < mean < PAPER_TEST_FLOOR else 1.0
-        scale, clip = lift * PAPER_TEST_GAIN, PAPER_TEST_CLIP
-    return np.minimum(images * np.float32(scale), np.float32(clip)), scale
+    exposure = measure_exposure(images[:, mask], config)
+    return exposure.apply(images), exposure.scale
 
 
 def apply_symmetry(

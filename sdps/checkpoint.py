@@ -30,7 +30,7 @@ class TrainedModel:
     """A network with its weights and where they come from.
 
     Attributes:
-        name: Name in `sdps.models.registry`.
+        name: Name in `sdps.models.registry` (several runs may train one model).
         network: The network, in eval mode, weights float32.
         options: Options it was built with.
         metadata: `config` (the training section as plain values), `data` (SHA-256 of the manifest),
@@ -41,6 +41,11 @@ class TrainedModel:
     network: nn.Module
     options: dict[str, Any]
     metadata: dict[str, Any]
+
+    @property
+    def role(self) -> str:
+        """What the model is for; see `registry.ModelEntry`."""
+        return registry.entry(self.name).role
 
     def augmentation(self) -> Augmentation:
         """Return the augmentation of training, whose exposure test images must be brought to."""
@@ -75,15 +80,15 @@ def save_weights(path: str | Path, model: TrainedModel, *, half: bool = False) -
         save_file(tensors, temporary, metadata=header)
 
 
-def load_weights(path: str | Path, expected: str) -> TrainedModel:
-    """Read weights written by `save_weights` and build their network.
+def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedModel:
+    """Read weights written by `save_weights` and build their network. Runs no code from the file.
 
     Args:
         path: The file.
-        expected: Name of the model the caller needs, e.g. `lcnet`.
+        role: Role or roles the caller can use, e.g. `lighting`; any if empty.
 
     Raises:
-        InputError: missing, truncated or foreign file, another model, or weights that do not fit it.
+        InputError: missing, truncated or foreign file, a model of another role, or weights that do not fit it.
     """
     if not Path(path).is_file():
         raise InputError(f"{path}: no such weights file; train one or give another path")
@@ -95,16 +100,32 @@ def load_weights(path: str | Path, expected: str) -> TrainedModel:
         raise InputError(f"{path}: truncated or not a safetensors file ({error}); copy or train it again") from error
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: not written by this project (no {FORMAT!r} header); train the network again")
-    if header["model"] != expected:
-        raise InputError(f"{path}: holds {header['model']!r} weights, {expected!r} is needed here; swap the files")
-    options, metadata = json.loads(header["options"]), json.loads(header["metadata"])
-    network = registry.create(expected, **options)
+    name, options, metadata = _described(path, header)
+    roles = (role,) if isinstance(role, str) else role
+    if roles and registry.entry(name).role not in roles:
+        raise InputError(
+            f"{path}: holds {name!r}, a model for {registry.entry(name).role!r}; one for {' or '.join(roles)} is "
+            "needed here; swap the files"
+        )
+    network = registry.create(name, **options)
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:
         detail = " ".join(str(error).split())[:160]
-        raise InputError(f"{path}: weights do not fit {expected!r} ({detail}); train it again") from error
-    return TrainedModel(expected, network.eval(), options, metadata)
+        raise InputError(f"{path}: weights do not fit {name!r} ({detail}); train it again") from error
+    return TrainedModel(name, network.eval(), options, metadata)
+
+
+def _described(path: str | Path, header: dict[str, str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Return model name, options and metadata of a file's header, or refuse it."""
+    try:
+        name, options, metadata = header["model"], json.loads(header["options"]), json.loads(header["metadata"])
+        build(Augmentation, metadata["config"]["augmentation"], "augmentation")
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged header ({error}); copy or train it again") from error
+    if name not in registry.MODELS:
+        raise InputError(f"{path}: holds {name!r}, a model this version does not know; see `sdps models`")
+    return name, options, metadata
 
 
 def save_state(path: str | Path, state: dict[str, Any]) -> None:

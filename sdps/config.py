@@ -1,4 +1,4 @@
-"""What a training run is told: one frozen dataclass per stage, defaults as in the paper (A.8 of its code).
+"""What a training run is told: one frozen dataclass per kind of model, defaults as in the paper's code.
 
 A run ends after `epochs`, or after `steps` or `minutes` when one of these is given; the learning rate
 follows the share of that budget already spent, so a shorter budget anneals fully all the same.
@@ -33,10 +33,13 @@ class TrainingConfig:
         optimiser: `adam` or `adamw`; betas 0.9 and 0.999.
         weight_decay: Weight decay (0 in the paper: its 4e-4 is parsed but never used).
         clip_gradient: Largest gradient norm; 0 leaves gradients alone.
+        ema: Decay of an exponential moving average of the weights, which is then validated and saved (0: none).
+        compile: Compile the network with `torch.compile`.
         precision: `bfloat16` runs the networks under autocast; weights and loss stay float32.
         channels_last: Keep feature maps channels-last, faster for NENet on CPUs.
         workers: Loader processes; 0 loads in the trainer's own.
         cache: Keep decoded scenes as memory-mapped arrays in `<data>/cache`.
+        rescale: Scenes larger than `size` are drawn at a random scale and cropped, instead of being shrunk whole.
         skip_missing: Train on the scenes that are there instead of refusing an incomplete folder.
         log_every: Steps between lines of metrics.
         validate_every: Steps between validations; 0 validates at the end only.
@@ -60,10 +63,13 @@ class TrainingConfig:
     optimiser: Literal["adam", "adamw"] = "adam"
     weight_decay: float = 0.0
     clip_gradient: float = 0.0
+    ema: float = 0.0
+    compile: bool = False
     precision: Literal["float32", "bfloat16"] = "float32"
     channels_last: bool = False
     workers: int = 2
     cache: bool = True
+    rescale: bool = False
     skip_missing: bool = False
     log_every: int = 20
     validate_every: int = 0
@@ -86,8 +92,9 @@ class TrainingConfig:
             raise InputError(f"accumulate {self.accumulate} must divide batch_scenes {self.batch_scenes}")
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 and at least 16, got {self.size}")
-        if not 0.0 <= self.warmup < 1.0:
-            raise InputError(f"warmup must be in [0, 1), got {self.warmup}")
+        for name in ("warmup", "ema"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise InputError(f"{name} must be in [0, 1), got {getattr(self, name)}")
         if self.schedule == "halving" and any(not 0.0 < epoch < self.epochs for epoch in self.halve_after):
             raise InputError(f"halve_after must lie between 0 and epochs ({self.epochs:g}), got {self.halve_after}")
 
@@ -106,19 +113,19 @@ class TrainingConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LightingTraining(TrainingConfig):
-    """Stage 1, LCNet.
+    """Models that tell lights: LCNet, its variants, and the second pass.
 
     Attributes:
         direction_classes: K_d, classes of azimuth and of elevation.
-        use_mask: Give LCNet the object mask.
-        use_global: Give LCNet the feature shared by all images.
         intensity_classes: K_e.
+        lights: The run whose lights a second pass starts from (empty: the one its registry entry names).
+        normals: The run whose normals a second pass sees (empty: the one its registry entry names).
     """
 
     direction_classes: int = 36
     intensity_classes: int = 20
-    use_mask: bool = True
-    use_global: bool = True
+    lights: str = ""
+    normals: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -126,34 +133,39 @@ class LightingTraining(TrainingConfig):
             raise InputError(f"size must be 128 for LCNet, whose last layers need it, got {self.size}")
         self.classes()
 
-    def classes(self) -> LightClasses:
-        """Return the discretised lighting space; intensities span the range they are drawn from."""
+    def intensity_range(self) -> tuple[float, float]:
+        """Return the range the intensity classes cover: the one intensities are drawn from."""
         low, high = self.augmentation.intensity_range
-        return LightClasses(
-            directions=self.direction_classes, intensities=self.intensity_classes, low=low, high=max(high, low + 1e-3)
-        )
+        return low, max(high, low + 1e-3)
+
+    def classes(self) -> LightClasses:
+        """Return the discretised lighting space."""
+        low, high = self.intensity_range()
+        return LightClasses(directions=self.direction_classes, intensities=self.intensity_classes, low=low, high=high)
 
 
 @dataclass(frozen=True, kw_only=True)
 class NormalTraining(TrainingConfig):
-    """Stage 2, NENet, on the lights of a frozen LCNet.
+    """Models that give normals, on the lights of a frozen lighting model, on true lights, or on none.
 
     Attributes:
         loss: `masked` averages over the object, `faithful` over all pixels as the authors' code does.
-        lights: `estimated` by the frozen LCNet, or the `true` ones (PS-FCN's training).
-        read_out: How LCNet's classes become lights: `centre` (the paper's) or `expectation`.
-        crop: Side of the random crop NENet sees (0: the whole image); LCNet always sees the whole.
+        lights: The run of a lighting model, or `true`; empty: what the model's registry entry names.
+        read_out: How light classes become lights: `centre` (the paper's), `expectation` or `peak`.
+        crop: Side of the random crop the network sees (0: the whole image); the lighting model always sees the whole.
         min_object: Least share of object pixels a crop should have; the best of a few draws is taken.
+        lighting_weight: Weight of the lighting loss beside the normal loss, for models that learn both.
     """
 
     epochs: float = 10.0
     batch_scenes: int = 16
     halve_after: tuple[float, ...] = (2.0, 4.0, 6.0, 8.0)
     loss: Literal["masked", "faithful"] = "masked"
-    lights: Literal["estimated", "true"] = "estimated"
+    lights: str = ""
     read_out: ReadOut = "centre"
     crop: int = 0
     min_object: float = 0.3
+    lighting_weight: float = 0.1
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,3 +173,58 @@ class NormalTraining(TrainingConfig):
             raise InputError(f"crop must be 0 or a multiple of 4 from 16 to size ({self.size}), got {self.crop}")
         if not 0.0 <= self.min_object < 1.0:
             raise InputError(f"min_object must be in [0, 1), got {self.min_object}")
+        if self.lighting_weight < 0.0:
+            raise InputError(f"lighting_weight must not be negative, got {self.lighting_weight}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PixelTraining(NormalTraining):
+    """Models that see one pixel at a time (CNN-PS).
+
+    Attributes:
+        pixels_per_scene: Pixels drawn per scene and step.
+        min_lights: Fewest lights a pixel is given.
+        rotations: Rotations about the view axis averaged at test.
+    """
+
+    epochs: float = 10.0
+    batch_scenes: int = 8
+    images: int = 64
+    learning_rate: float = 1e-3
+    schedule: Literal["halving", "cosine", "constant"] = "constant"
+    halve_after: tuple[float, ...] = ()
+    pixels_per_scene: int = 96
+    min_lights: int = 8
+    rotations: int = 10
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("pixels_per_scene", "min_lights", "rotations"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointTraining(NormalTraining):
+    """A lighting model and a normal model, both trained before, fine-tuned together.
+
+    Attributes:
+        normals: The run of the normal model.
+        lights: The run of the lighting model.
+        lighting_weight: Weight of the lighting loss.
+        normal_weight: Weight of the normal loss, whose gradients reach the lighting model through its lights.
+    """
+
+    lights: str = "lcnet"
+    normals: str = "nenet"
+    read_out: ReadOut = "expectation"
+    learning_rate: float = 1e-4
+    lighting_weight: float = 1.0
+    normal_weight: float = 10.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.read_out != "expectation":
+            raise InputError(f"read_out must be expectation, the only one with a gradient, got {self.read_out}")
+        if not self.normal_weight > 0.0:
+            raise InputError(f"normal_weight must be positive, got {self.normal_weight}")

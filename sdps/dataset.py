@@ -1,10 +1,9 @@
-"""From a rendered data folder to training batches, the same ones however many workers load them.
+"""From scenes to training samples, the same ones however many workers make them.
 
 The position in an endless stream of samples determines everything about a sample: scene, images,
 augmentation, crop. So a run is resumed exactly by one integer, and no two workers share a random stream.
 """
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,13 +16,12 @@ from torch.nn import functional
 from torch.utils.data import Dataset
 
 from render.errors import InputError
-from render.manifest import FAILED, SceneSpec, read_failed, read_manifest
+from render.manifest import SceneSpec
 from render.seeds import generator
 from sdps.augment import Augmentation, apply_symmetry, augment
-from sdps.scene_store import SceneStore
+from sdps.scene_store import SceneStore, StoredScene, finished_scenes, require_equal_counts
 
 _CROP_DRAWS = 8
-_log = logging.getLogger(__name__)
 
 
 class Batch(NamedTuple):
@@ -35,6 +33,7 @@ class Batch(NamedTuple):
     directions: Tensor  # (B, Q, 3) float32, unit
     intensities: Tensor  # (B, Q) float32
     corner: Tensor  # (B, 2) int64, row and column of the crop's upper left corner
+    seed: Tensor  # (B,) int64, non-negative, of the sample alone: for randomness a stage adds
 
     def to(self, device: torch.device) -> "Batch":
         """Copy every tensor to `device`."""
@@ -60,6 +59,8 @@ class SampleOptions:
         crop: Side of the random crop, 0 for none.
         min_object: Least share of object pixels wanted in a crop.
         augmentation: How images are altered.
+        rescale: Scenes larger than `size` are shrunk by a random factor and cropped to `size` at random, instead of
+            shrunk to it (`_rescale`); off in the paper, whose scenes are 128 pixels wide.
     """
 
     seed: int
@@ -68,6 +69,7 @@ class SampleOptions:
     crop: int = 0
     min_object: float = 0.3
     augmentation: Augmentation
+    rescale: bool = False
 
 
 class SceneDataset(Dataset):
@@ -97,8 +99,8 @@ class SceneDataset(Dataset):
         self.split = split
         self.options = options
         self.store = SceneStore(Path(folder), cache=cache)
-        self.scenes = _rendered(Path(folder), split, skip_missing)
-        _check_counts(folder, self.scenes, options.images)
+        self.scenes = finished_scenes(Path(folder), split, skip_missing=skip_missing)
+        require_equal_counts(folder, self.scenes, options.images)
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -116,29 +118,49 @@ class SceneDataset(Dataset):
         Raises:
             InputError: the shard is damaged or differs from the manifest.
         """
-        options = self.options
-        rng = generator(options.seed, "sample", self.split, key.epoch, key.position)
+        rng = generator(self.options.seed, "sample", self.split, key.epoch, key.position)
         scene = self.scenes[key.scene]
-        stored = self.store.load(scene)
-        count = len(stored.images)
-        chosen = rng.permutation(count)[: options.images]
-        images = stored.images[chosen].astype(np.float32)  # (Q, H, W, 3)
-        normals, mask = stored.normals, stored.mask
-        directions = scene.light_directions()[chosen]
-        if options.augmentation.symmetries:
-            turns, mirror = int(rng.integers(4)), bool(rng.integers(2))
-            images, normals, mask, directions = apply_symmetry(images, normals, mask, directions, turns, mirror)
-        images, normals, mask = _resize(images, normals, mask, options.size)
-        images, intensities = augment(images, mask, options.augmentation, rng)
-        corner = _crop_corner(mask, options.crop, options.min_object, rng) if options.crop else (0, 0)
-        return Batch(
-            images=torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))),
-            mask=torch.from_numpy(mask[None].astype(np.float32)),
-            normals=torch.from_numpy(np.ascontiguousarray(normals.transpose(2, 0, 1), dtype=np.float32)),
-            directions=torch.from_numpy(np.ascontiguousarray(directions, dtype=np.float32)),
-            intensities=torch.from_numpy(intensities),
-            corner=torch.tensor(corner),
-        )
+        return make_sample(scene, self.store.load(scene), self.options, rng)
+
+
+def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, rng: np.random.Generator) -> Batch:
+    """Make a training sample of a scene, stored or just rendered.
+
+    The order is that of the authors' loader: a random subset of the images, in random order; rescaling and cropping;
+    exposure, intensities and noise (`sdps.augment`).
+
+    Args:
+        scene: Manifest line, for the light directions.
+        stored: Its images and ground truth.
+        options: How the sample is made.
+        rng: Draws everything random, and has drawn nothing yet.
+
+    Returns:
+        The fields of a `Batch` without B.
+    """
+    # A child of the stream, so that the number does not depend on how much the sample draws.
+    seed = int(rng.spawn(1)[0].integers(2**63))
+    chosen = rng.permutation(len(stored.images))[: options.images]
+    images = stored.images[chosen].astype(np.float32)  # (Q, H, W, 3)
+    normals, mask = stored.normals, stored.mask
+    directions = scene.light_directions()[chosen]
+    if options.augmentation.symmetries:
+        turns, mirror = int(rng.integers(4)), bool(rng.integers(2))
+        images, normals, mask, directions = apply_symmetry(images, normals, mask, directions, turns, mirror)
+    if options.rescale and min(mask.shape) > options.size:
+        images, normals, mask = _rescale(images, normals, mask, options, rng)
+    images, normals, mask = _resize(images, normals, mask, options.size)
+    images, intensities = augment(images, mask, options.augmentation, rng)
+    corner = _crop_corner(mask, options.crop, options.min_object, rng) if options.crop else (0, 0)
+    return Batch(
+        images=torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))),
+        mask=torch.from_numpy(mask[None].astype(np.float32)),
+        normals=torch.from_numpy(np.ascontiguousarray(normals.transpose(2, 0, 1), dtype=np.float32)),
+        directions=torch.from_numpy(np.ascontiguousarray(directions, dtype=np.float32)),
+        intensities=torch.from_numpy(intensities),
+        corner=torch.tensor(corner),
+        seed=torch.tensor(seed),
+    )
 
 
 def collate(samples: list[Batch | InputError]) -> Batch | InputError:
@@ -159,10 +181,11 @@ class SampleStream:
         batch: Samples per batch.
         seed: Root seed.
         taken: Samples taken before this run.
+        part: Which samples of every batch to yield; all by default.
     """
 
-    def __init__(self, scenes: int, batch: int, seed: int, taken: int = 0) -> None:
-        self.scenes, self.batch, self.seed, self.taken = scenes, batch, seed, taken
+    def __init__(self, scenes: int, batch: int, seed: int, taken: int = 0, part: slice = slice(None)) -> None:
+        self.scenes, self.batch, self.seed, self.taken, self.part = scenes, batch, seed, taken, part
 
     def __iter__(self) -> Iterator[list[SampleKey]]:
         epoch, position = divmod(self.taken, self.scenes)
@@ -172,36 +195,26 @@ class SampleStream:
             for place in range(position, self.scenes):
                 keys.append(SampleKey(int(order[place]), epoch, place))
                 if len(keys) == self.batch:
-                    yield keys
+                    yield keys[self.part]
                     keys = []
             epoch, position = epoch + 1, 0
 
 
-def _rendered(folder: Path, split: str, skip_missing: bool) -> list[SceneSpec]:
-    """Return the scenes of a split that have a shard, or refuse a folder whose rendering is not finished."""
-    planned = read_manifest(folder, split)
-    scenes = [scene for scene in planned if (folder / scene.file).is_file()]
-    missing = {scene.id for scene in planned} - {scene.id for scene in scenes}
-    failed = missing & read_failed(folder).keys() if missing and not skip_missing else set()
-    if not scenes or (missing - failed and not skip_missing):
-        raise InputError(
-            f"{folder}: {len(missing)} of {len(planned)} shards of split {split!r} are missing; finish it with "
-            "`sdps render-data` or set skip_missing"
-        )
-    if failed:
-        about = "%s: %d of %d scenes of split %r could not be rendered (%s) and are left out"
-        _log.warning(about, folder, len(failed), len(planned), split, FAILED)
-    return scenes
+def _rescale(
+    images: np.ndarray, normals: np.ndarray, mask: np.ndarray, options: SampleOptions, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut the square window that, brought to `size`, is the scene shrunk at random and then cropped at random.
 
-
-def _check_counts(folder: str | Path, scenes: list[SceneSpec], images: int) -> None:
-    """Refuse a split whose scenes cannot give equally many images, since they would not stack."""
-    counts = {min(len(scene.lights), images) for scene in scenes}
-    if len(counts) > 1:
-        raise InputError(
-            f"{folder}: scenes have from {min(counts)} lights up, so {images} images cannot be drawn from each; "
-            f"set images to {min(counts)} or less"
-        )
+    Two deviations from the authors' loader. It draws the new height and width apart from each other, in [128, H) and
+    [128, W), and leaves the normals as they were, though unequal scaling alters those of the surface shown; here both
+    axes share one factor, with which the normals stay right, the shorter side's new length being uniform in
+    [size, its own]. And the window lies about a random pixel of the object, since background alone teaches nothing.
+    """
+    shorter = min(mask.shape)
+    side = round(options.size * shorter / rng.integers(options.size, shorter, endpoint=True))
+    row, column = _crop_corner(mask, side, options.min_object, rng)
+    window = np.s_[row : row + side, column : column + side]
+    return images[:, *window], normals[window], mask[window]
 
 
 def _resize(
@@ -222,11 +235,12 @@ def _resize(
 def _crop_corner(mask: np.ndarray, side: int, min_object: float, rng: np.random.Generator) -> tuple[int, int]:
     """Draw a crop's corner around a random object pixel; the first with enough object, else the best."""
     rows, columns = np.nonzero(mask)
-    limit = mask.shape[0] - side
-    best, best_share = (limit // 2, limit // 2), -1.0
+    last = mask.shape[0] - side, mask.shape[1] - side
+    best, best_share = (last[0] // 2, last[1] // 2), -1.0
     for _ in range(_CROP_DRAWS if len(rows) else 0):
         pixel = rng.integers(len(rows))
-        row, column = (int(np.clip(place - side // 2, 0, limit)) for place in (rows[pixel], columns[pixel]))
+        places = zip((rows[pixel], columns[pixel]), last, strict=True)
+        row, column = (int(np.clip(place - side // 2, 0, limit)) for place, limit in places)
         share = float(mask[row : row + side, column : column + side].mean())
         if share >= min_object:
             return row, column

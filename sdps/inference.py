@@ -1,154 +1,293 @@
-"""Using trained networks: images and a mask in, lights and normals out."""
+"""Using trained networks: images and a mask in, lights and normals out, in memory that many images do not fill."""
 
 import time
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from render.errors import InputError
-from sdps.augment import normalise_exposure
+from sdps.augment import measure_exposure
 from sdps.checkpoint import TrainedModel, load_weights
+from sdps.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map
 from sdps.estimate import Estimate
+from sdps.image_source import ImageSource, ObjectImages, View, survey
 from sdps.lighting import ReadOut
-from sdps.models.lcnet import resize_input
-from sdps.models.nenet import SIZE_MULTIPLE
-from sdps.stages import lighting_classes
+from sdps.models.base import Lights
+from sdps.models.lcnet import INPUT_SIZE, resize_input
+from sdps.models.lighting_variants import LCNetSecond
 
-_TINY = 1e-8
+_ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels"), "second": ("second",)}
 
 
-class _Crop(NamedTuple):
-    """Rows and columns of the object's box, and the padding that makes its sides multiples of 4."""
+class _Known(NamedTuple):
+    """Lights the caller gave."""
 
-    rows: slice
-    columns: slice
-    pad: tuple[int, int]  # below, right
+    directions: np.ndarray | None  # (L, 3), unit
+    intensities: np.ndarray | None  # (L,), with the mean of the range of training
+    balance: np.ndarray | None  # (L, 3), colours with mean 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Estimator:
-    """A trained pair of networks.
+    """Trained networks that work together: any lighting model with any normal model.
 
     Attributes:
-        lighting: Trained LCNet, or None when lights are always given.
-        normals: Trained NENet.
-        device: Where both run.
+        lighting: Trained lighting model, or None when lights are always given or `normals` is told none.
+        normals: Trained model that gives normals, by convolution or pixel by pixel; None for lights alone.
+        second: Trained second lighting pass. It sees the normals that `normals` finds at 128x128 under the first
+            lights; `normals` then works again, under the second lights.
+        device: Where all networks are.
         precision: `bfloat16` runs the networks under autocast.
-        read_out: How light classes become lights.
+        read_out: How light classes become lights. A first pass that a second follows is read out as expectation, as in
+            the second's training.
         margin: Pixels kept around the mask's bounding box.
-        antialias: Average when LCNet's input is shrunk to 128x128 (the authors' code only interpolates).
-        chunk_pixels: Image pixels NENet encodes at once; bounds memory whatever the number of images.
+        antialias: Average when the lighting networks' input is shrunk to 128x128 (the authors' code only interpolates).
+        chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images.
+        rotations: Rotations about the view axis that pixel networks average over.
+
+    Raises:
+        InputError: a model of another role than its place, or an option out of range.
     """
 
     lighting: TrainedModel | None
-    normals: TrainedModel
+    normals: TrainedModel | None
+    second: TrainedModel | None = None
     device: torch.device
     precision: Literal["float32", "bfloat16"] = "float32"
     read_out: ReadOut = "centre"
     margin: int = 15
     antialias: bool = True
-    chunk_pixels: int = 2**20
+    chunk_pixels: int = 2**19
+    rotations: int = 10
 
+    def __post_init__(self) -> None:
+        for place, roles in _ROLES.items():
+            model = getattr(self, place)
+            if model is not None and model.role not in roles:
+                raise InputError(f"{place}: {model.name!r} is a model for {model.role!r}, not for {' or '.join(roles)}")
+        if self.second is not None and self.normals is None:
+            raise InputError(f"second: {self.second.name!r} sees estimated normals; give a normal model too")
+        if self.second is not None and self.lighting is None:
+            raise InputError(f"second: {self.second.name!r} starts from estimated lights; give a lighting model too")
+        for name, least in (("margin", 0), ("chunk_pixels", 1), ("rotations", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
+
+    @property
+    def needs_lights(self) -> bool:
+        """Whether the normal model is told the lights; otherwise it works without a lighting model."""
+        return self.normals.role == "pixels" or self.normals.network.needs_lights
+
+    @torch.inference_mode()
     def estimate(
         self,
-        images: np.ndarray,
+        images: ImageSource,
         mask: np.ndarray,
         lights: np.ndarray | None = None,
         intensities: np.ndarray | None = None,
     ) -> Estimate:
         """Estimate normals, and whichever of light directions and intensities are not given.
 
+        Without a lighting model, given directions alone stand for lights of equal intensity. Normal models that are
+        told no lights see the images as they are, whatever is given.
+
         Args:
-            images: (L, H, W, 3) float, linear radiance of any overall scale, L >= 1, any size.
+            images: (L, H, W, 3), linear radiance of any overall scale, L >= 1, any size; an array, or anything that
+                gives the images of a slice. It is read several times, a few images at once.
             mask: (H, W) bool.
             lights: (L, 3) known light directions.
             intensities: (L,) or (L, 3) known intensities, of any overall scale.
 
         Returns:
-            The estimate; diagnostics hold `seconds`, `exposure` (factor applied for each network) and, where
-            LCNet was asked, `confidence` (L,), the product of its two most probable direction classes.
+            The estimate. Directions or intensities that nobody gave, estimated or assumed are empty, (0, 3) and (0,),
+            so that scoring them is refused. Diagnostics hold `seconds`, `exposure` (factor applied for each network)
+            and, where classes of light were estimated, `confidence` (L,), the product of the probabilities of the two
+            likeliest direction classes.
 
         Raises:
-            InputError: sizes that do not fit, non-finite values, an empty mask, or lights wanted without LCNet.
+            InputError: sizes that do not fit, non-finite values, an empty mask, or lights wanted without a lighting
+                model.
         """
-        _check(images, mask, lights, intensities)
-        if self.lighting is None and lights is None:
-            raise InputError("no LCNet weights were loaded, so light directions must be given")
+        if self.normals is None:
+            raise InputError("no normal model was loaded, so only lights can be estimated; load one")
+        if self.needs_lights and self.lighting is None and lights is None:
+            raise InputError("no lighting model was loaded, so light directions must be given")
         began = time.perf_counter()
-        crop = _bounding_box(mask, self.margin)
-        inside = mask[crop.rows, crop.columns]
-        cropped = images[:, crop.rows, crop.columns].astype(np.float32)
+        _check_lights(len(images), lights, intensities)
+        scene = survey(images, mask, self.margin)
+        known = self._known(lights, intensities)
         diagnostics: dict[str, Any] = {"exposure": {}}
-        # Given intensities have a scale of their own; those of training have the mean of their range.
-        gains = np.ones(len(images), np.float32) if intensities is None else np.asarray(intensities, np.float32)
-        gains = gains / gains.mean() * np.float32(np.mean(self.normals.augmentation().intensity_range))
         if self.lighting is not None and (lights is None or intensities is None):
-            directions, estimated = self._lights(cropped, inside, diagnostics)
-            lights = directions if lights is None else lights
-            gains = estimated if intensities is None else gains
-        lights = _unit(np.asarray(lights, np.float32))
+            found = self._estimate_lights(scene, known, diagnostics)
+        elif self.needs_lights:
+            equal = np.full(len(images), self._mean_intensity(), np.float32)
+            found = self._lights(known.directions, equal if known.intensities is None else known.intensities)
+        else:
+            found = None
+        multiple = 1 if self.normals.role == "pixels" else self.normals.network.size_multiple
+        view = self._view(scene, "normals", known.balance, pad_to(multiple), scene.mask.size, diagnostics)
         normals = np.zeros((*mask.shape, 3), np.float32)
-        normals[crop.rows, crop.columns] = self._normals(cropped, inside, crop.pad, lights, gains, diagnostics)
-        normals[~mask] = 0.0
+        box = self._normals(view, found)[0].permute(1, 2, 0).cpu().numpy()  # padded (h, w, 3)
+        box = box[: scene.mask.shape[0], : scene.mask.shape[1]]
+        normals[scene.rows, scene.columns] = np.where(scene.mask[..., None], box, np.float32(0.0))
+        directions, gains = known[:2] if found is None else (part[0].float().cpu().numpy() for part in found[:2])
         diagnostics["seconds"] = time.perf_counter() - began
-        return Estimate(normals, lights, gains if gains.ndim == 1 else gains.mean(1), diagnostics)
+        return Estimate(
+            normals,
+            np.zeros((0, 3), np.float32) if directions is None else directions,
+            np.zeros(0, np.float32) if gains is None else gains,
+            diagnostics,
+        )
 
     @torch.inference_mode()
-    def _lights(
-        self, images: np.ndarray, mask: np.ndarray, diagnostics: dict[str, Any]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return directions (L, 3) and intensities (L,) from LCNet."""
-        images, scale = normalise_exposure(images, mask, self.lighting.augmentation())
-        diagnostics["exposure"]["lighting"] = scale
-        with self._autocast():
-            logits = self.lighting.network(
-                *resize_input(self._tensor(images), self._tensor(mask[None, ..., None])[0], self.antialias)
-            )
-        directions, intensities = lighting_classes(self.lighting).read_out(*logits, self.read_out)
-        peaks = [values.float().softmax(-1).amax(-1)[0] for values in (logits.azimuth, logits.elevation)]
-        diagnostics["confidence"] = (peaks[0] * peaks[1]).cpu().numpy()
-        return directions[0].cpu().numpy(), intensities[0].cpu().numpy()
+    def estimate_lights(self, images: ImageSource, mask: np.ndarray, intensities: np.ndarray | None = None) -> Estimate:
+        """Estimate the lights alone, as `estimate` does on its way.
 
-    @torch.inference_mode()
-    def _normals(
-        self,
-        images: np.ndarray,
-        mask: np.ndarray,
-        pad: tuple[int, int],
-        lights: np.ndarray,
-        intensities: np.ndarray,
-        diagnostics: dict[str, Any],
-    ) -> np.ndarray:  # (H, W, 3)
-        """Return NENet's normals of the crop."""
-        images, scale = normalise_exposure(images, mask, self.normals.augmentation())
-        diagnostics["exposure"]["normals"] = scale
-        gains = (intensities[:, None] if intensities.ndim == 1 else intensities) + _TINY  # (L, 1 or 3)
+        Args:
+            images, mask, intensities: As in `estimate`.
+
+        Returns:
+            An estimate whose normals are empty, (0, 0, 3).
+
+        Raises:
+            InputError: as in `estimate`, or no lighting model was loaded.
+        """
+        if self.lighting is None:
+            raise InputError("no lighting model was loaded; load one, or give the lights")
+        began = time.perf_counter()
+        _check_lights(len(images), None, intensities)
+        diagnostics: dict[str, Any] = {"exposure": {}}
+        scene = survey(images, mask, self.margin)
+        found = self._estimate_lights(scene, self._known(None, intensities), diagnostics)
+        directions, gains = (part[0].float().cpu().numpy() for part in found[:2])
+        diagnostics["seconds"] = time.perf_counter() - began
+        return Estimate(np.zeros((0, 0, 3), np.float32), directions, gains, diagnostics)
+
+    def _estimate_lights(self, scene: ObjectImages, known: _Known, diagnostics: dict[str, Any]) -> Lights:
+        """Return the lights (1, L, ...) after one or two passes; what is known stays."""
+        read_out = self.read_out if self.second is None else "expectation"
+        lights = self._lighting_pass("lighting", scene, read_out, diagnostics)
+        if self.second is not None:
+            first = self._merged(known, lights)
+            small = self._view(scene, "normals", known.balance, self._shrink, INPUT_SIZE**2, diagnostics)
+            normals, mask = self._normals(small, first), small.mask
+
+            def context(part: slice) -> Tensor:
+                return LCNetSecond.context(normals, mask, first.directions[:, part])
+
+            lights = self._lighting_pass("second", scene, self.read_out, diagnostics, context)
+        if lights.confidence is not None:
+            diagnostics["confidence"] = lights.confidence[0].float().cpu().numpy()
+        return self._merged(known, lights)
+
+    def _lighting_pass(
+        self, place: str, scene: ObjectImages, read_out: ReadOut, diagnostics: dict[str, Any], context: Any = None
+    ) -> Lights:
+        """Return the lights (1, L, ...) that the lighting network in `place` finds."""
+        network = getattr(self, place).network
+        view = self._view(scene, place, None, self._shrink, INPUT_SIZE**2, diagnostics)
+        return network.lights(lighting_prediction(network, view, self._autocast, context), read_out)
+
+    def _normals(self, view: View, lights: Lights | None) -> Tensor:
+        """Return normals (1, 3, h, w) of a view."""
         network = self.normals.network
-        chunk = max(1, self.chunk_pixels // mask.size)
-        feature = None
-        for start in range(0, len(images), chunk):
-            part = slice(start, start + chunk)
-            inputs = self._tensor(images[part] / gains[part, None, None])
-            inputs = functional.pad(inputs, (0, pad[1], 0, pad[0]))
-            with self._autocast():
-                encoded = network.encode(inputs, torch.from_numpy(lights[None, part]).to(self.device))
-            feature = encoded if feature is None else torch.maximum(feature, encoded)
-        with self._autocast():
-            normals = network.regress(feature)[0].float().cpu().numpy().transpose(1, 2, 0)
-        return normals[: mask.shape[0], : mask.shape[1]]
+        if self.normals.role == "pixels":
+            return pixel_normal_map(network, view, lights, self._autocast, rotations=self.rotations)
+        return normal_map(network, view, lights, self._autocast)
 
-    def _tensor(self, images: np.ndarray) -> Tensor:
-        """Turn (Q, H, W, C) into (1, Q, C, H, W) float32 on the device."""
-        array = np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32)
-        return torch.from_numpy(array)[None].to(self.device)
+    def _view(
+        self,
+        scene: ObjectImages,
+        place: str,
+        balance: np.ndarray | None,
+        fit: Any,
+        pixels: int,  # of an image as the network sees it
+        diagnostics: dict[str, Any],
+    ) -> View:
+        """Return the scene as the model in `place` saw scenes in training."""
+        exposure = measure_exposure(scene.sample, getattr(self, place).augmentation())
+        diagnostics["exposure"][place] = exposure.scale
+        return View(scene, exposure, balance, fit, max(1, self.chunk_pixels // pixels), self.device)
 
-    def _autocast(self) -> torch.autocast:
+    @property
+    def _shrink(self) -> Any:
+        return partial(resize_input, antialias=self.antialias)
+
+    def _autocast(self) -> AbstractContextManager:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
+
+    def _mean_intensity(self) -> float:
+        model = self.lighting if self.normals is None else self.normals
+        return float(np.mean(model.augmentation().intensity_range))
+
+    def _known(self, lights: np.ndarray | None, intensities: np.ndarray | None) -> _Known:
+        """Bring given lights to unit length and given intensities, whose scale is their own, to that of training."""
+        directions = balance = gains = None
+        if lights is not None:
+            directions = np.asarray(lights, np.float64)
+            directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
+        if intensities is not None:
+            colours = np.asarray(intensities, np.float64)
+            colours = colours / colours.mean() * self._mean_intensity()
+            gains = (colours if colours.ndim == 1 else colours.mean(1)).astype(np.float32)
+            balance = None if colours.ndim == 1 else (colours / colours.mean(1, keepdims=True)).astype(np.float32)
+        return _Known(directions, gains, balance)
+
+    def _lights(self, directions: np.ndarray, intensities: np.ndarray) -> Lights:
+        return Lights(*(torch.from_numpy(part)[None].to(self.device) for part in (directions, intensities)))
+
+    def _merged(self, known: _Known, lights: Lights) -> Lights:
+        """Return the lights with what is known in place of what was estimated."""
+        pairs = zip(known[:2], lights[:2], strict=True)
+        return Lights(*(lit.float() if one is None else torch.from_numpy(one)[None].to(lit) for one, lit in pairs))
+
+
+def load_estimator(
+    *,
+    lighting: str | Path | None = None,
+    normals: str | Path,
+    second: str | Path | None = None,
+    device: str | torch.device | None = None,
+    **options: Any,
+) -> Estimator:
+    """Load trained models that shall work together.
+
+    Args:
+        lighting: Safetensors of a lighting model; None for known lights only, or a normal model that is told none.
+        normals: Safetensors of a normal model.
+        second: Safetensors of a second lighting pass.
+        device: Torch device; CUDA when there is one, else CPU.
+        options: Other fields of `Estimator`.
+
+    Raises:
+        InputError: a file is missing, damaged, or of a model for something else.
+    """
+    device = default_device(device)
+    files = {"lighting": lighting, "normals": normals, "second": second}
+    models = {place: None if file is None else load_model(file, device, _ROLES[place]) for place, file in files.items()}
+    return Estimator(**models, device=device, **options)
+
+
+def default_device(device: str | torch.device | None = None) -> torch.device:
+    """Return the device asked for, else CUDA where there is one, else the CPU."""
+    return torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+
+
+def load_model(file: str | Path, device: torch.device, role: str | tuple[str, ...] = ()) -> TrainedModel:
+    """Load a trained model for inference on `device`.
+
+    Raises:
+        InputError: the file is missing, damaged, or of a model of another role.
+    """
+    model = load_weights(file, role)
+    model.network.to(device, memory_format=torch.channels_last)  # a third faster on CPUs
+    return model
 
 
 def load_pair(
@@ -158,59 +297,20 @@ def load_pair(
     device: str | torch.device | None = None,
     **options: Any,
 ) -> Estimator:
-    """Load LCNet and NENet weights.
-
-    Args:
-        lighting_file: LCNet's safetensors, or None for known lights only.
-        normals_file: NENet's safetensors.
-        device: Torch device; CUDA when there is one, else CPU.
-        options: Other fields of `Estimator`.
-
-    Raises:
-        InputError: a file is missing, damaged, or of another network.
-    """
-    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    lighting = None if lighting_file is None else load_weights(lighting_file, "lcnet")
-    normals = load_weights(normals_file, "nenet")
-    for model in (lighting, normals):
-        if model is not None:
-            model.network.to(device, memory_format=torch.channels_last)  # a third faster on CPUs
-    return Estimator(lighting=lighting, normals=normals, device=device, **options)
+    """Load a lighting model, or None for known lights only, and a normal model; see `load_estimator`."""
+    return load_estimator(lighting=lighting_file, normals=normals_file, device=device, **options)
 
 
-def _bounding_box(mask: np.ndarray, margin: int) -> _Crop:
-    """Return the box around the mask with `margin` pixels, inside the image, and its padding to multiples of 4."""
-    slices, pads = [], []
-    for axis, size in enumerate(mask.shape):
-        inside = np.flatnonzero(mask.any(axis=1 - axis))
-        start, stop = max(int(inside[0]) - margin, 0), min(int(inside[-1]) + 1 + margin, size)
-        slices.append(slice(start, stop))
-        pads.append(-(stop - start) % SIZE_MULTIPLE)
-    return _Crop(slices[0], slices[1], (pads[0], pads[1]))
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def _check(images: np.ndarray, mask: np.ndarray, lights: np.ndarray | None, intensities: np.ndarray | None) -> None:
-    """Refuse unusable input in one line."""
-    if images.ndim != 4 or images.shape[-1] != 3 or not len(images):
-        raise InputError(f"images must be (L, H, W, 3) with L >= 1, got {images.shape}")
-    if mask.shape != images.shape[1:3] or mask.dtype != np.bool_:
-        raise InputError(f"the mask must be bool of shape {images.shape[1:3]}, got {mask.dtype} of {mask.shape}")
-    if not mask.any():
-        raise InputError("the mask is empty; mark the object's pixels")
-    if not np.isfinite(images[:, mask]).all():
-        raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
-    if lights is not None and np.shape(lights) != (len(images), 3):
-        raise InputError(
-            f"{len(images)} images need light directions of shape ({len(images)}, 3), got {np.shape(lights)}"
-        )
-    if lights is not None and not (np.linalg.norm(lights, axis=-1) > 0.0).all():
-        raise InputError("a light direction is zero or NaN; give unit vectors from the surface to the light")
+def _check_lights(count: int, lights: np.ndarray | None, intensities: np.ndarray | None) -> None:
+    """Refuse lights that cannot be those of `count` images, in one line."""
+    if lights is not None and np.shape(lights) != (count, 3):
+        raise InputError(f"{count} images need light directions of shape ({count}, 3), got {np.shape(lights)}")
+    if lights is not None:
+        lengths = np.linalg.norm(lights, axis=-1)
+        if not ((lengths > 0.0) & np.isfinite(lengths)).all():
+            raise InputError("a light direction is zero or NaN; give unit vectors from the surface to the light")
     if intensities is not None:
-        if np.shape(intensities) not in ((len(images),), (len(images), 3)):
-            raise InputError(f"{len(images)} images need as many intensities, got {np.shape(intensities)}")
-        if not (np.asarray(intensities) > 0.0).all():
-            raise InputError("light intensities must be positive numbers")
+        if np.shape(intensities) not in ((count,), (count, 3)):
+            raise InputError(f"{count} images need as many intensities, got {np.shape(intensities)}")
+        if not ((np.asarray(intensities) > 0.0) & np.isfinite(intensities)).all():
+            raise InputError("light intensities must be positive finite numbers")

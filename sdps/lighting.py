@@ -17,7 +17,7 @@ import torch
 from render.errors import InputError
 
 Array = np.ndarray | torch.Tensor
-ReadOut = Literal["centre", "expectation"]
+ReadOut = Literal["centre", "expectation", "peak"]
 
 
 def _library(array: Array) -> ModuleType:
@@ -86,6 +86,25 @@ class LightClasses:
             bin_index(intensities, self.low, self.high, self.intensities),
         )
 
+    def encode_soft(
+        self, directions: torch.Tensor, intensities: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return class probabilities (..., K) whose expectation is the exact azimuth, elevation and intensity.
+
+        Each value shares its weight between the two nearest class centres; beyond the outermost centre it has one.
+
+        Args:
+            directions: (..., 3), of any length.
+            intensities: (...).
+        """
+        values = (*azimuth_elevation(directions), intensities)
+        return tuple(_shared_weights(part, *span) for part, span in zip(values, self._spans(), strict=True))
+
+    def _spans(self) -> tuple[tuple[float, float, int], ...]:
+        """Return low, high and count of the bins of azimuth, elevation and intensity."""
+        angles = (-90.0, 90.0, self.directions)
+        return angles, angles, (self.low, self.high, self.intensities)
+
     def decode(self, azimuth: Array, elevation: Array, intensity: Array) -> tuple[Array, Array]:
         """Return the unit direction (..., 3) and intensity (...) at the centre of each class."""
         azimuth = bin_centre(azimuth, -90.0, 90.0, self.directions)
@@ -101,20 +120,40 @@ class LightClasses:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Turn class logits into unit directions (..., 3) and intensities (...), float32.
 
-        `centre` is the paper's read-out, the middle of the most probable class; `expectation` the mean
-        over the softmax, which has no quantisation floor.
+        `centre` is the paper's read-out, the middle of the most probable class; `expectation` the mean over the
+        softmax, which has no quantisation floor; `peak` the top of the parabola through the log-probabilities of the
+        most probable class and its two neighbours.
         """
         logits = [values.float() for values in (azimuth, elevation, intensity)]
         if how == "centre":
             return self.decode(*(values.argmax(-1) for values in logits))
-        spans = ((-90.0, 90.0), (-90.0, 90.0), (self.low, self.high))
-        azimuth, elevation, intensity = (_expectation(values, span) for values, span in zip(logits, spans, strict=True))
+        read = _expectation if how == "expectation" else _peak
+        pairs = zip(logits, self._spans(), strict=True)
+        azimuth, elevation, intensity = (read(values, *span) for values, span in pairs)
         return unit_direction(azimuth, elevation), intensity
 
 
-def _expectation(logits: torch.Tensor, span: tuple[float, float]) -> torch.Tensor:
+def _shared_weights(values: torch.Tensor, low: float, high: float, count: int) -> torch.Tensor:
+    """Return (..., K) weights of the bin centres around each of values (...)."""
+    position = ((values - low) / (high - low) * count - 0.5).clamp(0.0, count - 1.0)
+    centres = torch.arange(count, device=values.device, dtype=position.dtype)
+    return (1.0 - (position[..., None] - centres).abs()).clamp(min=0.0)
+
+
+def _expectation(logits: torch.Tensor, low: float, high: float, count: int) -> torch.Tensor:
     """Return the mean bin centre (...) under the softmax of logits (..., K)."""
-    count = logits.shape[-1]
-    centres = bin_centre(torch.arange(count, device=logits.device), *span, count)
+    centres = bin_centre(torch.arange(count, device=logits.device), low, high, count)
     # Not a matrix product: autocast would round that to bfloat16, whose steps near 80 are half a degree.
     return (logits.softmax(-1) * centres).sum(-1)
+
+
+def _peak(logits: torch.Tensor, low: float, high: float, count: int) -> torch.Tensor:
+    """Return the top (...) of the parabola through the largest of logits (..., K) and its neighbours."""
+    best = logits.argmax(-1, keepdim=True)
+    inner = best.clamp(1, count - 2)
+    left, middle, right = (logits.gather(-1, inner + step).squeeze(-1) for step in (-1, 0, 1))
+    best, curvature = best.squeeze(-1), 2.0 * middle - left - right
+    # At the border, and on a plateau, there is no parabola with a top: the class centre stays.
+    usable = (best == inner.squeeze(-1)) & (curvature > 1e-6)
+    offset = torch.where(usable, 0.5 * (right - left) / curvature.clamp(min=1e-6), torch.zeros_like(middle))
+    return bin_centre(best + offset.clamp(-0.5, 0.5), low, high, count)

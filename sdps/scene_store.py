@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,14 +12,15 @@ import numpy as np
 from render.config import to_plain
 from render.errors import InputError
 from render.files import atomic_path
-from render.manifest import SceneSpec
+from render.manifest import FAILED, SceneSpec, read_failed, read_manifest
 from render.shards import read_shard
 
 CACHE_FOLDER = "cache"
+_log = logging.getLogger(__name__)
 
 
 class StoredScene(NamedTuple):
-    """What training needs of a shard; with a cache the images are a read-only memory map."""
+    """What training needs of a rendered scene; with a cache the images are a read-only memory map."""
 
     images: np.ndarray  # (L, H, W, 3) float16
     normals: np.ndarray  # (H, W, 3) float32
@@ -61,6 +64,52 @@ class SceneStore:
             return StoredScene(np.load(images, mmap_mode="r"), ground[..., :3], ground[..., 3] > 0.5)
         except (OSError, ValueError) as error:
             raise InputError(f"{images}: damaged cache entry ({error}); delete {images.parent}") from error
+
+
+def finished_scenes(folder: Path, split: str, *, skip_missing: bool = False) -> list[SceneSpec]:
+    """Return the scenes of a split that have a shard.
+
+    Args:
+        folder: Data folder.
+        split: `train`, `val` or `test`.
+        skip_missing: Leave out scenes without a shard. Those that could not be rendered (`failed.jsonl`) are left out
+            in any case, with a warning.
+
+    Raises:
+        InputError: no manifest, no scene of the split, or a folder whose rendering is not finished.
+    """
+    planned = read_manifest(folder, split)
+    scenes = [scene for scene in planned if (folder / scene.file).is_file()]
+    missing = {scene.id for scene in planned} - {scene.id for scene in scenes}
+    failed = missing & read_failed(folder).keys() if missing and not skip_missing else set()
+    if not scenes or (missing - failed and not skip_missing):
+        raise InputError(
+            f"{folder}: {len(missing)} of {len(planned)} shards of split {split!r} are missing; finish it with "
+            "`sdps render-data` or set skip_missing"
+        )
+    if failed:
+        about = "%s: %d of %d scenes of split %r could not be rendered (%s) and are left out"
+        _log.warning(about, folder, len(failed), len(planned), split, FAILED)
+    return scenes
+
+
+def require_equal_counts(where: str | Path, scenes: Sequence[SceneSpec], images: int) -> None:
+    """Refuse scenes that cannot give equally many images, since their samples would not stack.
+
+    Args:
+        where: What the scenes belong to, for the message.
+        scenes: Scenes to draw from.
+        images: Images wanted of each.
+
+    Raises:
+        InputError: some scenes have fewer lights than `images`, and not all equally many.
+    """
+    counts = {min(len(scene.lights), images) for scene in scenes}
+    if len(counts) > 1:
+        raise InputError(
+            f"{where}: scenes have from {min(counts)} lights up, so {images} images cannot be drawn from each; "
+            f"set images to {min(counts)} or less"
+        )
 
 
 def _identity(path: Path, scene: SceneSpec) -> str:

@@ -1,11 +1,12 @@
-"""What each of the two stages asks of a batch: its network, its loss and its validation metrics.
+"""What models of each role ask of a batch: the network, its loss and its validation metrics.
 
 The trainer (`sdps.training`) knows nothing else about them.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,48 +16,81 @@ from render.seeds import derived_seed
 from sdps.checkpoint import TrainedModel
 from sdps.config import LightingTraining, NormalTraining, TrainingConfig
 from sdps.dataset import Batch, SampleOptions
-from sdps.lighting import LightClasses
-from sdps.losses import faithful_normal_loss, lighting_loss, masked_normal_loss
+from sdps.losses import faithful_normal_loss, masked_normal_loss
 from sdps.metrics import angle_degrees, direction_mae, intensity_error
 from sdps.models import registry
-from sdps.models.lcnet import LCNet, resize_input
+from sdps.models.base import Lights
+from sdps.models.lcnet import resize_input
+from sdps.models.registry import TRUE_LIGHTS
+from sdps.models.upsfcn import UPSFCNLight
 
-_TINY = 1e-8
+
+class Part(NamedTuple):
+    """A network to be saved by itself."""
+
+    name: str  # of the weights file
+    model: str  # in the registry
+    network: nn.Module
+    options: dict[str, Any]
 
 
 class Stage(ABC):
     """A network in training. Subclasses give `loss` and `metrics`.
 
     Args:
-        name: The network's name in the registry, which also names the weights file.
+        name: The run's name, which also names the weights file.
+        model: Name in the registry.
         config: The run's configuration.
         options: Options of the network.
     """
 
-    def __init__(self, name: str, config: TrainingConfig, options: dict[str, Any]) -> None:
-        self.name, self.config, self.options = name, config, options
+    goal = "direction_mae"
+    """The metric, lower being better, by which the best weights are kept."""
+
+    def __init__(self, name: str, model: str, config: TrainingConfig, options: dict[str, Any]) -> None:
+        self.name, self.model, self.config, self.options = name, model, config, options
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(derived_seed(config.seed, "weights", name))
-            self.network: nn.Module = registry.create(name, **options)
+            torch.manual_seed(derived_seed(config.seed, "weights", model))
+            self.network: nn.Module = self.build()
+
+    def build(self) -> nn.Module:
+        """Return the network with fresh weights."""
+        return registry.create(self.model, **self.options)
+
+    def frozen(self) -> list[nn.Module]:
+        """Return the networks that are used but not trained."""
+        return []
 
     def to(self, device: torch.device) -> None:
         """Move all networks to `device`, in the memory layout the configuration asks for."""
         layout = torch.channels_last if self.config.channels_last else torch.contiguous_format
-        self.network.to(device, memory_format=layout)
+        for network in (self.network, *self.frozen()):
+            network.to(device, memory_format=layout)
 
     def origin(self) -> dict[str, Any]:
         """Return what else these weights depend on, for their metadata."""
         return {}
 
+    def parts(self, network: nn.Module) -> list[Part]:
+        """Return what is saved of `network`, which is `self.network` or an average of its weights."""
+        return [Part(self.name, self.model, network, self.options)]
+
     def sample_options(self) -> SampleOptions:
         """Return how training samples are made."""
         config = self.config
-        return SampleOptions(seed=config.seed, images=config.images, size=config.size, augmentation=config.augmentation)
+        return SampleOptions(
+            seed=config.seed,
+            images=config.images,
+            size=config.size,
+            rescale=config.rescale,
+            augmentation=config.augmentation,
+        )
 
     def validation_options(self) -> SampleOptions:
         """Return how validation samples are made: whole images in the pose they were rendered."""
         options = self.sample_options()
-        return replace(options, crop=0, augmentation=replace(options.augmentation, symmetries=False))
+        augmentation = replace(options.augmentation, symmetries=False)
+        return replace(options, crop=0, rescale=False, augmentation=augmentation)
 
     @abstractmethod
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -68,123 +102,147 @@ class Stage(ABC):
 
 
 class LightingStage(Stage):
-    """Stage 1: LCNet learns the classes of light direction and intensity."""
+    """Models that tell lights from images and mask."""
 
     config: LightingTraining
 
-    def __init__(self, config: LightingTraining) -> None:
-        options = {
-            "direction_classes": config.direction_classes,
-            "intensity_classes": config.intensity_classes,
-            "use_mask": config.use_mask,
-            "use_global": config.use_global,
-        }
-        super().__init__("lcnet", config, options)
-        self.classes = config.classes()
+    def __init__(self, config: LightingTraining, *, model: str = "lcnet", name: str | None = None) -> None:
+        super().__init__(name or model, model, config, lighting_options(model, config))
+
+    def predict(self, batch: Batch) -> Any:
+        """Return the network's prediction."""
+        return self.network(batch.images, batch.mask)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the summed cross-entropies of azimuth, elevation and intensity."""
-        logits = self.network(batch.images, batch.mask)
-        terms = lighting_loss(logits, self.classes.encode(batch.directions, batch.intensities))
-        return terms.total, {f"{name}_loss": value for name, value in terms._asdict().items() if name != "total"}
+        """Return the network's own loss."""
+        terms = self.network.loss(self.predict(batch), batch.directions, batch.intensities)
+        return terms["total"], {f"{name}_loss": value for name, value in terms.items() if name != "total"}
 
     def metrics(self, batch: Batch) -> dict[str, float]:
-        """Return the loss, and direction and intensity errors of both read-outs."""
-        logits = self.network(batch.images, batch.mask)
-        total = lighting_loss(logits, self.classes.encode(batch.directions, batch.intensities)).total
-        values = {"loss": float(total)}
-        for how, suffix in (("centre", ""), ("expectation", "_expectation")):
-            directions, intensities = (tensor.cpu().numpy() for tensor in self.classes.read_out(*logits, how))
-            values |= _light_errors(directions, intensities, batch, suffix)
+        """Return the loss, and direction and intensity errors of every read-out."""
+        prediction = self.predict(batch)
+        values = {"loss": float(self.network.loss(prediction, batch.directions, batch.intensities)["total"])}
+        for how, suffix in (("centre", ""), ("expectation", "_expectation"), ("peak", "_peak")):
+            values |= light_errors(self.network.lights(prediction, how), batch, suffix)
         return values
 
 
 class NormalStage(Stage):
-    """Stage 2: NENet learns normals under the lights a frozen LCNet estimates.
+    """Models that give normals, under the lights of a frozen lighting model, true ones, or none.
 
     Args:
         config: The run's configuration.
-        lighting: Trained LCNet; may be absent when `config.lights` is `true`.
+        lighting: Trained lighting model; may be absent for true lights, or a model that is told none.
+        model: Name in the registry.
+        name: Name of the run.
     """
 
     config: NormalTraining
+    goal = "normal_mae"
 
-    def __init__(self, config: NormalTraining, lighting: TrainedModel | None = None) -> None:
-        assert lighting is not None or config.lights == "true", "estimated lights need a trained LCNet"
-        super().__init__("nenet", config, {})
-        self.lighting = lighting if config.lights == "estimated" else None
-        if self.lighting is not None:
-            self.lighting.network.requires_grad_(False).eval()
-            self.classes = lighting_classes(self.lighting)
+    def __init__(
+        self,
+        config: NormalTraining,
+        lighting: TrainedModel | None = None,
+        *,
+        model: str = "nenet",
+        name: str | None = None,
+    ) -> None:
+        super().__init__(name or model, model, config, normal_options(model, config))
+        self.source = config.lights or registry.entry(model).lights
+        assert lighting is not None or self.source in (TRUE_LIGHTS, ""), f"{model} needs a trained lighting model"
+        self.lighting = freeze(lighting) if self.source not in (TRUE_LIGHTS, "") else None
 
-    def to(self, device: torch.device) -> None:
-        super().to(device)
-        if self.lighting is not None:
-            self.lighting.network.to(device)
+    def frozen(self) -> list[nn.Module]:
+        return [] if self.lighting is None else [self.lighting.network]
 
     def origin(self) -> dict[str, Any]:
-        """Record the data and step of the LCNet whose lights were used."""
+        """Record the lights trained on, and the data and step of the model they came from."""
         if self.lighting is None:
-            return {"lights": "true"}
-        metadata = self.lighting.metadata
-        return {"lights": "estimated", "lcnet": {key: metadata.get(key) for key in ("data", "step", "metrics")}}
+            return {"lights": self.source or "none"}
+        return {"lights": self.source, "lighting": described(self.lighting)}
 
     def sample_options(self) -> SampleOptions:
-        config = self.config
-        return SampleOptions(
-            seed=config.seed,
-            images=config.images,
-            size=config.size,
-            augmentation=config.augmentation,
-            crop=config.crop,
-            min_object=config.min_object,
-        )
+        return replace(super().sample_options(), crop=self.config.crop, min_object=self.config.min_object)
 
     @torch.no_grad()
-    def lights(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Return the directions (B, Q, 3) and intensities (B, Q) that NENet is given."""
+    def lights(self, batch: Batch) -> Lights | None:
+        """Return the lights the network is given."""
+        if not self.source:
+            return None
         if self.lighting is None:
-            return batch.directions, batch.intensities
-        network: LCNet = self.lighting.network
-        logits = network(*resize_input(batch.images, batch.mask))
-        return self.classes.read_out(*logits, self.config.read_out)
+            return Lights(batch.directions, batch.intensities)
+        network = self.lighting.network
+        return network.lights(network(*resize_input(batch.images, batch.mask)), self.config.read_out)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the configured normal loss on the crops."""
-        directions, intensities = self.lights(batch)
+        """Return the configured normal loss on the crops, and the lighting loss of models that learn both."""
+        lights = self.lights(batch)
         side = self.config.crop or self.config.size
-        images, mask, truth = (_crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
-        normals = self.network(images / (intensities[..., None, None, None] + _TINY), directions)
+        images, mask, truth = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
+        seen = self.network.observe(images, mask, lights)
+        if isinstance(self.network, UPSFCNLight):
+            normals, logits = self.network.with_lights(seen)
+        else:
+            normals, logits = self.network(seen), None
         masked = masked_normal_loss(normals, truth, mask)
         loss = masked if self.config.loss == "masked" else faithful_normal_loss(normals, truth)
-        return loss, {"masked_loss": masked}
+        terms = {"masked_loss": masked}
+        if logits is not None:
+            terms["lighting_loss"] = self.network.lighting_loss(logits, batch.directions, batch.intensities)
+            loss = loss + self.config.lighting_weight * terms["lighting_loss"]
+        return loss, terms
 
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return the normal MAE on whole images and the errors of the lights used."""
-        directions, intensities = self.lights(batch)
-        normals = self.network(batch.images / (intensities[..., None, None, None] + _TINY), directions)
-        inside = batch.mask[:, 0].bool()
-        pairs = [tensor.permute(0, 2, 3, 1)[inside].cpu().numpy() for tensor in (normals, batch.normals)]
+        lights = self.lights(batch)
+        normals = self.network(self.network.observe(batch.images, batch.mask, lights))
         values = {
             "loss": float(masked_normal_loss(normals, batch.normals, batch.mask)),
-            "normal_mae": float(angle_degrees(*pairs).mean()),
+            "normal_mae": normal_error(normals, batch),
         }
-        return values | _light_errors(directions.cpu().numpy(), intensities.cpu().numpy(), batch, "")
+        return values | (light_errors(lights, batch, "") if lights is not None else {})
 
 
-def lighting_classes(model: TrainedModel) -> LightClasses:
-    """Return the discretised lighting space a trained LCNet predicts."""
-    low, high = model.augmentation().intensity_range
-    return LightClasses(
-        directions=model.options["direction_classes"],
-        intensities=model.options["intensity_classes"],
-        low=low,
-        high=max(high, low + 1e-3),
-    )
+def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:
+    """Return the options of a lighting network that the configuration decides."""
+    low, high = config.intensity_range()
+    values = {
+        "direction_classes": config.direction_classes,
+        "intensity_classes": config.intensity_classes,
+        "intensity_range": [low, high],
+    }
+    return {name: value for name, value in values.items() if name in registry.network_options(model)}
 
 
-def _light_errors(directions: np.ndarray, intensities: np.ndarray, batch: Batch, suffix: str) -> dict[str, float]:
-    """Return direction and intensity errors, (B, Q, 3) and (B, Q), each averaged over the scenes."""
+def normal_options(model: str, config: NormalTraining) -> dict[str, Any]:
+    """Return the options of a normal network that the configuration decides."""
+    if "intensity_range" not in registry.network_options(model):
+        return {}
+    return {"intensity_range": list(config.augmentation.intensity_range)}
+
+
+def freeze(model: TrainedModel) -> TrainedModel:
+    """Make a trained model's weights constant."""
+    model.network.requires_grad_(False).eval()
+    return model
+
+
+def described(model: TrainedModel) -> dict[str, Any]:
+    """Return what tells one trained model from another."""
+    return {"model": model.name, **{key: model.metadata.get(key) for key in ("data", "step", "metrics")}}
+
+
+def normal_error(normals: Tensor, batch: Batch) -> float:
+    """Return the mean angular error in degrees of normals (B, 3, H, W) over the mask's pixels."""
+    inside = batch.mask[:, 0].bool()
+    pairs = [tensor.permute(0, 2, 3, 1)[inside].cpu().numpy() for tensor in (normals, batch.normals)]
+    return float(angle_degrees(*pairs).mean()) if len(pairs[0]) else 0.0
+
+
+def light_errors(lights: Lights, batch: Batch, suffix: str) -> dict[str, float]:
+    """Return direction and intensity errors, each averaged over the scenes."""
+    directions, intensities = (tensor.float().cpu().numpy() for tensor in lights[:2])
     true_directions, true_intensities = batch.directions.cpu().numpy(), batch.intensities.cpu().numpy()
     errors = [intensity_error(*pair) for pair in zip(intensities, true_intensities, strict=True)]
     return {
@@ -193,9 +251,34 @@ def _light_errors(directions: np.ndarray, intensities: np.ndarray, batch: Batch,
     }
 
 
-def _crop(tensor: Tensor, corner: Tensor, side: int) -> Tensor:
+def crop(tensor: Tensor, corner: Tensor, side: int) -> Tensor:
     """Cut (B, ..., S, S) to (B, ..., side, side) at each sample's own corner (B, 2)."""
     if tensor.shape[-1] == side:
         return tensor
     corners = corner.tolist()
     return torch.stack([item[..., r : r + side, c : c + side] for item, (r, c) in zip(tensor, corners, strict=True)])
+
+
+def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
+    """Return the stage that trains a run.
+
+    Args:
+        name: Name of the run.
+        model: Name in the registry, or `sdps-joint`.
+        config: The run's configuration, of the model's role.
+        trained: The models it needs, by what they are for: `lighting`, `normals`.
+    """
+    from sdps.joint import JointStage, SecondStage
+    from sdps.pixel_stage import PixelStage
+    from sdps.recipes import JOINT
+
+    if model == JOINT:
+        return JointStage(config, trained["lighting"], trained["normals"], name=name)
+    role = registry.entry(model).role
+    if role == "lighting":
+        return LightingStage(config, model=model, name=name)
+    if role == "second":
+        return SecondStage(config, trained["lighting"], trained["normals"], model=model, name=name)
+    if role == "pixels":
+        return PixelStage(config, model=model, name=name)
+    return NormalStage(config, trained.get("lighting"), model=model, name=name)

@@ -1,8 +1,9 @@
-"""The trainer of both stages: load, step, log, validate, checkpoint, resume.
+"""The trainer of every model: load, step, log, validate, checkpoint, resume.
 
-A run's folder holds `metrics.jsonl`, `checkpoint.pt` (everything needed to go on) and, once finished,
-`<network>.safetensors`. Running the same command again resumes; a run that was stopped and resumed
-takes the same steps on the same batches as one that was not.
+A run's folder holds `metrics.jsonl`, `checkpoint.pt` (everything needed to go on), the best weights so far
+(`<run>-best.safetensors`) and, once finished, the last (`<run>.safetensors`). Running the same command again resumes;
+a run that was stopped and resumed takes the same steps on the same batches as one that was not. Started by `torchrun`,
+several processes share every batch and take the steps one process would take.
 """
 
 import logging
@@ -15,17 +16,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from render.config import to_plain
 from render.errors import InputError
-from render.manifest import MANIFEST, read_manifest
+from render.manifest import read_manifest
 from render.progress import progress_bar
-from render.shards import file_hash
 from sdps.checkpoint import TrainedModel, code_version, load_state, save_state, save_weights
-from sdps.dataset import Batch, SampleKey, SampleStream, SceneDataset, collate
-from sdps.interrupts import StopRequest, leave_signals_to_parent, stop_on_signal
+from sdps.dataset import Batch, SampleKey, SceneDataset, collate
+from sdps.distributed import Team, team
+from sdps.interrupts import StopRequest, stop_on_signal
 from sdps.loggers import JsonlLogger, Logger, Meter, TensorBoardLogger
+from sdps.sources import BatchSource, StoredScenes
 from sdps.stages import Stage
 
 CHECKPOINT = "checkpoint.pt"
@@ -44,7 +48,7 @@ class TrainingResult:
     """How a run ended.
 
     Attributes:
-        weights: The safetensors file, or None when the run was stopped before its budget was spent.
+        weights: The safetensors files by name, or None when the run was stopped before its budget was spent.
         steps: Optimiser steps taken in all.
         seconds: Seconds of training in all.
         metrics: Final validation metrics, `val_...`; empty without validation scenes.
@@ -52,7 +56,7 @@ class TrainingResult:
         interrupted: Stopped by a signal; the same call resumes.
     """
 
-    weights: Path | None
+    weights: dict[str, Path] | None
     steps: int
     seconds: float
     metrics: dict[str, float]
@@ -65,6 +69,7 @@ def train(
     data_folder: str | Path,
     out_folder: str | Path,
     *,
+    source: BatchSource | None = None,
     device: str | torch.device | None = None,
     loggers: Sequence[Logger] = (),
     tensorboard: bool = False,
@@ -72,9 +77,10 @@ def train(
     """Train a stage until its budget is spent, resuming whatever `out_folder` holds.
 
     Args:
-        stage: `LightingStage` or `NormalStage`, which carries the configuration.
+        stage: What to train; carries the configuration.
         data_folder: Rendered data with splits `train` and, for validation, `val`.
         out_folder: Folder of the run.
+        source: Where training batches come from; by default the stored scenes of `data_folder`.
         device: Torch device; CUDA when there is one, else CPU.
         loggers: Receivers of metrics beside `metrics.jsonl`.
         tensorboard: Also log to `<out_folder>/tensorboard`.
@@ -83,58 +89,73 @@ def train(
         InputError: unusable data, a checkpoint of another configuration or data set, or a loss that is
             no longer finite.
     """
-    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    trainer = Trainer(stage, Path(data_folder), Path(out_folder), device)
+    with team(device) as here:
+        trainer = Trainer(stage, Path(data_folder), Path(out_folder), here, source)
+        try:
+            return _train(trainer, list(loggers), tensorboard)
+        finally:
+            trainer.source.close()
+
+
+def _train(trainer: "Trainer", loggers: list[Logger], tensorboard: bool) -> TrainingResult:
+    """Resume, run, validate and save."""
     trainer.resume()
     if trainer.finished_metrics is not None and trainer.progress() >= 1.0:
         return trainer.result(trainer.finished_metrics, 0.0, interrupted=False)
     trainer.finished_metrics = None
-    loggers = [JsonlLogger(trainer.folder / METRICS, trainer.step), *loggers]
-    if tensorboard:
-        loggers.append(TensorBoardLogger(trainer.folder / "tensorboard"))
+    if trainer.team.leads:
+        loggers.insert(0, JsonlLogger(trainer.folder / METRICS, trainer.step))
+        if tensorboard:
+            loggers.append(TensorBoardLogger(trainer.folder / "tensorboard"))
+    metrics: dict[str, float] = {}
     try:
         with stop_on_signal() as stop:
-            waiting_share = _run(trainer, loggers, stop)
-        metrics = {}
-        if not stop.requested:
-            metrics = trainer.finished_metrics = trainer.validate()
-            _report(loggers, trainer.step, metrics)
-            trainer.save_weights(metrics)
-        trainer.save()
+            waiting_share, stopped = _run(trainer, loggers, stop)
+        if trainer.team.leads:
+            if not stopped:
+                metrics = trainer.finished_metrics = trainer.validate()
+                _report(loggers, trainer.step, metrics)
+                trainer.save_weights(metrics)
+            trainer.save()
     finally:
         for logger in loggers:
             logger.close()
-    if stop.requested:
+    trainer.team.wait()  # the others may want the leader's weights next
+    if stopped:
         _log.warning("stopped after step %d; run the same command again to resume", trainer.step)
-    return trainer.result(metrics, waiting_share, interrupted=stop.requested)
+    return trainer.result(metrics, waiting_share, interrupted=stopped)
 
 
-def _run(trainer: "Trainer", loggers: Iterable[Logger], stop: StopRequest) -> float:
-    """Take steps until the budget is spent or a stop is requested; return the share of time spent waiting."""
+def _run(trainer: "Trainer", loggers: Iterable[Logger], stop: StopRequest) -> tuple[float, bool]:
+    """Take steps until the budget is spent or a stop is requested; return the share of time waited, and whether."""
     config = trainer.config
-    batches = iter(trainer.loader())
+    batches = trainer.source.batches(trainer.samples)
     meter = Meter()
     saved = time.perf_counter()
-    bar = progress_bar(total=100.0, initial=100.0 * trainer.progress(), desc=trainer.stage.name,
-               bar_format="{l_bar}{bar}| {elapsed}<{remaining} {postfix}")  # fmt: skip
+    look = {"desc": trainer.stage.name, "bar_format": "{l_bar}{bar}| {elapsed}<{remaining} {postfix}"}
+    bar = progress_bar(total=100.0, initial=100.0 * trainer.progress(), disable=not trainer.team.leads, **look)
     with bar:
-        while trainer.progress() < 1.0 and not stop.requested:
+        while True:
+            stopped = trainer.team.any(stop.requested)
+            (progress,) = trainer.team.agree([trainer.progress()])
+            if progress >= 1.0 or stopped:
+                break
             with meter.waiting():
                 batch = next(batches)
             if isinstance(batch, InputError):
                 raise batch
-            meter.add(trainer.take_step(batch), batch.images.shape[0] * batch.images.shape[1])
+            meter.add(trainer.take_step(batch, progress), batch.images.shape[0] * batch.images.shape[1])
             if trainer.step % config.log_every == 0:
                 values = meter.summary() | {"learning_rate": trainer.learning_rate, "seconds": trainer.seconds()}
                 _report(loggers, trainer.step, values)
                 bar.set_postfix_str(f"loss {values['loss']:.3f}, {values['images_per_second']:.0f} images/s")
-            if config.validate_every and trainer.step % config.validate_every == 0:
+            if config.validate_every and trainer.step % config.validate_every == 0 and trainer.team.leads:
                 _report(loggers, trainer.step, trainer.validate())
-            if time.perf_counter() - saved > 60.0 * config.checkpoint_minutes:
+            if trainer.team.leads and time.perf_counter() - saved > 60.0 * config.checkpoint_minutes:
                 trainer.save()
                 saved = time.perf_counter()
             bar.update(100.0 * min(trainer.progress(), 1.0) - bar.n)
-    return meter.total_waiting_share()
+    return meter.total_waiting_share(), stopped
 
 
 def _report(loggers: Iterable[Logger], step: int, values: dict[str, float]) -> None:
@@ -143,23 +164,49 @@ def _report(loggers: Iterable[Logger], step: int, values: dict[str, float]) -> N
             logger.log(step, values)
 
 
+class _Loss(nn.Module):
+    """A stage's loss as a module, so that `DistributedDataParallel` sees one forward pass."""
+
+    def __init__(self, stage: Stage) -> None:
+        super().__init__()
+        self.stage, self.network = stage, stage.network
+
+    def forward(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        return self.stage.loss(batch)
+
+
 class Trainer:
     """The state of a run and what can be done to it."""
 
-    def __init__(self, stage: Stage, data: Path, folder: Path, device: torch.device) -> None:
-        self.stage, self.config, self.data, self.folder, self.device = stage, stage.config, data, folder, device
+    def __init__(self, stage: Stage, data: Path, folder: Path, here: Team, source: BatchSource | None = None) -> None:
+        self.stage, self.config, self.data, self.folder, self.team = stage, stage.config, data, folder, here
         config = self.config
-        stage.to(device)
+        stage.to(here.device)
         options = {"cache": config.cache, "skip_missing": config.skip_missing}
-        self.dataset = SceneDataset(data, "train", stage.sample_options(), **options)
+        self.source = source or StoredScenes(
+            SceneDataset(data, "train", stage.sample_options(), **options),
+            batch=config.batch_scenes,
+            workers=config.workers,
+            pin_memory=here.device.type == "cuda",
+            rank=here.rank,
+            world=here.world,
+        )
         self.validation = None
-        if config.validation_scenes and any(scene.split == "val" for scene in read_manifest(data)):
+        if config.validation_scenes and here.leads and any(scene.split == "val" for scene in read_manifest(data)):
             self.validation = SceneDataset(data, "val", stage.validation_options(), **options)
         kind = torch.optim.Adam if config.optimiser == "adam" else torch.optim.AdamW
         self.optimiser = kind(
             stage.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
         )
+        average = get_ema_multi_avg_fn(config.ema)
+        self.average = AveragedModel(stage.network, multi_avg_fn=average) if config.ema else None
+        if config.compile:
+            stage.network.compile()
+        self._loss: nn.Module = _Loss(stage)
+        if here.world > 1:
+            self._loss = DistributedDataParallel(self._loss)
         self.step = self.samples = 0
+        self.best = math.inf
         self.learning_rate = config.learning_rate
         self.finished_metrics: dict[str, float] | None = None
         self._earlier_seconds, self._started = 0.0, time.perf_counter()
@@ -175,39 +222,31 @@ class Trainer:
             return self.step / config.steps
         if config.minutes is not None:
             return self.seconds() / (60.0 * config.minutes)
-        return self.samples / (config.epochs * len(self.dataset))
+        return self.samples / (config.epochs * self.source.scenes)
 
-    def loader(self) -> DataLoader:
-        """Return an endless loader that starts at the sample after the last one taken."""
-        config = self.config
-        return DataLoader(
-            self.dataset,
-            batch_sampler=SampleStream(len(self.dataset), config.batch_scenes, config.seed, self.samples),
-            num_workers=config.workers,
-            collate_fn=collate,
-            pin_memory=self.device.type == "cuda",
-            persistent_workers=config.workers > 0,
-            worker_init_fn=leave_signals_to_parent,
-        )
-
-    def take_step(self, batch: Batch) -> dict[str, float]:
+    def take_step(self, batch: Batch, progress: float) -> dict[str, float]:
         """Take one optimiser step on `batch` and return its losses.
+
+        Args:
+            batch: This process's share of the step's scenes.
+            progress: Share of the budget spent, which the learning rate follows.
 
         Raises:
             InputError: the loss is not finite.
         """
         config = self.config
         self.stage.network.train()
-        self.learning_rate = config.learning_rate_at(self.progress())
+        self.learning_rate = config.learning_rate_at(progress)
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate
         totals: dict[str, float] = {}
         for part in _parts(batch, config.accumulate):
             with self._autocast():
-                loss, terms = self.stage.loss(part.to(self.device))
+                loss, terms = self._loss(part.to(self.team.device))
             (loss / config.accumulate).backward()
             for name, value in {"loss": loss, **terms}.items():
                 totals[name] = totals.get(name, 0.0) + float(value.detach()) / config.accumulate
+        totals = self.team.mean(totals)
         if not math.isfinite(totals["loss"]):
             raise InputError(f"the loss became {totals['loss']} at step {self.step + 1}; lower learning_rate")
         if config.clip_gradient:
@@ -215,37 +254,56 @@ class Trainer:
             totals["gradient_norm"] = float(norm)
         self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
+        if self.average is not None:
+            self.average.update_parameters(self.stage.network)
         self.step += 1
         self.samples += config.batch_scenes
         return totals
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Return the stage's metrics, prefixed `val_`, averaged over fixed samples of the `val` split."""
+        """Return the stage's metrics, prefixed `val_`, averaged over fixed samples of the `val` split.
+
+        The best weights so far, by the stage's goal, are saved.
+        """
         if self.validation is None:
             return {}
+        trained, self.stage.network = self.stage.network, self._kept()
         self.stage.network.eval()
         count = min(self.config.validation_scenes, len(self.validation))
         rows = []
-        for index in np.linspace(0, len(self.validation) - 1, count).round().astype(int):
-            batch = collate([self.validation.sample(SampleKey(int(index), 0, int(index)))])
-            with self._autocast():
-                rows.append(self.stage.metrics(batch.to(self.device)))
-        return {f"val_{name}": float(np.mean([row[name] for row in rows])) for name in rows[0]}
+        try:
+            for index in np.linspace(0, len(self.validation) - 1, count).round().astype(int):
+                batch = collate([self.validation.sample(SampleKey(int(index), 0, int(index)))])
+                with self._autocast():
+                    rows.append(self.stage.metrics(batch.to(self.team.device)))
+        finally:
+            self.stage.network = trained
+        values = {f"val_{name}": float(np.mean([row[name] for row in rows])) for name in rows[0]}
+        if values[f"val_{self.stage.goal}"] < self.best:
+            self.best = values[f"val_{self.stage.goal}"]
+            self.save_weights(values, "-best")
+        return values
+
+    def _kept(self) -> nn.Module:
+        """Return the network that is validated and saved: the trained one, or its moving average."""
+        return self.stage.network if self.average is None else self.average.module
 
     def _autocast(self) -> torch.autocast:
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16")
+        return torch.autocast(self.team.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16")
 
     def save(self) -> None:
         """Write the checkpoint: weights, optimiser, random state, and place in the data."""
-        cuda = torch.cuda.get_rng_state_all() if self.device.type == "cuda" else []
+        cuda = torch.cuda.get_rng_state_all() if self.team.device.type == "cuda" else []
         state = {
             "identity": self._identity(),
             "network": self.stage.network.state_dict(),
+            "average": self.average.state_dict() if self.average is not None else {},
             "optimiser": self.optimiser.state_dict(),
             "random": {"cpu": torch.get_rng_state(), "cuda": cuda},
             "step": self.step,
             "samples": self.samples,
+            "best": self.best,
             "seconds": self.seconds(),
             "finished_metrics": self.finished_metrics,
         }
@@ -264,18 +322,20 @@ class Trainer:
         self._compare(path, state.get("identity", {}))
         self.stage.network.load_state_dict(state["network"])
         self.optimiser.load_state_dict(state["optimiser"])
+        if self.average is not None:
+            self.average.load_state_dict(state["average"])
         torch.set_rng_state(state["random"]["cpu"])
-        if self.device.type == "cuda" and state["random"]["cuda"]:
+        if self.team.device.type == "cuda" and state["random"]["cuda"]:
             torch.cuda.set_rng_state_all(state["random"]["cuda"])
-        self.step, self.samples = state["step"], state["samples"]
+        self.step, self.samples, self.best = state["step"], state["samples"], state["best"]
         self.finished_metrics = state["finished_metrics"]
         self._earlier_seconds, self._started = state["seconds"], time.perf_counter()
 
     def _identity(self) -> dict[str, Any]:
         """Return what a checkpoint must share with the run that resumes it."""
         fixed = {key: value for key, value in to_plain(self.config).items() if key not in _MAY_CHANGE}
-        data = {"data": file_hash(self.data / MANIFEST), "scenes": len(self.dataset)}
-        return {"stage": self.stage.name, **data, **self.stage.origin(), **fixed}
+        about = {"model": self.stage.model, **self.source.identity()}
+        return about | self.stage.origin() | {f"config.{key}": value for key, value in fixed.items()}
 
     def _compare(self, path: Path, saved: dict[str, Any]) -> None:
         for key, value in self._identity().items():
@@ -284,26 +344,25 @@ class Trainer:
                     f"{path}: of another run ({key} was {saved.get(key)!r}, now {value!r}); choose another --out"
                 )
 
-    def save_weights(self, metrics: dict[str, float]) -> None:
-        """Write the network with everything needed to use and to trace it."""
+    def save_weights(self, metrics: dict[str, float], suffix: str = "") -> None:
+        """Write each network with everything needed to use and to trace it."""
         metadata = {
             "config": to_plain(self.config),
-            "data": file_hash(self.data / MANIFEST),
+            **self.source.identity(),
             "code": code_version(),
             "step": self.step,
             "seconds": round(self.seconds(), 1),
             "metrics": metrics,
             **self.stage.origin(),
         }
-        model = TrainedModel(self.stage.name, self.stage.network, self.stage.options, metadata)
-        save_weights(self._weights(), model)
-
-    def _weights(self) -> Path:
-        return self.folder / f"{self.stage.name}.safetensors"
+        for part in self.stage.parts(self._kept()):
+            model = TrainedModel(part.model, part.network, part.options, metadata)
+            save_weights(self.folder / f"{part.name}{suffix}.safetensors", model)
 
     def result(self, metrics: dict[str, float], waiting_share: float, *, interrupted: bool) -> TrainingResult:
         """Describe how the run ended."""
-        weights = None if interrupted else self._weights()
+        names = [part.name for part in self.stage.parts(self.stage.network)]
+        weights = None if interrupted else {name: self.folder / f"{name}.safetensors" for name in names}
         return TrainingResult(weights, self.step, self.seconds(), metrics, waiting_share, interrupted)
 
 

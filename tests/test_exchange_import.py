@@ -276,4 +276,4 @@ def test_the_trainer_reads_imported_folders(tmp_path):
         steps=1, batch_scenes=2, images=2, workers=0, validation_scenes=0, precision="float32", log_every=1
     )
     result = train(LightingStage(config), tmp_path / "data", tmp_path / "lcnet")
-    assert result.steps == 1 and result.weights.is_file()
+    assert result.steps == 1 and result.weights["lcnet"].is_file()

@@ -43,19 +43,22 @@ def test_paper_preset_has_the_published_composition_and_schedule():
     counts = {family: count * per_shape for family, count in preset.data.families.items()}
     assert counts == {"blobby": 25_920, "sculpture": 59_292}
     assert preset.data.light_count == 64
-    assert (preset.lighting.epochs, preset.lighting.batch_scenes, preset.lighting.images) == (20, 32, 32)
-    assert (preset.normals.epochs, preset.normals.batch_scenes, preset.normals.loss) == (10, 16, "faithful")
-    assert preset.lighting.learning_rate_at(0.26) == pytest.approx(2.5e-4)
+    lighting, normals, psfcn = (preset.run(name).config for name in ("lcnet", "nenet", "psfcn"))
+    assert (lighting.epochs, lighting.batch_scenes, lighting.images) == (20, 32, 32)
+    assert (normals.epochs, normals.batch_scenes, normals.loss) == (10, 16, "faithful")
+    assert lighting.learning_rate_at(0.26) == pytest.approx(2.5e-4)
+    assert (psfcn.epochs, psfcn.batch_scenes, psfcn.crop, psfcn.learning_rate_at(0.2)) == (30, 32, 32, 5e-4)
 
 
 def test_overrides_reach_any_field_and_convert_types():
     preset = presets.load("smoke", ["data.size=32", "lighting.learning_rate=1e-3", "test.materials=[chrome]",
                                     "data.families.blobby=1", "lighting.augmentation.noise=0"])  # fmt: skip
     assert preset.data.size == 32
-    assert preset.lighting.learning_rate == 1e-3
+    lighting = preset.run("lcnet").config
+    assert lighting.learning_rate == 1e-3
     assert preset.test.materials == ("chrome",)
     assert preset.data.families == {"blobby": 1, "sculpture": 3}
-    assert preset.lighting.augmentation.noise == 0.0
+    assert lighting.augmentation.noise == 0.0
 
 
 @pytest.mark.parametrize(
@@ -96,7 +99,7 @@ def test_unknown_command_and_flag(capsys):
 def test_help_lists_every_command(capsys):
     assert main([]) == 0
     text = capsys.readouterr().out
-    for command in ("doctor", "render-data", "train", "eval-merltest", "regenerate", "materials", "shapes"):
+    for command in ("doctor", "render-data", "models", "train", "eval-merltest", "regenerate", "materials", "shapes"):
         assert command in text
 
 
@@ -237,15 +240,18 @@ def test_the_whole_line_at_smoke_scale(capsys, tmp_path):
     results = json.loads((tmp_path / "eval" / "results.json").read_text())
     assert len(results["scenes"]) == 4
     for scene in results["scenes"]:
-        assert scene["scores"]["constant"]["direction_mae"] == pytest.approx(42.2, abs=2)  # the light set's own mean
-        assert scene["scores"]["least squares, true lights"]["normal_mae"] < 35
-        assert 0 < scene["scores"]["LCNet + NENet"]["normal_mae"] < 90
+        assert scene["scores"]["constant predictor"]["direction_mae"] == pytest.approx(
+            42.2, abs=2
+        )  # the light set's own mean
+        assert scene["scores"]["least-squares, true lights"]["normal_mae"] < 35
+        assert 0 < scene["scores"]["lcnet + nenet"]["normal_mae"] < 90
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") >= 4 * 6
     assert not re.search(r"(src|href)=\"(?!data:)", page)  # self-contained
-    for folder in ("data", "lighting", "normals", "merltest", "eval"):
+    for folder in ("data", "models/lcnet", "models/nenet", "merltest", "eval"):
         assert presets.load(str(tmp_path / folder / "config.yaml")).name == "smoke"
-    assert (tmp_path / "lighting" / "lcnet.safetensors").exists()
+    for name in ("lcnet.safetensors", "lcnet-best.safetensors", "curves.png", "MODEL_CARD.md"):
+        assert (tmp_path / "models" / "lcnet" / name).stat().st_size > 100
 
 
 # ---- Pictures --------------------------------------------------------------------------------------

@@ -1,6 +1,8 @@
 """From shards to batches: augmentation in its order, streams of random numbers, cache, and refusals."""
 
 import json
+from itertools import islice
+from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +15,10 @@ from render.errors import InputError
 from render.manifest import read_manifest
 from render.shards import read_shard
 from sdps.augment import Augmentation, apply_symmetry, augment, exposure_scale, normalise_exposure
-from sdps.dataset import SampleKey, SampleOptions, SampleStream, SceneDataset, collate
+from sdps.dataset import Batch, SampleKey, SampleOptions, SampleStream, SceneDataset, collate, make_sample
 from sdps.metrics import normal_mae
+from sdps.scene_store import StoredScene
+from sdps.sources import StoredScenes
 
 PLAIN = Augmentation(
     exposure="paper", exposure_range=(1.0, 1.0), intensity_range=(1.0, 1.0), noise=0.0, clip=1e6
@@ -30,6 +34,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def options(**changes: object) -> SampleOptions:
     return SampleOptions(**{"seed": 0, "images": 4, "size": 32, "augmentation": Augmentation(), **changes})
+
+
+def same(first: Batch, second: Batch) -> bool:
+    return all(torch.equal(*pair) for pair in zip(first, second, strict=True))
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -256,3 +264,121 @@ def test_augmentation_fields_are_checked() -> None:
         Augmentation(intensity_range=(0.0, 2.0))
     with pytest.raises(InputError, match=r"augmentation\.mean_level"):
         Augmentation(mean_level=5.0, clip=4.0)
+
+
+# ---- Seeds of samples, and crops of large scenes -----------------------------------------------------
+
+
+def test_every_sample_has_a_seed_of_its_own_that_its_crop_does_not_change(folder: Path) -> None:
+    plain, cropped = (SceneDataset(folder, "train", options(**changes)) for changes in ({}, {"crop": 12}))
+    keys = [SampleKey(0, epoch, position) for epoch in range(3) for position in range(3)]
+    seeds = [plain.sample(key).seed for key in keys]
+    assert len({int(seed) for seed in seeds}) == 9
+    assert all(seed.dtype == torch.int64 and seed >= 0 for seed in seeds)
+    assert [cropped.sample(key).seed for key in keys] == seeds
+    other = SceneDataset(folder, "train", options(seed=1))
+    assert other.sample(keys[0]).seed != seeds[0]
+    assert collate([plain.sample(key) for key in keys]).seed.tolist() == [int(seed) for seed in seeds]
+
+
+def ramp(height: int, width: int) -> StoredScene:
+    """Return a scene whose images tell which row and column a pixel had, with all normals tilted alike."""
+    rows, columns = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
+    image = np.stack([rows, columns, np.ones_like(rows)], axis=-1) / 64.0
+    normals = np.tile(np.array([0.6, 0.0, 0.8], np.float32), (height, width, 1))
+    return StoredScene(np.repeat(image[None], 4, 0).astype(np.float16), normals, np.ones((height, width), bool))
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 64), (48, 80)])
+def test_large_scenes_are_rescaled_by_one_factor_and_cropped(folder: Path, height: int, width: int) -> None:
+    (scene,) = read_manifest(folder, "train")[:1]
+    config = options(augmentation=PLAIN, rescale=True)
+    steps, starts = [], []
+    for number in range(60):
+        sample = make_sample(scene, ramp(height, width), config, rng(number))
+        assert sample.images.shape == (4, 3, 32, 32)
+        inner = 64.0 * sample.images[0, :2, 1:-1, 1:-1]  # antialiasing flattens the border of the ramp
+        down, right = inner[0].diff(dim=0).mean(), inner[1].diff(dim=1).mean()
+        assert down == pytest.approx(float(right), rel=0.05)
+        assert inner[0].max() <= height and inner[1].max() <= width
+        steps.append(float(down))
+        starts.append((round(float(inner[0].min())), round(float(inner[1].min()))))
+        torch.testing.assert_close(sample.normals, torch.tensor([0.6, 0.0, 0.8])[:, None, None].expand(3, 32, 32))
+    most = min(height, width) / 32
+    assert 1.0 <= min(steps) < 1.1 and 0.95 * most < max(steps) <= most + 0.01
+    assert len(set(starts)) > 30
+    repeated = [make_sample(scene, ramp(height, width), config, rng(7)) for _ in range(2)]
+    assert same(*repeated)
+
+
+def test_rescaling_leaves_scenes_alone_that_are_not_larger(folder: Path) -> None:
+    key = SampleKey(1, 0, 3)
+    for size in (32, 48):
+        plain, rescaled = (
+            SceneDataset(folder, "train", options(size=size, rescale=rescale)).sample(key) for rescale in (False, True)
+        )
+        assert same(plain, rescaled)
+
+
+def test_rescaled_scenes_still_obey_lamberts_law(tmp_path: Path) -> None:
+    from sdps.classical.least_squares import least_squares
+
+    write_data(tmp_path, ("train",), lights=6, size=96)
+    config = options(augmentation=Augmentation(noise=0.0, symmetries=True, clip=1e6), images=6, rescale=True)
+    for position in range(4):
+        sample = SceneDataset(tmp_path, "train", config).sample(SampleKey(0, 0, position))
+        images, mask = sample.images.numpy().transpose(0, 2, 3, 1), sample.mask[0].numpy() > 0
+        mask &= images.min((0, 3)) > 1e-2  # lit by all
+        normals = sample.normals.numpy().transpose(1, 2, 0)
+        estimate = least_squares(images, mask, sample.directions.numpy(), sample.intensities.numpy())
+        assert mask.mean() > 0.1
+        assert normal_mae(estimate.normals, normals, mask) < 1.0
+
+
+# ---- The source of stored batches --------------------------------------------------------------------
+
+
+def test_stored_batches_resume_and_do_not_depend_on_the_workers(folder: Path) -> None:
+    dataset = SceneDataset(folder, "train", options())
+    whole = list(islice(StoredScenes(dataset, batch=2).batches(0), 6))
+    source = StoredScenes(dataset, batch=2, workers=2)
+    resumed = list(islice(source.batches(4), 4))
+    assert all(same(*pair) for pair in zip(whole[2:], resumed, strict=True))
+    assert len(active_children()) == 2
+    again = next(source.batches(2))  # another place: the first loader ends
+    assert same(again, whole[1])
+    assert len(active_children()) == 2
+    source.close()
+    source.close()
+    assert not active_children()
+
+
+def test_processes_share_every_batch(folder: Path) -> None:
+    dataset = SceneDataset(folder, "train", options())
+    whole = islice(StoredScenes(dataset, batch=4).batches(8), 3)
+    parts = [islice(StoredScenes(dataset, batch=4, rank=rank, world=2).batches(8), 3) for rank in range(2)]
+    for batch, *shares in zip(whole, *parts, strict=True):
+        assert [len(share.images) for share in shares] == [2, 2]
+        assert same(batch, Batch(*(torch.cat(tensors) for tensors in zip(*shares, strict=True))))
+    with pytest.raises(InputError, match="batch_scenes 4 cannot be shared by 3 processes"):
+        StoredScenes(dataset, batch=4, world=3)
+    with pytest.raises(InputError, match="rank must be from 0 to 1"):
+        StoredScenes(dataset, batch=4, rank=2, world=2)
+
+
+def test_identity_tells_data_sets_apart(folder: Path, tmp_path: Path) -> None:
+    source = StoredScenes(SceneDataset(folder, "train", options()), batch=2)
+    assert (source.scenes, source.identity()["scenes"]) == (5, 5)
+    write_data(tmp_path, ("train",) * 5 + ("val",), lights=6, size=32, seed=1)
+    other = StoredScenes(SceneDataset(tmp_path, "train", options()), batch=2)
+    assert other.identity()["data"] != source.identity()["data"]
+    json.dumps(source.identity())
+
+
+def test_stored_batches_hand_on_mistakes(tmp_path: Path) -> None:
+    scenes = write_data(tmp_path, ("train", "train"), lights=4, size=16)
+    path = tmp_path / scenes[1].file
+    path.write_bytes(path.read_bytes()[:-100])
+    source = StoredScenes(SceneDataset(tmp_path, "train", options(size=16)), batch=2, workers=1)
+    assert "render it again" in str(next(source.batches(0)))
+    source.close()

@@ -118,3 +118,37 @@ def test_impossible_class_counts_are_refused() -> None:
         LightClasses(directions=1)
     with pytest.raises(InputError, match="0 < low < high"):
         LightClasses(low=2.0, high=0.2)
+
+
+def test_soft_classes_have_the_exact_value_as_their_expectation() -> None:
+    classes = LightClasses()
+    directions = torch.from_numpy(uniform_hemisphere(200)).float()
+    directions = directions[directions[:, 2] > 0.1]
+    intensities = torch.linspace(0.25, 1.95, len(directions))
+    azimuth, elevation, intensity = classes.encode_soft(directions, intensities)
+    for weights, count in ((azimuth, 36), (elevation, 36), (intensity, 20)):
+        assert weights.shape == (len(directions), count)
+        torch.testing.assert_close(weights.sum(-1), torch.ones(len(directions)))
+        assert int((weights > 0).sum(-1).max()) <= 2
+    inside = (azimuth_elevation(directions)[0].abs() < 87.5) & (azimuth_elevation(directions)[1].abs() < 87.5)
+    found = classes.read_out(azimuth.clamp(min=1e-12).log(), elevation.clamp(min=1e-12).log(),
+                             intensity.clamp(min=1e-12).log(), "expectation")  # fmt: skip
+    torch.testing.assert_close(found[0][inside], directions[inside], atol=1e-4, rtol=0)
+    torch.testing.assert_close(found[1], intensities, atol=1e-4, rtol=0)
+
+
+def test_the_peak_of_a_sampled_gaussian_is_found_exactly_and_stays_in_its_bin() -> None:
+    classes = LightClasses()
+    centres = bin_centre(torch.arange(36), -90, 90, 36)
+    truth = torch.linspace(-80, 80, 41)
+    logits = -0.5 * ((centres - truth[:, None]) / 7.0) ** 2
+    flat = torch.zeros(41, 20)
+    directions, intensities = classes.read_out(logits, logits, flat, "peak")
+    azimuth, elevation = azimuth_elevation(directions)
+    torch.testing.assert_close(azimuth, truth, atol=2e-3, rtol=0)
+    torch.testing.assert_close(elevation, truth, atol=2e-3, rtol=0)
+    assert bool((intensities == intensities[0]).all())  # a plateau keeps its class centre
+    edge = torch.zeros(1, 36)
+    edge[0, 0] = 5.0
+    at_edge, _ = classes.read_out(edge, edge, flat[:1], "peak")
+    torch.testing.assert_close(at_edge, classes.read_out(edge, edge, flat[:1], "centre")[0])

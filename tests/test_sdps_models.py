@@ -4,11 +4,14 @@ import pytest
 import torch
 
 from render.errors import InputError
-from sdps.losses import faithful_normal_loss, lighting_loss, masked_normal_loss
+from sdps.losses import faithful_normal_loss, masked_normal_loss
+from sdps.models.base import Lights, Observations
 from sdps.models.blocks import parameter_count
 from sdps.models.lcnet import LCNet, LightingLogits, resize_input
+from sdps.models.lighting_variants import LCNetSecond
 from sdps.models.nenet import NENet
-from sdps.models.registry import MODELS, create
+from sdps.models.registry import COMBINATIONS, MODELS, PUBLISHED_PARAMETERS, create
+from sdps.models.upsfcn import UPSFCN
 
 
 @pytest.fixture(autouse=True)
@@ -74,13 +77,12 @@ def test_nenet_ignores_the_order_of_its_images_and_takes_any_number_and_size() -
     images, directions = torch.rand(1, 5, 3, 20, 36), torch.rand(1, 5, 3)
     order = torch.tensor([4, 2, 0, 3, 1])
     with torch.no_grad():
-        whole = network(images, directions)
-        torch.testing.assert_close(network(images[:, order], directions[:, order]), whole)
-        running = torch.maximum(
-            network.encode(images[:, :2], directions[:, :2]), network.encode(images[:, 2:], directions[:, 2:])
-        )
+        whole = network(Observations(images, directions))
+        torch.testing.assert_close(network(Observations(images[:, order], directions[:, order])), whole)
+        halves = [Observations(images[:, part], directions[:, part]) for part in (slice(2), slice(2, 5))]
+        running = torch.maximum(*(network.encode(half) for half in halves))
         torch.testing.assert_close(network.regress(running), whole)
-        assert network(images[:, :1], directions[:, :1]).shape == (1, 3, 20, 36)
+        assert network(Observations(images[:, :1], directions[:, :1])).shape == (1, 3, 20, 36)
     torch.testing.assert_close(whole.norm(dim=1), torch.ones(1, 20, 36))
 
 
@@ -94,15 +96,15 @@ def test_resizing_for_lcnet_keeps_means() -> None:
 
 def test_lighting_loss_of_uniform_logits_is_the_log_of_the_class_counts() -> None:
     logits = LightingLogits(torch.zeros(2, 3, 36), torch.zeros(2, 3, 36), torch.zeros(2, 3, 20))
-    classes = tuple(torch.zeros(2, 3, dtype=torch.int64) for _ in range(3))
-    loss = lighting_loss(logits, classes)
-    assert float(loss.azimuth) == pytest.approx(3.5835, abs=1e-4)  # ln 36
-    assert float(loss.total) == pytest.approx(2 * 3.5835 + 2.9957, abs=1e-3)
+    loss = LCNet().loss(logits, torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3), torch.ones(2, 3))
+    assert float(loss["azimuth"]) == pytest.approx(3.5835, abs=1e-4)  # ln 36
+    assert float(loss["total"]) == pytest.approx(2 * 3.5835 + 2.9957, abs=1e-3)
 
 
 def test_faithful_loss_is_the_masked_one_diluted_by_the_background() -> None:
     truth = torch.nn.functional.normalize(torch.randn(2, 3, 8, 8), dim=1)
     mask = (torch.rand(2, 1, 8, 8) < 0.4).float()
+    mask[1] = mask[0]  # the loss weighs scenes, not pixels
     share = float(mask.mean())
     normals = [torch.nn.functional.normalize(torch.randn(2, 3, 8, 8), dim=1).requires_grad_() for _ in range(2)]
     normals[1].data.copy_(normals[0].data)
@@ -120,3 +122,62 @@ def test_faithful_loss_is_torchs_cosine_embedding_loss() -> None:
     flat = [tensor.permute(0, 2, 3, 1).reshape(-1, 3) for tensor in (normals, truth)]
     reference = torch.nn.CosineEmbeddingLoss()(*flat, torch.ones(36))
     assert float(faithful_normal_loss(normals, truth)) == pytest.approx(float(reference), abs=1e-5)
+
+
+def test_published_counts_are_met_within_two_per_cent() -> None:
+    for name, millions in PUBLISHED_PARAMETERS.items():
+        assert MODELS[name].parameters == pytest.approx(millions * 1e6, rel=0.02), name
+    for name in ("sdps", "sdps-reg"):
+        assert COMBINATIONS[name].parameters() == pytest.approx(6.6e6, rel=0.02)
+    assert COMBINATIONS["sdps-plus"].parameters() <= 10_000_000
+
+
+def test_reconstructions_say_so() -> None:
+    for name in ("lcnet-reg", "upsfcn-wide", "upsfcn-deep", "upsfcn-deep-mask", "upsfcn-light"):
+        assert MODELS[name].reconstruction, name
+        assert "reconstruction" in (MODELS[name].build.__doc__ or "")
+
+
+def test_the_masked_loss_of_parts_averages_to_that_of_the_whole() -> None:
+    truth = torch.nn.functional.normalize(torch.randn(4, 3, 8, 8), dim=1)
+    normals = torch.nn.functional.normalize(torch.randn(4, 3, 8, 8), dim=1)
+    mask = (torch.rand(4, 1, 8, 8) < torch.tensor([0.1, 0.9, 0.5, 0.0])[:, None, None, None]).float()
+    parts = [masked_normal_loss(normals[part], truth[part], mask[part]) for part in (slice(2), slice(2, 4))]
+    torch.testing.assert_close(torch.stack(parts).mean(), masked_normal_loss(normals, truth, mask))
+
+
+def test_per_pixel_networks_see_shading_without_albedo() -> None:
+    network = NENet(per_pixel=True)
+    images, mask = torch.rand(1, 4, 3, 8, 8) + 0.1, torch.ones(1, 1, 8, 8)
+    lights = Lights(torch.rand(1, 4, 3), torch.ones(1, 4))
+    albedo = torch.rand(1, 1, 1, 8, 8) + 0.5
+    first, second = (network.observe(stack, mask, lights).images for stack in (images, images * albedo))
+    torch.testing.assert_close(first, second, rtol=1e-3, atol=1e-4)
+    # The published norm is that of 32 images, whatever their number here.
+    twice = network.observe(images.repeat(1, 2, 1, 1, 1), mask, Lights(torch.rand(1, 8, 3), torch.ones(1, 8))).images
+    torch.testing.assert_close(twice[:, :4], first)
+    thirty_two = torch.rand(1, 32, 3, 4, 4)
+    norm = thirty_two.square().sum((1, 2), keepdim=True).sqrt()
+    seen = network.observe(thirty_two, torch.ones(1, 1, 4, 4), Lights(torch.rand(1, 32, 3), torch.ones(1, 32)))
+    torch.testing.assert_close(seen.images, thirty_two / norm, rtol=1e-3, atol=1e-5)
+
+
+def test_a_network_sees_only_what_it_declares() -> None:
+    images, mask = torch.rand(1, 2, 3, 8, 8), torch.ones(1, 1, 8, 8)
+    lights = Lights(torch.rand(1, 2, 3), torch.full((1, 2), 0.5))
+    seen = NENet().observe(images, mask, lights)
+    torch.testing.assert_close(seen.images, images * 2.0)
+    assert seen.directions is lights.directions and seen.mask is None
+    alone = UPSFCN(use_mask=True).observe(images, mask, None)
+    assert alone.images is images and alone.directions is None and alone.mask is mask
+
+
+def test_the_second_pass_sees_the_shading_of_the_first_lights() -> None:
+    normals = torch.zeros(1, 3, 2, 2)
+    normals[:, 2] = 1.0
+    mask = torch.tensor([[[[1.0, 0.0], [1.0, 1.0]]]])
+    directions = torch.tensor([[[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]])
+    context = LCNetSecond.context(normals, mask, directions)
+    assert context.shape == (1, 3, 4, 2, 2)
+    torch.testing.assert_close(context[0, :, 3, 0, 0], torch.tensor([1.0, 0.8, 0.0]))
+    assert float(context[0, :, :, 0, 1].abs().max()) == 0.0  # outside the mask

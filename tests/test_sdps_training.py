@@ -100,10 +100,10 @@ def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, uninterrupted
 def test_finished_run_is_left_alone_and_a_longer_budget_goes_on(folder: Path, tmp_path: Path) -> None:
     config = replace(QUICK, steps=2, schedule="constant")
     first = train(NormalStage(config), folder, tmp_path)
-    time_of_change = first.weights.stat().st_mtime_ns
+    time_of_change = first.weights["nenet"].stat().st_mtime_ns
     again = train(NormalStage(config), folder, tmp_path)
     assert (again.steps, again.metrics) == (2, first.metrics)
-    assert again.weights.stat().st_mtime_ns == time_of_change
+    assert again.weights["nenet"].stat().st_mtime_ns == time_of_change
     longer = train(NormalStage(replace(config, steps=4)), folder, tmp_path)
     whole = train(NormalStage(replace(config, steps=4)), folder, tmp_path / "whole")
     assert longer.metrics == whole.metrics
@@ -167,19 +167,20 @@ def test_stage_two_leaves_the_lighting_network_as_it_is(folder: Path, tmp_path: 
     lighting = TrainedModel("lcnet", create("lcnet").eval(), {"direction_classes": 36, "intensity_classes": 20},
                             {"config": {"augmentation": {}}, "data": "d", "step": 1})  # fmt: skip
     before = {name: tensor.clone() for name, tensor in lighting.network.state_dict().items()}
-    stage = NormalStage(replace(QUICK, steps=2, lights="estimated"), lighting)
+    stage = NormalStage(replace(QUICK, steps=2, lights="lcnet"), lighting)
     result = train(stage, folder, tmp_path)
     assert all(torch.equal(tensor, before[name]) for name, tensor in lighting.network.state_dict().items())
-    assert load_weights(result.weights, "nenet").metadata["lcnet"]["data"] == "d"
+    assert load_weights(result.weights["nenet"], "normals").metadata["lighting"]["data"] == "d"
     # NENet is given class centres, not the true lights.
     dataset = SceneDataset(folder, "train", stage.sample_options())
-    directions, intensities = stage.lights(collate([dataset.sample(SampleKey(0, 0, 0))]))
-    labels = stage.classes.encode(directions, intensities)
-    torch.testing.assert_close(stage.classes.decode(*labels)[0], directions)
+    lights = stage.lights(collate([dataset.sample(SampleKey(0, 0, 0))]))
+    classes = lighting.network.classes
+    labels = classes.encode(lights.directions, lights.intensities)
+    torch.testing.assert_close(classes.decode(*labels)[0], lights.directions)
 
 
 def test_weights_carry_their_origin(uninterrupted: tuple) -> None:
-    model = load_weights(uninterrupted[1].weights, "nenet")
+    model = load_weights(uninterrupted[1].weights["nenet"], "normals")
     assert model.metadata["step"] == 8
     assert len(model.metadata["data"]) == 64
     assert build(NormalTraining, model.metadata["config"]) == QUICK
@@ -187,33 +188,40 @@ def test_weights_carry_their_origin(uninterrupted: tuple) -> None:
 
 
 def test_half_precision_weights_load_as_float32(tmp_path: Path) -> None:
-    model = TrainedModel("nenet", create("nenet"), {}, {"config": {}})
+    model = TrainedModel("nenet", create("nenet"), {}, {"config": {"augmentation": {}}})
     save_weights(tmp_path / "whole.safetensors", model)
     save_weights(tmp_path / "half.safetensors", model, half=True)
     assert (tmp_path / "half.safetensors").stat().st_size < 0.51 * (tmp_path / "whole.safetensors").stat().st_size
-    loaded = load_weights(tmp_path / "half.safetensors", "nenet").network
+    loaded = load_weights(tmp_path / "half.safetensors", "normals").network
     for name, tensor in loaded.state_dict().items():
         assert tensor.dtype == torch.float32
         torch.testing.assert_close(tensor, model.network.state_dict()[name], atol=1e-3, rtol=1e-3)
 
 
 def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path: Path) -> None:
-    weights = uninterrupted[1].weights
+    weights = uninterrupted[1].weights["nenet"]
     cut, text = tmp_path / "cut.safetensors", tmp_path / "text.safetensors"
     cut.write_bytes(weights.read_bytes()[:-1000])
     text.write_text("not weights")
     misfit = tmp_path / "misfit.safetensors"
-    save_weights(misfit, TrainedModel("lcnet", create("lcnet"), {"intensity_classes": 10}, {}))
+    save_weights(
+        misfit, TrainedModel("lcnet", create("lcnet"), {"intensity_classes": 10}, {"config": {"augmentation": {}}})
+    )
+    headless, foreign = tmp_path / "headless.safetensors", tmp_path / "foreign.safetensors"
+    save_weights(headless, TrainedModel("nenet", create("nenet"), {}, {}))
+    save_weights(foreign, TrainedModel("nenet2", create("nenet"), {}, {"config": {"augmentation": {}}}))
     cases = [
-        (weights, "lcnet", "holds 'nenet' weights"),
-        (cut, "nenet", "truncated"),
-        (text, "nenet", "truncated or not a safetensors"),
-        (tmp_path / "none.safetensors", "nenet", "no such weights"),
-        (misfit, "lcnet", "do not fit"),
+        (weights, "lighting", "holds 'nenet', a model for 'normals'"),
+        (cut, "normals", "truncated"),
+        (text, "normals", "truncated or not a safetensors"),
+        (tmp_path / "none.safetensors", "normals", "no such weights"),
+        (misfit, "lighting", "do not fit"),
+        (headless, "normals", "damaged header"),
+        (foreign, "normals", "a model this version does not know"),
     ]
-    for path, name, message in cases:
+    for path, role, message in cases:
         with pytest.raises(InputError, match=message) as error:
-            load_weights(path, name)
+            load_weights(path, role)
         assert "\n" not in str(error.value)
 
 

@@ -1,6 +1,6 @@
 """The layers both networks are made of (SDPS-Net, supplement; no normalisation layer anywhere)."""
 
-from torch import nn
+from torch import Tensor, nn
 
 SLOPE = 0.1
 
@@ -15,6 +15,15 @@ def deconv(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(
         nn.ConvTranspose2d(inputs, outputs, 4, stride=2, padding=1, bias=False), nn.LeakyReLU(SLOPE, inplace=True)
     )
+
+
+def max_over_images(features: Tensor, *, keepdim: bool = False) -> Tensor:
+    """Return the maximum over the images of features (B, Q, ...), as (B, ...) or (B, 1, ...).
+
+    By `max`, as in the authors' code, whose gradient goes to one image; that of `amax` is shared by ties, and becomes
+    NaN under `torch.compile` with bfloat16 (torch 2.13).
+    """
+    return features.max(dim=1, keepdim=keepdim).values
 
 
 def initialise(network: nn.Module) -> None:

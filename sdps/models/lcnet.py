@@ -9,6 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from sdps.lighting import LightClasses, ReadOut
+from sdps.losses import class_loss
+from sdps.models.base import LightingNetwork, Lights
 from sdps.models.blocks import conv, initialise
 
 INPUT_SIZE = 128
@@ -22,19 +25,73 @@ class LightingLogits(NamedTuple):
     intensity: Tensor  # (B, Q, K_e)
 
 
-def _head(classes: int) -> nn.Sequential:
+class LightingTrunk(LightingNetwork):
+    """The layers every lighting network shares: extractor, local-global fusion, and convolutions down to 1x1.
+
+    Args:
+        inputs: Input channels.
+        use_mask: One of them is the object mask.
+        use_global: Concatenate the feature shared by all images to each image's own.
+        widths: Channels of the extractor at 1/8 and 1/16 of the size, and of the classifier.
+    """
+
+    def __init__(
+        self, *, inputs: int, use_mask: bool, use_global: bool, widths: tuple[int, int, int] = (128, 256, 256)
+    ) -> None:
+        super().__init__()
+        self.use_mask, self.use_global = use_mask, use_global
+        middle, local, last = widths
+        self.extractor = nn.Sequential(
+            conv(inputs, 64, stride=2),  # 64 x 64
+            conv(64, 128, stride=2),  # 32 x 32
+            conv(128, 128),
+            conv(128, middle, stride=2),  # 16 x 16
+            conv(middle, middle),
+            conv(middle, local, stride=2),  # 8 x 8
+            conv(local, local),
+        )
+        self.classifier = nn.Sequential(
+            conv(2 * local if use_global else local, last),
+            conv(last, last, stride=2),  # 4 x 4
+            conv(last, last, stride=2),  # 2 x 2
+            conv(last, last, stride=2),  # 1 x 1
+        )
+
+    def encode(self, images: Tensor, mask: Tensor, context: Tensor | None = None) -> Tensor:
+        """Return the local features (B, Q, F, 8, 8) of images (B, Q, 3, 128, 128)."""
+        assert images.shape[-2:] == (INPUT_SIZE, INPUT_SIZE), images.shape
+        return super().encode(images, mask, context)
+
+    def fuse(self, local: Tensor, shared: Tensor) -> Tensor:
+        """Return one vector per image, (B Q, F', 1, 1)."""
+        if not self.use_global:
+            return self.classifier(local.flatten(0, 1))
+        # The first convolution sees [local, shared]. What it makes of the shared half is the same for every image of a
+        # scene, so it is computed once per scene and added.
+        (first, activation), rest = self.classifier[0], self.classifier[1:]
+        width = local.shape[2]
+        own = functional.conv2d(local.flatten(0, 1), first.weight[:, :width], first.bias, padding=1)
+        common = functional.conv2d(shared.flatten(0, 1), first.weight[:, width:], padding=1)  # (B, F', 8, 8)
+        own = own.unflatten(0, local.shape[:2]) + common[:, None]
+        return rest(activation(own.flatten(0, 1)))
+
+
+def head(inputs: int, outputs: int) -> nn.Sequential:
     """Two fully connected layers, written as 1x1 convolutions on the 1x1 map."""
-    return nn.Sequential(conv(256, 64, kernel=1), nn.Conv2d(64, classes, 1))
+    return nn.Sequential(conv(inputs, 64, kernel=1), nn.Conv2d(64, outputs, 1))
 
 
-class LCNet(nn.Module):
-    """Classifies the light of every image from its local feature and the maximum over all images.
+class LCNet(LightingTrunk):
+    """Classifies the light of every image from its local feature and the maximum over all images (SDPS-Net, sec. 4.1).
 
     Args:
         direction_classes: K_d, classes of azimuth and of elevation.
         intensity_classes: K_e.
-        use_mask: Give the object mask as a fourth input channel (off: the paper's ablation).
-        use_global: Concatenate the feature shared by all images (off: the paper's ablation).
+        intensity_range: Relative intensities the classes cover.
+        use_mask: Give the object mask as a fourth input channel (off: the paper's ablation A2).
+        use_global: Concatenate the feature shared by all images (off: the paper's ablation A3).
+        context: Further input channels.
+        widths: See `LightingTrunk`.
     """
 
     def __init__(
@@ -42,54 +99,39 @@ class LCNet(nn.Module):
         *,
         direction_classes: int = 36,
         intensity_classes: int = 20,
+        intensity_range: tuple[float, float] = (0.2, 2.0),
         use_mask: bool = True,
         use_global: bool = True,
+        context: int = 0,
+        widths: tuple[int, int, int] = (128, 256, 256),
     ) -> None:
-        super().__init__()
-        self.use_mask = use_mask
-        self.use_global = use_global
-        self.extractor = nn.Sequential(
-            conv(4 if use_mask else 3, 64, stride=2),  # 64 x 64
-            conv(64, 128, stride=2),  # 32 x 32
-            conv(128, 128),
-            conv(128, 128, stride=2),  # 16 x 16
-            conv(128, 128),
-            conv(128, 256, stride=2),  # 8 x 8
-            conv(256, 256),
-        )
-        self.classifier = nn.Sequential(
-            conv(512 if use_global else 256, 256),
-            conv(256, 256, stride=2),  # 4 x 4
-            conv(256, 256, stride=2),  # 2 x 2
-            conv(256, 256, stride=2),  # 1 x 1
-        )
-        self.azimuth = _head(direction_classes)
-        self.elevation = _head(direction_classes)
-        self.intensity = _head(intensity_classes)
+        inputs = 3 + use_mask + context
+        super().__init__(inputs=inputs, use_mask=use_mask, use_global=use_global, widths=tuple(widths))
+        low, high = intensity_range
+        self.classes = LightClasses(directions=direction_classes, intensities=intensity_classes, low=low, high=high)
+        self.azimuth = head(widths[2], direction_classes)
+        self.elevation = head(widths[2], direction_classes)
+        self.intensity = head(widths[2], intensity_classes)
         initialise(self)
 
-    def forward(
-        self,
-        images: Tensor,  # (B, Q, 3, 128, 128)
-        mask: Tensor,  # (B, 1, 128, 128)
-    ) -> LightingLogits:
-        """Return the class logits of every image; the order of the images does not matter."""
-        scenes, count = images.shape[:2]
-        assert images.shape[-2:] == (INPUT_SIZE, INPUT_SIZE), images.shape
-        inputs = images
-        if self.use_mask:
-            inputs = torch.cat([images, mask[:, None].expand(-1, count, -1, -1, -1)], dim=2)
-        local = self.extractor(inputs.flatten(0, 1)).unflatten(0, (scenes, count))  # (B, Q, 256, 8, 8)
-        if self.use_global:
-            shared = local.amax(dim=1, keepdim=True).expand_as(local)
-            local = torch.cat([local, shared], dim=2)  # (B, Q, 512, 8, 8)
-        feature = self.classifier(local.flatten(0, 1))  # (B Q, 256, 1, 1)
-        return LightingLogits(
-            *(
-                head(feature).flatten(1).unflatten(0, (scenes, count))
-                for head in (self.azimuth, self.elevation, self.intensity)
-            )
-        )
+    def predict(self, local: Tensor, shared: Tensor) -> LightingLogits:
+        """Return the class logits of every image."""
+        feature = self.fuse(local, shared)
+        heads = (self.azimuth, self.elevation, self.intensity)
+        return LightingLogits(*(part(feature).flatten(1).unflatten(0, local.shape[:2]) for part in heads))
+
+    def loss(self, prediction: LightingLogits, directions: Tensor, intensities: Tensor) -> dict[str, Tensor]:
+        """Return the cross-entropies of the true classes and their sum (SDPS-Net, eq. 2)."""
+        targets = self.classes.encode(directions, intensities)
+        pairs = zip(prediction._asdict().items(), targets, strict=True)
+        terms = {name: class_loss(logits, target) for (name, logits), target in pairs}
+        return {"total": torch.stack(list(terms.values())).sum(), **terms}
+
+    def lights(self, prediction: LightingLogits, read_out: ReadOut = "centre") -> Lights:
+        """Return the lights of the likeliest classes, or another read-out of the class probabilities."""
+        directions, intensities = self.classes.read_out(*prediction, read_out)
+        peaks = [values.float().softmax(-1).amax(-1) for values in (prediction.azimuth, prediction.elevation)]
+        return Lights(directions, intensities, peaks[0] * peaks[1])
 
 
 def resize_input(images: Tensor, mask: Tensor, antialias: bool = True) -> tuple[Tensor, Tensor]:

@@ -7,59 +7,81 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sdps.models.blocks import conv, deconv, initialise
+from sdps.models.base import NormalNetwork, Observations
+from sdps.models.blocks import conv, deconv, initialise, max_over_images
 
 SIZE_MULTIPLE = 4
 
 
-class NENet(nn.Module):
-    """Regresses normals from the maximum over per-image features.
+class MaxFusionNet(NormalNetwork):
+    """Extractor per image, maximum over the images, regressor: the frame NENet, PS-FCN and UPS-FCN share.
 
-    The maximum lets any number of images in, in any order; `encode` followed by `regress` lets a caller
-    keep a running maximum, so that memory does not grow with the number of images.
+    Args:
+        inputs: Input channels.
+        widths: Channels of the extractor at full, half and quarter size.
+        deeper: Further convolutions of the extractor at quarter size, and of the regressor at half size.
     """
 
-    def __init__(self) -> None:
+    size_multiple = SIZE_MULTIPLE
+
+    def __init__(
+        self, inputs: int, *, widths: tuple[int, int, int] = (64, 128, 256), deeper: tuple[int, int] = (0, 0)
+    ) -> None:
         super().__init__()
+        full, half, quarter = widths
         self.extractor = nn.Sequential(
-            conv(6, 64),
-            conv(64, 128, stride=2),  # H/2 x W/2
-            conv(128, 128),
-            conv(128, 256, stride=2),  # H/4 x W/4
-            conv(256, 256),
-            deconv(256, 128),  # H/2 x W/2
-            conv(128, 128),
+            conv(inputs, full),
+            conv(full, half, stride=2),  # H/2 x W/2
+            conv(half, half),
+            conv(half, quarter, stride=2),  # H/4 x W/4
+            conv(quarter, quarter),
+            *(conv(quarter, quarter) for _ in range(deeper[0])),
+            deconv(quarter, half),  # H/2 x W/2
+            conv(half, half),
         )
         self.regressor = nn.Sequential(
-            conv(128, 128),
-            conv(128, 128),
-            deconv(128, 64),  # H x W
+            conv(half, half),
+            conv(half, half),
+            *(conv(half, half) for _ in range(deeper[1])),
+            deconv(half, full),  # H x W
         )
-        self.normal = nn.Conv2d(64, 3, 3, padding=1, bias=False)
-        initialise(self)
+        self.normal = nn.Conv2d(full, 3, 3, padding=1, bias=False)
 
-    def encode(
-        self,
-        images: Tensor,  # (B, Q, 3, H, W)
-        directions: Tensor,  # (B, Q, 3)
-    ) -> Tensor:
-        """Return the maximum (B, 128, H/2, W/2) over the features of the given images.
+    def local(self, seen: Observations) -> Tensor:
+        """Return the feature of every image, (B, Q, F, H/2, W/2)."""
+        scenes, count, _, height, width = seen.images.shape
+        assert height % SIZE_MULTIPLE == 0 and width % SIZE_MULTIPLE == 0, seen.images.shape
+        parts = [seen.images]
+        if seen.directions is not None:
+            lights = seen.directions.to(seen.images.dtype)[..., None, None]
+            parts.append(lights.expand(-1, -1, -1, height, width))
+        if seen.mask is not None:
+            parts.append(seen.mask[:, None].expand(-1, count, -1, -1, -1))
+        inputs = torch.cat(parts, dim=2) if len(parts) > 1 else seen.images
+        return self.extractor(inputs.flatten(0, 1)).unflatten(0, (scenes, count))
 
-        The images are already divided by their light intensities.
-        """
-        scenes, count, _, height, width = images.shape
-        assert height % SIZE_MULTIPLE == 0 and width % SIZE_MULTIPLE == 0, images.shape
-        broadcast = directions[..., None, None].expand(-1, -1, -1, height, width).to(images.dtype)
-        inputs = torch.cat([images, broadcast], dim=2).flatten(0, 1)  # (B Q, 6, H, W)
-        return self.extractor(inputs).unflatten(0, (scenes, count)).amax(dim=1)
+    def encode(self, seen: Observations) -> Tensor:
+        """Return the maximum (B, F, H/2, W/2) over the features of the given images."""
+        return max_over_images(self.local(seen))
 
     def regress(self, feature: Tensor) -> Tensor:
-        """Return unit normals (B, 3, H, W), float32, of the aggregated feature (B, 128, H/2, W/2)."""
+        """Return unit normals (B, 3, H, W), float32, of the aggregated feature (B, F, H/2, W/2)."""
         feature = self.regressor(feature).float()
         # Never under autocast: a normal rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
         with torch.autocast(feature.device.type, enabled=False):
             return functional.normalize(self.normal(feature), dim=1)
 
-    def forward(self, images: Tensor, directions: Tensor) -> Tensor:
-        """Return unit normals (B, 3, H, W) of (B, Q, 3, H, W) images and their (B, Q, 3) directions."""
-        return self.regress(self.encode(images, directions))
+
+class NENet(MaxFusionNet):
+    """Regresses normals from images divided by their intensities, and the direction of each (SDPS-Net, sec. 4.2).
+
+    PS-FCN (Chen et al., ECCV 2018) has the same layers and differs in training only.
+
+    Args:
+        per_pixel: Divide by each pixel's norm over the lights first, as PS-FCN (Norm.) does.
+    """
+
+    def __init__(self, *, per_pixel: bool = False) -> None:
+        super().__init__(6)
+        self.per_pixel = per_pixel
+        initialise(self)

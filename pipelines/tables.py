@@ -1,0 +1,21 @@
+"""Tables as aligned text."""
+
+from collections.abc import Collection
+
+
+def render_text(title: str, header: list[str], rows: list[list[str]], left: Collection[int] = (0,)) -> str:
+    """Lay out a table with aligned columns under its title; columns in `left` are set flush left."""
+    widths = [max(len(line[column]) for line in [header, *rows]) for column in range(len(header))]
+    lines = [
+        "  ".join(
+            cell.ljust(width) if column in left else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in [header, *rows]
+    ]
+    return "\n".join([title, *lines]) + "\n"
+
+
+def number(value: float) -> str:
+    """Write a figure with two decimals from 1 up, three below."""
+    return f"{value:.2f}" if value >= 1 else f"{value:.3f}"

@@ -1,0 +1,158 @@
+"""What networks of one role have in common, so that any lighting network works with any normal network.
+
+Legend: B scenes, Q images of a scene, H and W the image's sides.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from sdps.lighting import LightClasses, ReadOut
+from sdps.models.blocks import max_over_images
+
+_TINY = 1e-8
+_SCALE_FLOOR = 1e-4
+"""Added to a pixel's norm over the lights: far below any lit pixel, but keeps black ones from dividing by zero."""
+
+
+class Lights(NamedTuple):
+    """The light of every image."""
+
+    directions: Tensor  # (B, Q, 3) float32, unit, from the surface to the light
+    intensities: Tensor  # (B, Q) float32, positive, relative
+    confidence: Tensor | None = None  # (B, Q) float32 in [0, 1], the product of the likeliest direction classes
+
+
+class LightingNetwork(nn.Module, ABC):
+    """Estimates the light of every image of a scene.
+
+    `encode` looks at images one by one, `predict` at their features and the maximum over all of them, so that a caller
+    can go through any number of images in chunks. Subclasses set `extractor` and `classes`.
+
+    Attributes:
+        use_mask: The mask is a fourth input channel.
+        use_global: The feature shared by all images is seen beside each image's own.
+        classes: The discretised lighting space.
+    """
+
+    use_mask: bool = True
+    use_global: bool = True
+    extractor: nn.Module
+    classes: LightClasses
+
+    def encode(
+        self,
+        images: Tensor,  # (B, Q, 3, 128, 128)
+        mask: Tensor,  # (B, 1, 128, 128)
+        context: Tensor | None = None,  # (B, Q, C, 128, 128), further channels
+    ) -> Tensor:
+        """Return the local features (B, Q, F, 8, 8)."""
+        parts = [images]
+        if self.use_mask:
+            parts.append(mask[:, None].expand(-1, images.shape[1], -1, -1, -1))
+        if context is not None:
+            parts.append(context)
+        inputs = torch.cat(parts, dim=2) if len(parts) > 1 else images
+        return self.extractor(inputs.flatten(0, 1)).unflatten(0, images.shape[:2])
+
+    @abstractmethod
+    def predict(
+        self,
+        local: Tensor,  # (B, Q, F, 8, 8)
+        shared: Tensor,  # (B, 1, F, 8, 8), the maximum over all images
+    ) -> Any:
+        """Return the prediction of every image, whatever form `loss` and `lights` want."""
+
+    @abstractmethod
+    def loss(
+        self,
+        prediction: Any,
+        directions: Tensor,  # (B, Q, 3)
+        intensities: Tensor,  # (B, Q)
+    ) -> dict[str, Tensor]:
+        """Return named losses, means over all images; `total` is the one to minimise."""
+
+    @abstractmethod
+    def lights(self, prediction: Any, read_out: ReadOut = "centre") -> Lights:
+        """Return directions, intensities and confidence of a prediction."""
+
+    def forward(self, images: Tensor, mask: Tensor, context: Tensor | None = None) -> Any:
+        """Return the prediction of every image; the order of the images does not matter."""
+        local = self.encode(images, mask, context)
+        return self.predict(local, max_over_images(local, keepdim=True))
+
+
+class Observations(NamedTuple):
+    """What a normal network sees of a scene; made by `NormalNetwork.observe`."""
+
+    images: Tensor  # (B, Q, 3, H, W), divided by the light intensities if the network is told the lights
+    directions: Tensor | None = None  # (B, Q, 3)
+    mask: Tensor | None = None  # (B, 1, H, W)
+
+
+class NormalNetwork(nn.Module, ABC):
+    """Estimates normals from any number of images, in any order, by the maximum over their features.
+
+    `encode` followed by `regress` lets a caller keep a running maximum, so that memory does not grow with the number
+    of images. A network with `per_pixel` also needs each pixel's norm over all images beforehand.
+
+    Attributes:
+        needs_lights: The network is told directions, and its images are divided by the intensities.
+        needs_mask: The mask is an input channel.
+        per_pixel: Images are divided by each pixel's norm over all lights and channels (PS-FCN (Norm.), Chen et al.,
+            TPAMI 2020), which takes albedo away and leaves shading.
+    """
+
+    needs_lights: bool = True
+    needs_mask: bool = False
+    per_pixel: bool = False
+    size_multiple: int = 4
+
+    def observe(
+        self,
+        images: Tensor,  # (B, Q, 3, H, W)
+        mask: Tensor,  # (B, 1, H, W)
+        lights: Lights | None,
+        mean_square: Tensor | None = None,  # (B, 1, 1, H, W)
+    ) -> Observations:
+        """Prepare images for `encode`.
+
+        Args:
+            images: Exposed images, under lights of the intensities in `lights`.
+            mask: 0 or 1.
+            lights: May be None for networks that are not told the lights.
+            mean_square: `mean_square(...)` over all images of the scene where `images` are only some; see `per_pixel`.
+        """
+        if self.needs_lights:
+            images = divide(images, lights.intensities)
+        if self.per_pixel:
+            squares = mean_square if mean_square is not None else self.mean_square(images)
+            # The published norm of 32 images of 3 channels, whatever the number of images here.
+            images = images / ((32 * 3 * squares).sqrt() + _SCALE_FLOOR)
+        return Observations(images, lights.directions if self.needs_lights else None, mask if self.needs_mask else None)
+
+    @staticmethod
+    def mean_square(images: Tensor) -> Tensor:
+        """Return the mean over images and channels of the squares, (B, 1, 1, H, W), of (B, Q, 3, H, W)."""
+        # Before any autocast region: squares of bfloat16 would carry errors of a per cent.
+        # The tiny floor keeps the square root's gradient finite at pixels that are black under every light.
+        return images.float().square().mean(dim=(1, 2), keepdim=True).clamp(min=1e-14)
+
+    @abstractmethod
+    def encode(self, seen: Observations) -> Tensor:
+        """Return the maximum over the features of the given images."""
+
+    @abstractmethod
+    def regress(self, feature: Tensor) -> Tensor:
+        """Return unit normals (B, 3, H, W), float32, of the aggregated feature."""
+
+    def forward(self, seen: Observations) -> Tensor:
+        """Return unit normals (B, 3, H, W)."""
+        return self.regress(self.encode(seen))
+
+
+def divide(images: Tensor, intensities: Tensor) -> Tensor:
+    """Divide images (B, Q, 3, H, W) by intensities (B, Q)."""
+    return images / (intensities[..., None, None, None] + _TINY)

@@ -1,0 +1,72 @@
+"""Several processes of `torchrun` take the steps one process takes."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from safetensors.torch import load_file
+from sdps_scenes import write_data
+
+SCRIPT = """
+import sys
+from sdps.config import NormalTraining
+from sdps.stages import NormalStage
+from sdps.training import train
+
+config = NormalTraining(
+    steps=4, batch_scenes=4, images=2, size=32, crop=16, lights="true", log_every=1, workers=0, validation_scenes=2,
+    validate_every=2, schedule="cosine", clip_gradient=1.0, ema=0.5, accumulate=int(sys.argv[3]),
+)
+result = train(NormalStage(config), sys.argv[1], sys.argv[2])
+assert result.steps == 4, result
+"""
+
+
+def run(folder: Path, out: Path, processes: int, accumulate: int = 1) -> list[dict]:
+    """Train in a fresh process, or several under torchrun; return the metrics without what measures time."""
+    script = out.with_suffix(".py")
+    script.write_text(SCRIPT)
+    launch = (
+        ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)] if processes > 1 else []
+    )
+    command = [sys.executable, *launch, str(script), str(folder), str(out), str(accumulate)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    timed = {"seconds", "images_per_second", "waiting_share"}
+    return [{key: value for key, value in line.items() if key not in timed} for line in lines]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data")
+    write_data(path, ("train",) * 6 + ("val", "val"), lights=4, size=32)
+    return path
+
+
+def test_two_processes_give_the_losses_of_one(folder: Path, tmp_path: Path) -> None:
+    alone, together = run(folder, tmp_path / "one", 1), run(folder, tmp_path / "two", 2)
+    assert [line["step"] for line in alone] == [line["step"] for line in together]
+    for first, second in zip(alone, together, strict=True):
+        assert first.keys() == second.keys()
+        for key, value in first.items():
+            assert second[key] == pytest.approx(value, rel=2e-4, abs=1e-6), (first["step"], key)
+    weights = [load_file(tmp_path / name / "nenet.safetensors") for name in ("one", "two")]
+    for name, tensor in weights[0].items():
+        assert float((tensor - weights[1][name]).abs().max()) < 2e-3, name
+
+
+def test_a_batch_that_cannot_be_shared_is_refused(folder: Path, tmp_path: Path) -> None:
+    script = tmp_path / "odd.py"
+    script.write_text(SCRIPT.replace("batch_scenes=4", "batch_scenes=3"))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    done = subprocess.run(
+        [*command, str(folder), str(tmp_path / "out"), "1"], capture_output=True, text=True, check=False,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert done.returncode != 0
+    assert "batch_scenes 3 cannot be shared by 2 processes" in done.stderr
