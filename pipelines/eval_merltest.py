@@ -6,6 +6,7 @@ output folder has its row; least squares and a constant predictor, which shows w
 """
 
 import argparse
+import logging
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ from render.shards import Shard, read_shard
 if TYPE_CHECKING:
     from pipelines.runners import Runner
 
+_log = logging.getLogger(__name__)
 LIGHTING_COLUMNS = ("direction_mae", "intensity_error")
 DEFINITION = (
     "Means over scenes (one per material). Normals: mean angular error in degrees over mask pixels. Directions: mean "
@@ -48,7 +50,8 @@ class SceneResult:
         scores: `scores[method][metric]`, averaged over the repeats.
         mask: (H, W) bool.
         truth: (H, W, 3) true normals.
-        normals: (H, W, 3) estimated normals of the methods that are shown, by method.
+        shown: The methods whose pictures are shown, the main one first.
+        normals: (H, W, 3) estimated normals of these methods, by method; of those that found any.
         true_lights: (L, 3) directions.
         lights: (L, 3) directions the first method shown estimated; empty if it estimates none.
         picture: (H, W, 3) float32, the brightest input image.
@@ -58,6 +61,7 @@ class SceneResult:
     scores: dict[str, dict[str, float]]
     mask: np.ndarray
     truth: np.ndarray
+    shown: tuple[str, ...]
     normals: dict[str, np.ndarray]
     true_lights: np.ndarray
     lights: np.ndarray
@@ -129,11 +133,15 @@ def evaluate(
         shard = read_shard(folder / scene.file, scene)
         runs = [_evaluate_once(scene, shard, repeat, config, runners, pictured) for repeat in range(config.repeats)]
         first = runs[0]
-        averaged = {
-            method: {metric: float(np.mean([run.scores[method][metric] for run in runs])) for metric in values}
-            for method, values in first.scores.items()
-        }
+        averaged = {method: _mean_scores([run.scores[method] for run in runs]) for method in first.scores}
         yield replace(first, scores=averaged)
+
+
+def _mean_scores(repeats: list[dict[str, float]]) -> dict[str, float]:
+    """Average each metric over the repeats; none of a method that failed in one of them."""
+    if not all(repeats):
+        return {}
+    return {metric: float(np.mean([values[metric] for values in repeats])) for metric in repeats[0]}
 
 
 def _evaluate_once(
@@ -151,8 +159,13 @@ def _evaluate_once(
     images = shard.images.astype(np.float32) * gains[:, None, None, None] * mask[..., None]
     scores, normals, estimated = {}, {}, np.zeros((0, 3), np.float32)
     for runner in runners:
-        estimate = runner.estimate(images, mask, lights, gains)
         name = runner.method.name
+        try:
+            estimate = runner.estimate(images, mask, lights, gains)
+        except InputError as error:  # such as least squares under lights that were all estimated alike
+            _log.warning("%s, %s: no score (%s)", scene.id, name, error)
+            scores.setdefault(name, {})
+            continue
         scores[name] = scores.get(name, {}) | runner.score(estimate, mask, shard.normals, lights, gains)
         if name in pictured and estimate.normals.size:
             normals[name] = estimate.normals
@@ -162,6 +175,7 @@ def _evaluate_once(
         scores=scores,
         mask=mask,
         truth=shard.normals,
+        shown=tuple(pictured),
         normals={name: normals[name] for name in pictured if name in normals},
         true_lights=lights,
         lights=estimated,
@@ -175,8 +189,12 @@ def build_tables(
     """Average over the materials of each shape: {title: (header, rows)}, all text."""
     shapes = list(dict.fromkeys(result.scene.shape for result in results))
 
-    def mean(shape: str, method: Method, metric: str) -> float:
-        return float(np.mean([r.scores[method.name][metric] for r in results if r.scene.shape == shape]))
+    def cell(shape: str, method: Method, metric: str, paper: float | None) -> str:
+        scored = [r.scores[method.name] for r in results if r.scene.shape == shape]
+        values = [scores[metric] for scores in scored if metric in scores]
+        text = number(float(np.mean(values))) if values else "-"
+        text += f" ({number(paper)})" if paper is not None else ""
+        return text + (f" [{len(scored) - len(values)} of {len(scored)} failed]" if len(values) < len(scored) else "")
 
     tables = {}
     if lighting:
@@ -186,18 +204,14 @@ def build_tables(
             for shape in shapes:
                 beside = _beside(published.LIGHTING, method.paper, shape, len(LIGHTING_COLUMNS))
                 cells += [
-                    _cell(mean(shape, method, metric), figure)
-                    for metric, figure in zip(LIGHTING_COLUMNS, beside, strict=True)
+                    cell(shape, method, metric, figure) for metric, figure in zip(LIGHTING_COLUMNS, beside, strict=True)
                 ]
             body.append([method.paper or "-", method.name, *cells])
         header = ["row", "model", *(f"{shape} {name}" for shape in shapes for name in ("direction", "intensity"))]
         tables["Table A, lighting estimation"] = (header, body)
     body = [
         [method.paper or "-", method.name]
-        + [
-            _cell(mean(shape, method, "normal_mae"), *_beside(published.NORMALS, method.paper, shape, 1))
-            for shape in shapes
-        ]
+        + [cell(shape, method, "normal_mae", *_beside(published.NORMALS, method.paper, shape, 1)) for shape in shapes]
         for method in normals
     ]
     tables["Table B, normal estimation (MAE)"] = (["row", "model", *shapes], body)
@@ -210,10 +224,6 @@ def _beside(table: dict[str, tuple], row: str, shape: str, count: int) -> tuple[
         return (None,) * count
     figures = table[row][1 + published.SHAPES.index(shape)]
     return figures if isinstance(figures, tuple) else (figures,)
-
-
-def _cell(ours: float, paper: float | None) -> str:
-    return number(ours) + (f" ({number(paper)})" if paper is not None else "")
 
 
 def results_json(results: list[SceneResult], tables: dict, preset: Preset, weights: dict[str, str]) -> dict:

@@ -61,13 +61,8 @@ def choose(results: list["SceneResult"], count: int) -> list["SceneResult"]:
     return chosen
 
 
-def _main(result: "SceneResult") -> str:
-    """Return the method whose pictures are shown first."""
-    return next(iter(result.normals))
-
-
 def _error(result: "SceneResult") -> float:
-    return result.scores[_main(result)]["normal_mae"]
+    return result.scores[result.shown[0]].get("normal_mae", np.inf)
 
 
 def _table(title: str, header: list[str], rows: list[list[str]]) -> str:
@@ -99,8 +94,9 @@ def _scene(result: "SceneResult") -> str:
             (f"normals, {name}", pictures.normal_map(normals, mask)),
             (f"error, {np.nanmean(errors):.1f}°", pictures.error_map(errors, ERROR_LIMIT)),
         ]
-    if len(result.lights):
-        text = f"lights, {result.scores[_main(result)]['direction_mae']:.1f}°"
+    directions = result.scores[result.shown[0]].get("direction_mae")
+    if len(result.lights) and directions is not None:
+        text = f"lights, {directions:.1f}°"
         tiles.append((text, pictures.light_plot(result.true_lights, result.lights)))
     figures = "".join(
         f'<figure><img src="{pictures.data_uri(picture)}" alt="{html.escape(text)}">'
@@ -113,15 +109,18 @@ def _scene(result: "SceneResult") -> str:
 
 def _per_material(results: list["SceneResult"]) -> str:
     """Render one line per scene, worst first."""
-    names = list(results[0].normals)
     wanted = [
         (name, metric, digits)
-        for name in names
+        for name in results[0].shown
         for metric, digits in (("normal_mae", 2), ("direction_mae", 2), ("intensity_error", 3))
-        if metric in results[0].scores[name]
+        if any(metric in result.scores[name] for result in results)
     ]
+
+    def cell(scores: dict[str, float], metric: str, digits: int) -> str:
+        return f"{scores[metric]:.{digits}f}" if metric in scores else "-"
+
     rows = [
-        [r.scene.shape, r.scene.material, *(f"{r.scores[name][metric]:.{digits}f}" for name, metric, digits in wanted)]
+        [r.scene.shape, r.scene.material, *(cell(r.scores[name], metric, digits) for name, metric, digits in wanted)]
         for r in sorted(results, key=_error, reverse=True)
     ]
     about = {"normal_mae": "normals", "direction_mae": "directions", "intensity_error": "intensities"}

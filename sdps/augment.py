@@ -3,8 +3,8 @@
 Shards hold HDR radiance: a dark material is really dark (0.01), a mirror's highlight reaches hundreds.
 The paper instead starts from 8-bit images. Two exposure modes bridge that:
 
-* `paper`: one random factor per scene, then the sensor's clip, random light intensities, noise: the
-  authors' order exactly (they need no clip, since an 8-bit file has saturated before).
+* `paper`: the sensor's clip, one random factor per scene, random light intensities, noise: the authors' order exactly
+  (their 8-bit files have saturated before).
 * `mean`: random light intensities first, then the whole set is exposed so that the object's mean is at a
   fixed level, as a photographer would, with a jitter, then the clip and noise. Test images are brought
   to the same level, so that absolute brightness carries no spurious meaning.
@@ -30,7 +30,8 @@ class Augmentation:
         exposure_range: Uniform range of the factor (`paper`); (1, 3) in the paper.
         mean_level: Mean radiance of the object's pixels over the set after exposure (`mean`).
         mean_jitter: Uniform range of the factor on `mean_level`.
-        clip: Sensor saturation: values are clipped here after exposure.
+        clip: Sensor saturation. `mean` clips exposed images, `paper` the radiance as it was rendered. Unclipped
+            highlights reach hundreds; a network that sees them learns more slowly (docs/models.md has the figures).
         intensity_range: Uniform range of the light intensity of each image; the labels of LCNet.
         noise: Full width of the uniform noise added to every pixel, background included.
         symmetries: Mirror and quarter-turn scenes at random, with their normals and lights (not in the
@@ -41,7 +42,7 @@ class Augmentation:
     exposure_range: tuple[float, float] = (1.0, 3.0)
     mean_level: float = 0.3
     mean_jitter: tuple[float, float] = (0.7, 1.4)
-    clip: float = 4.0
+    clip: float = 1.0
     intensity_range: tuple[float, float] = (0.2, 2.0)
     noise: float = 0.05
     symmetries: bool = False
@@ -77,7 +78,7 @@ def augment(
     intensities = rng.uniform(*config.intensity_range, len(images)).astype(np.float32)  # (Q,)
     gains = intensities[:, None, None, None]
     if config.exposure == "paper":
-        images = np.minimum(images * factor, np.float32(config.clip)) * gains
+        images = np.minimum(images, np.float32(config.clip)) * (factor * gains)
     else:
         images = images * gains
         factor *= exposure_scale(images[:, mask], config.mean_level, config.clip)

@@ -13,8 +13,7 @@ class Estimate:
     Attributes:
         normals: (H, W, 3) float32, unit in the camera frame, zero outside the mask; (0, 0, 3) of methods that give
             lights alone.
-        light_directions: (L, 3) float32, unit, from the surface to the light; (0, 3) where there are none, neither given
-            nor estimated.
+        light_directions: (L, 3) float32, unit, from the surface to the light; (0, 3) where none were given or found.
         intensities: (L,) float32, relative: known up to one common scale; (0,) where there are none.
         diagnostics: What else the method can say (maps, class probabilities, seconds), by name.
     """

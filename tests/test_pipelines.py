@@ -240,9 +240,8 @@ def test_the_whole_line_at_smoke_scale(capsys, tmp_path):
     results = json.loads((tmp_path / "eval" / "results.json").read_text())
     assert len(results["scenes"]) == 4
     for scene in results["scenes"]:
-        assert scene["scores"]["constant predictor"]["direction_mae"] == pytest.approx(
-            42.2, abs=2
-        )  # the light set's own mean
+        constant = scene["scores"]["constant predictor"]
+        assert constant["direction_mae"] == pytest.approx(42.2, abs=2)  # the light set's own mean
         assert scene["scores"]["least-squares, true lights"]["normal_mae"] < 35
         assert 0 < scene["scores"]["lcnet + nenet"]["normal_mae"] < 90
     page = (tmp_path / "report.html").read_text()
@@ -252,6 +251,29 @@ def test_the_whole_line_at_smoke_scale(capsys, tmp_path):
         assert presets.load(str(tmp_path / folder / "config.yaml")).name == "smoke"
     for name in ("lcnet.safetensors", "lcnet-best.safetensors", "curves.png", "MODEL_CARD.md"):
         assert (tmp_path / "models" / "lcnet" / name).stat().st_size > 100
+    evaluate_combinations(capsys, flags, tmp_path)
+
+
+def evaluate_combinations(capsys, flags, out):
+    """Train two more models in the folder of the line above, and combine what is there."""
+    assert main(["train", *flags, "--models", "psfcn,cnnps", "--set", "pixels.steps=1"]) == 0
+    assert "psfcn: 2 steps" in (text := capsys.readouterr().out) and "cnnps: 1 steps" in text
+    flags = [*flags, "--set", "test.rotations=1"]
+    combinations = {
+        "lcnet + psfcn": ["--lights", "lcnet", "--normals", "psfcn"],
+        "cnnps, true lights": ["--normals", "cnnps"],  # it is trained on true lights
+        "lcnet + cnnps": ["--lights", "lcnet", "--normals", "cnnps"],
+        "lcnet + nenet, true intensities": ["--normals", "sdps", "--intensities", "true"],
+        "lcnet + least-squares": ["--lights", "lcnet", "--normals", "least-squares"],
+    }
+    for name, words in combinations.items():
+        assert main(["eval-merltest", *flags, *words]) == 0
+        assert name in capsys.readouterr().out
+    scores = json.loads((out / "eval" / "results.json").read_text())["scenes"][0]["scores"]
+    assert "direction_mae" not in scores["least-squares, true lights"]  # what was given is not scored
+    assert "did you mean 'psfcn'" in fails(capsys, "eval-merltest", *flags, "--lights", "lcnet", "--normals", "psfnc")
+    line = fails(capsys, "eval-merltest", *flags, "--normals", "sdps-plus")
+    assert "no such weights; train them with `sdps train --models" in line
 
 
 # ---- Pictures --------------------------------------------------------------------------------------

@@ -51,13 +51,13 @@ def test_plain_augmentation_changes_nothing() -> None:
     np.testing.assert_array_equal(intensities, 1.0)
 
 
-def test_paper_order_is_exposure_clip_intensities_noise() -> None:
-    config = Augmentation(exposure="paper", exposure_range=(2.0, 2.0), clip=3.0, noise=0.05)
+def test_paper_order_is_clip_exposure_intensities_noise() -> None:
+    config = Augmentation(exposure="paper", exposure_range=(3.0, 3.0), noise=0.05)
     images = np.full((500, 2, 2, 3), 4.0, np.float32)
     images[:, 0] = 0.0  # background
     mask = np.array([[False, False], [True, True]])
     out, intensities = augment(images, mask, config, rng())
-    # 4 * 2 saturates at 3 before the intensities scale it, so values reach 6; noise comes last and everywhere.
+    # 4 saturates at 1, as in an 8-bit file; exposure and intensity then reach 6; noise comes last and everywhere.
     assert intensities.min() >= 0.2
     assert intensities.max() < 2.0
     residue = out[:, 1] - 3.0 * intensities[:, None, None]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,14 @@ from sdps_scenes import write_data
 
 from render.config import build
 from render.errors import InputError
+from sdps import recipes
 from sdps.augment import Augmentation
 from sdps.checkpoint import TrainedModel, load_state, load_weights, save_weights
-from sdps.config import LightingTraining, NormalTraining
+from sdps.config import JointTraining, LightingTraining, NormalTraining
 from sdps.dataset import SampleKey, SceneDataset, collate
-from sdps.models.registry import create
-from sdps.stages import LightingStage, NormalStage, Stage
+from sdps.joint import JointStage
+from sdps.models.registry import MODELS, create
+from sdps.stages import LightingStage, NormalStage, Stage, create_stage
 from sdps.training import CHECKPOINT, METRICS, TrainingResult, train
 
 TIMES = {"seconds", "images_per_second", "waiting_share"}
@@ -142,6 +145,73 @@ def test_tensorboard_is_an_extra(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
     train(NormalStage(replace(QUICK, steps=1)), folder, tmp_path, tensorboard=True)
     assert list((tmp_path / "tensorboard").glob("events.out.tfevents.*"))
+
+
+def test_best_and_last_weights_are_kept(folder: Path, tmp_path: Path) -> None:
+    result = train(NormalStage(replace(QUICK, validate_every=2)), folder, tmp_path)
+    lines = [json.loads(line) for line in (tmp_path / METRICS).read_text().splitlines()]
+    values = {line["step"]: line["val_normal_mae"] for line in lines if "val_normal_mae" in line}
+    best = load_weights(tmp_path / "nenet-best.safetensors").metadata
+    assert best["metrics"]["val_normal_mae"] == min(values.values()) == values[best["step"]]
+    assert load_weights(result.weights["nenet"]).metadata["step"] == 8
+
+
+def test_averaged_weights_are_validated_saved_and_resumed(folder: Path, tmp_path: Path) -> None:
+    config = replace(QUICK, ema=0.5, steps=4)
+    stage = NormalStage(config)
+    result = train(stage, folder, tmp_path / "whole")
+    saved = load_file(result.weights["nenet"])
+    moving = stage.network.state_dict()
+    assert not torch.equal(saved["normal.weight"], moving["normal.weight"])
+    # The average of decay 0.5 over four steps is nearer to the last weights than the first weights are.
+    first = NormalStage(config).network.state_dict()["normal.weight"]
+    last = moving["normal.weight"]
+    assert float((saved["normal.weight"] - last).norm()) < float((first - last).norm())
+    train(NormalStage(config), folder, tmp_path / "parts", loggers=[StopAt(2)])
+    train(NormalStage(config), folder, tmp_path / "parts")
+    assert_same_run(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_fine_tuning_together_reaches_the_lighting_network_through_the_lights(folder: Path, tmp_path: Path) -> None:
+    def model(name: str) -> TrainedModel:
+        return TrainedModel(name, create(name), {}, {"config": {"augmentation": {}}, "data": "d", "step": 1})
+
+    config = JointTraining(
+        steps=2, batch_scenes=2, images=2, size=32, crop=16, workers=0, validation_scenes=1, lighting_weight=0.0
+    )
+    stage = JointStage(config, model("lcnet"), model("nenet"))
+    before = {name: tensor.clone() for name, tensor in stage.network.state_dict().items()}
+    result = train(stage, folder, tmp_path)
+    changed = {name for name, tensor in stage.network.state_dict().items() if not torch.equal(tensor, before[name])}
+    assert {"lighting.azimuth.1.weight", "lighting.intensity.1.weight", "normals.normal.weight"} <= changed
+    assert sorted(result.weights) == ["lcnet-joint", "nenet-joint"]
+    assert load_weights(result.weights["lcnet-joint"], "lighting").name == "lcnet"
+
+
+@pytest.mark.slow
+def test_compiled_networks_take_the_same_steps(folder: Path, tmp_path: Path) -> None:
+    if shutil.which("g++") is None:
+        pytest.skip("torch.compile needs a C++ compiler on a CPU")
+    losses = []
+    for compiled in (False, True):
+        out = tmp_path / str(compiled)
+        config = LightingTraining(steps=3, batch_scenes=2, images=4, workers=0, log_every=1, validation_scenes=0,
+                                  precision="bfloat16", compile=compiled)  # fmt: skip
+        train(LightingStage(config), folder, out)
+        losses.append([row["loss"] for row in rows(out)])
+    assert losses[0] == pytest.approx(losses[1], rel=0.02)  # bfloat16 rounds elsewhere
+
+
+def test_a_stage_is_made_for_every_model(folder: Path) -> None:
+    for name, item in MODELS.items():
+        needed = recipes.run(name, {}, {}).requires
+        trained = {
+            use: TrainedModel(run, create(run).eval(), {}, {"config": {"augmentation": {}}})
+            for use, run in needed.items()
+        }
+        stage = create_stage(name, name, recipes.run(name, {}, {}).config, trained)
+        assert stage.goal == ("direction_mae" if item.role in ("lighting", "second") else "normal_mae")
+        assert len(stage.parts(stage.network)) == 1
 
 
 def test_loss_that_is_not_finite_ends_the_run(folder: Path, tmp_path: Path) -> None:
