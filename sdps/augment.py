@@ -77,12 +77,14 @@ def augment(
     factor = np.float32(rng.uniform(*bounds))
     intensities = rng.uniform(*config.intensity_range, len(images)).astype(np.float32)  # (Q,)
     gains = intensities[:, None, None, None]
+    # One copy, then in place: fresh memory for every step would cost more than the arithmetic.
     if config.exposure == "paper":
-        images = np.minimum(images, np.float32(config.clip)) * (factor * gains)
+        images = np.minimum(images, np.float32(config.clip))
+        images *= factor * gains
     else:
         images = images * gains
-        factor *= exposure_scale(images[:, mask], config.mean_level, config.clip)
-        images = np.minimum(images * factor, np.float32(config.clip))
+        images *= factor * exposure_scale(images[:, mask], config.mean_level, config.clip)
+        np.minimum(images, np.float32(config.clip), out=images)
     if config.noise:
         noise = rng.random(images.shape, dtype=np.float32)
         noise -= np.float32(0.5)

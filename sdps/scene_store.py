@@ -1,7 +1,6 @@
 """Reading scenes from shards, with an optional cache of decoded arrays that several processes may share."""
 
 import hashlib
-import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.config import to_plain
 from render.errors import InputError
 from render.files import atomic_path
 from render.manifest import FAILED, SceneSpec, read_failed, read_manifest
@@ -118,7 +116,7 @@ def _identity(path: Path, scene: SceneSpec) -> str:
         status = path.stat()
     except OSError as error:
         raise InputError(f"{path}: no such shard; run `sdps render-data` to finish the folder") from error
-    text = json.dumps([to_plain(scene), status.st_size, status.st_mtime_ns])
+    text = f"{scene.digest()} {status.st_size} {status.st_mtime_ns}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
