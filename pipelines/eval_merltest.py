@@ -91,7 +91,8 @@ def main(args: argparse.Namespace) -> int:
     folder = out / "merltest"
     render_planned(wanted, folder, preset)
     results = list(evaluate(wanted, folder, preset.test, runners, shown(normals)))
-    tables = build_tables(results, lighting, normals)
+    second = [method for method in normals if method.second]  # rows of both tables
+    tables = build_tables(results, [*lighting, *second] if lighting else [], normals)
     presets.save_resolved(preset, out / "eval")
     weights = {name: str(methods.file_of(out, name)) for method in (*lighting, *normals) for name in method.models()}
     write_json(out / "eval" / "results.json", results_json(results, tables, preset, weights))

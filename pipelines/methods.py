@@ -133,6 +133,7 @@ def chosen(out: Path, lights: str | None, normals: str | None, second: str | Non
         lights, normals, second = lights or pair.lighting, pair.normals, second or pair.second
     if normals is None:
         raise InputError("--lights and --second need --normals as well; see `sdps models`")
+    require(out, [Method(name="", normals=normals, lights=lights or NONE, second=second or NONE)])
     needs = model_of(out, normals)
     if lights is None and needs is not None and MODELS[needs].lights:
         lights = MODELS[needs].lights

@@ -21,8 +21,8 @@ from sdps.observation_maps import predict_normals
 Autocast = Callable[[], AbstractContextManager]
 _GREY_VALUES = 2**26
 """Grey values kept at once for pixel networks (256 MiB); of more, the images are read again for further pixels."""
-_PIXELS = 512
-"""Pixels a pixel network sees at once."""
+_PIXELS = {"cpu": 64, "cuda": 2048}
+"""Pixels a pixel network sees at once: what fits the caches of a CPU is twice as fast there as more."""
 
 
 def lighting_prediction(
@@ -95,12 +95,13 @@ def pixel_normal_map(network: nn.Module, view: View, lights: Lights, autocast: A
         for part, images in view:
             pixels = divide(images, lights.intensities[:, part])[0].flatten(2)[..., some]  # (n, 3, p)
             grey[:, part] = pixels.mean(dim=1).T
-        for start in range(0, len(some), _PIXELS):
-            values = grey[start : start + _PIXELS]
+        count = _PIXELS.get(places.device.type, 512)
+        for start in range(0, len(some), count):
+            values = grey[start : start + count]
             valid = torch.ones_like(values, dtype=torch.bool)
             with autocast():
                 found = predict_normals(network, values, lights.directions[0], valid, rotations=rotations)
-            normals[some[start : start + _PIXELS]] = found
+            normals[some[start : start + count]] = found
     return normals.T.unflatten(1, inside.shape)[None]
 
 

@@ -261,7 +261,6 @@ def evaluate_combinations(capsys, flags, out):
     flags = [*flags, "--set", "test.rotations=1"]
     combinations = {
         "lcnet + psfcn": ["--lights", "lcnet", "--normals", "psfcn"],
-        "cnnps, true lights": ["--normals", "cnnps"],  # it is trained on true lights
         "lcnet + cnnps": ["--lights", "lcnet", "--normals", "cnnps"],
         "lcnet + nenet, true intensities": ["--normals", "sdps", "--intensities", "true"],
         "lcnet + least-squares": ["--lights", "lcnet", "--normals", "least-squares"],

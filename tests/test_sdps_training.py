@@ -367,15 +367,3 @@ def test_lcnet_learns_the_light_intensities_of_a_few_scenes(tmp_path: Path) -> N
     assert before["intensity_error"] > 0.25
     assert after["intensity_error"] < 0.15
     assert after["direction_mae"] < 3.0
-
-
-def test_nenet_learns_the_normals_of_a_few_scenes(tmp_path: Path) -> None:
-    write_data(tmp_path, ("train",) * 3, lights=6, size=32)
-    config = NormalTraining(
-        steps=300, batch_scenes=2, images=4, size=32, learning_rate=2e-3, clip_gradient=1.0, lights="true", **OVERFIT
-    )
-    stage = NormalStage(config)
-    before = evaluate(stage, tmp_path)["normal_mae"]
-    train(stage, tmp_path, tmp_path / "run")
-    assert before > 30.0
-    assert evaluate(stage, tmp_path)["normal_mae"] < 5.0
