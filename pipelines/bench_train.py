@@ -66,8 +66,8 @@ class BenchTrainConfig:
 
     models: tuple[str, ...] = ("lcnet", "nenet")
     data: str = ""
-    seconds: float = 30.0
-    rounds: int = 5
+    seconds: float = 10.0
+    rounds: int = 3
     scenes: int = 4
     images: int = 12
     size: int = 128

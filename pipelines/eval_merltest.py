@@ -97,7 +97,7 @@ def main(args: argparse.Namespace) -> int:
     weights = {name: str(methods.file_of(out, name)) for method in (*lighting, *normals) for name in method.models()}
     write_json(out / "eval" / "results.json", results_json(results, tables, preset, weights))
     report.write(out / "report.html", preset, tables, results, out)
-    sys.stdout.write("\n".join(render_text(f"\n{title}", *table) for title, table in tables.items()))
+    sys.stdout.write("\n".join(render_text(f"\n{title}", *table, left=(0, 1)) for title, table in tables.items()))
     sys.stdout.write(f"\n{DEFINITION}\n{out / 'report.html'}\n")
     return 0
 
