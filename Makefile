@@ -89,7 +89,7 @@ test-slow: $(ASSETS_READY)
 	$(VENV)/bin/python -m pytest -m "slow and not gpu"
 
 lint: $(READY)
-	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff check --no-cache .
 	$(VENV)/bin/ruff format --check .
 
 bench: OUT = out/bench

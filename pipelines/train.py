@@ -97,9 +97,8 @@ def train_run(
 
 def document(folder: Path, data: Path, result: "TrainingResult") -> None:
     """Write the learning curves and the model cards of a finished run."""
-    from sdps.model_card import write_model_card
-
     from sdps.curves import write_curves
+    from sdps.model_card import write_model_card
     from sdps.training import METRICS
 
     write_curves(folder / METRICS, folder / "curves.png")

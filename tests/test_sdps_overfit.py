@@ -24,7 +24,7 @@ COMMON = {
 }  # fmt: skip
 LIGHTING = {"batch_scenes": 3, "images": 6, "learning_rate": 1e-3, "clip_gradient": 5.0, "precision": "bfloat16"}
 NORMALS = {"batch_scenes": 3, "images": 6, "size": 16, "crop": 0, "learning_rate": 2e-3, "clip_gradient": 1.0}
-STEPS = {"lighting": 300, "second": 300, "normals": 600, "pixels": 1200}
+STEPS = {"lighting": 300, "second": 300, "normals": 600, "pixels": 400}
 QUICK = ("nenet",)  # the rest waits for `make test-slow`
 
 
@@ -39,7 +39,7 @@ def stage_of(name: str, role: str) -> Stage:
     """Return the stage that trains a model on true lights where it is told lights, in few steps."""
     settings = COMMON | (LIGHTING if role in ("lighting", "second") else NORMALS) | {"steps": STEPS[role]}
     if role == "pixels":
-        settings |= {"images": 24, "clip_gradient": 0.0, "learning_rate": 1e-3, "pixels_per_scene": 128}
+        settings |= {"images": 24, "clip_gradient": 0.0, "learning_rate": 1e-3, "pixels_per_scene": 64}
     if role in ("normals", "pixels") and entry(name).lights:
         settings["lights"] = "true"
     run = recipes.run(name, {}, {name: settings})
