@@ -16,12 +16,20 @@ COMMANDS = {
     "models": ("models", "add_arguments", "main", "list the learned models"),
     "train": ("train", "add_arguments", "main", "train models, by default LCNet, then NENet"),
     "eval-merltest": ("eval_merltest", "add_arguments", "main", "render and score MERL-Test scenes"),
+    "eval-classical": ("eval_classical", "add_arguments", "main", "compare the classical methods on rendered scenes"),
+    "eval-photos": (
+        "eval_photos",
+        "add_arguments",
+        "main",
+        "score uncalibrated methods on real photographs",
+    ),
     "regenerate": ("regenerate", "add_arguments", "main", "render test scenes of chosen shapes and materials"),
     "fit-material": ("fit_material", "add_arguments", "main", "fit the built-in model to a MERL .binary table"),
     "materials": ("catalogue", "add_material_arguments", "materials_main", "list the built-in materials"),
     "shapes": ("catalogue", "add_shape_arguments", "shapes_main", "list the shape families"),
     "noise": ("noise", "add_arguments", "main", "measure the renderer's noise against converged images"),
     "bench-train": ("bench_train", "add_arguments", "main", "measure training against a plain float32 loop"),
+    "bench-classical": ("bench_classical", "add_arguments", "main", "time the classical methods on a large object"),
     "bench": ("bench", "add_arguments", "main", "measure the renderer against Mitsuba's path integrator"),
 }
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from pipelines.train import MODELS_FOLDER, weights_file
 from render.errors import InputError, unknown
 from sdps import recipes
+from sdps.classical import registry as classical
 from sdps.lighting import ReadOut
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from pipelines.presets import Preset
 
 NONE = ""
-CLASSICAL = ("least-squares", "constant")
+CLASSICAL = (*classical.METHODS, "constant")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +26,7 @@ class Method:
     Attributes:
         name: Label of its row.
         lights: A lighting model (run or file), `true`, or empty for none.
-        normals: A normal model, `least-squares`, or empty for lighting alone.
+        normals: A normal model, a classical method, or empty for lighting alone.
         second: A second lighting pass, or empty.
         intensities: `true` where only the intensities are given, else empty.
         read_out: How light classes become lights; None for the preset's.

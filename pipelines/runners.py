@@ -10,7 +10,7 @@ from pipelines.methods import Method
 from pipelines.presets import TestConfig
 from sdps.baselines import constant_estimate
 from sdps.checkpoint import TrainedModel
-from sdps.classical.least_squares import least_squares
+from sdps.classical import registry as classical
 from sdps.estimate import Estimate
 from sdps.inference import Estimator, default_device, load_model
 from sdps.metrics import score
@@ -71,12 +71,14 @@ class Runner:
             given["intensities"] = intensities
         if method.normals == "constant":
             return constant_estimate(len(images), mask)
-        if method.normals == "least-squares":
+        if method.normals in classical.METHODS:
+            if not classical.METHODS[method.normals].calibrated:
+                return classical.run(method.normals, images, mask)
             found = (given["lights"], given["intensities"]) if method.lights == TRUE_LIGHTS else None
             if found is None:
                 estimated = self.estimator.estimate_lights(images, mask, given.get("intensities"))
                 found = estimated.light_directions, estimated.intensities
-            return least_squares(images, mask, *found)
+            return classical.run(method.normals, images, mask, *found)
         if not method.normals:
             return self.estimator.estimate_lights(images, mask, given.get("intensities"))
         return self.estimator.estimate(images, mask, **given)

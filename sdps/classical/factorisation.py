@@ -16,6 +16,7 @@ from render.errors import InputError
 from sdps.classical.gbr import Gbr
 from sdps.classical.observations import Observations, observe
 from sdps.classical.rpca import robust_low_rank
+from sdps.classical.shadows import fit_lit
 from sdps.estimate import Estimate
 
 _log = logging.getLogger(__name__)
@@ -112,7 +113,10 @@ def impose_integrability(factors: Factors, mask: np.ndarray, *, smoothing: float
         maps = np.stack([ndimage.gaussian_filter(maps[..., i], smoothing) for i in range(3)], axis=-1)
         weight = ndimage.gaussian_filter(mask.astype(float), smoothing)
         maps /= np.maximum(weight, 1e-6)[..., None]
-    inner = ndimage.binary_erosion(np.pad(mask, 1), iterations=2)[1:-1, 1:-1]
+    # A Gaussian window that reaches over the edge is one-sided, and its derivatives are biased.
+    depth = ndimage.distance_transform_cdt(np.pad(mask, 1), metric="taxicab")[1:-1, 1:-1]
+    margin = max(2, round(3.0 * smoothing))
+    inner = depth > (margin if (depth > margin).sum() >= 12 else 2)
     if inner.sum() < 12:
         raise InputError(f"the mask has only {int(inner.sum())} pixels away from its edge; too few to differentiate")
     along_x = np.gradient(maps, axis=1)[inner]
@@ -191,7 +195,7 @@ def prepare(
     Args:
         images: (L, H, W, 3) or (L, H, W), linear radiance.
         mask: (H, W) bool.
-        robust: Take out highlights and shadows by `robust_low_rank` first.
+        robust: Take highlights out by `robust_low_rank` first, and leave shadows out of the fit (`fit_lit`).
         smoothing: See `impose_integrability`.
         minimum: Fewest images the method can work with.
 
@@ -201,7 +205,11 @@ def prepare(
     observations = observe(images, mask, minimum=minimum)
     profiles = observations.grey()
     cleaned = robust_low_rank(profiles, progress=True) if robust else profiles
-    factors = impose_integrability(factorise(cleaned), observations.mask, smoothing=smoothing)
+    factors = factorise(cleaned)
+    if robust:
+        surface, lights = fit_lit(profiles, cleaned, factors.lights)
+        factors = replace(factors, surface=surface, lights=lights)
+    factors = impose_integrability(factors, observations.mask, smoothing=smoothing)
     return Prepared(observations, profiles, cleaned, oriented(factors, observations.mask))
 
 
@@ -230,7 +238,7 @@ def factorisation(images: np.ndarray, mask: np.ndarray, *, robust: bool = True) 
     """Stop at integrability and take the bas-relief transformation of equal light intensities.
 
     The plain rival of the methods that resolve the ambiguity: of all members of the group, the one under which the
-    intensities of the lights vary least (Hayakawa 1994, sec. 4, restricted to the group). That is right where all lights
+    intensities of the lights vary least (Hayakawa 1994, sec. 4, restricted to the group). That is right where lights
     are equally strong.
 
     Args:

@@ -1,15 +1,20 @@
 """Calibrated least squares (Woodham 1980): Lambert's law solved per pixel under known lights."""
 
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
 from render.errors import InputError
+from sdps.classical.observations import REC601, Observations, observe
 from sdps.estimate import Estimate
-
-_GREY = np.array([0.299, 0.587, 0.114])
-"""Rec. 601 weights of R, G, B, as in the DiLiGenT benchmark's own baseline; blue is the noisiest channel there."""
 
 _MIN_CONDITION = 1e-3
 """Smallest over largest singular value of the light matrix below which lights count as coplanar."""
+
+_CHUNK_VALUES = 2_000_000
+"""Observations solved at a time: 16 MB per float64 array of them, whatever the size of the object."""
 
 
 def least_squares(
@@ -35,64 +40,111 @@ def least_squares(
         surface when the intensities are absolute.
 
     Raises:
-        InputError: fewer than three images, coplanar lights, an empty mask, non-finite values, or sizes that differ.
+        InputError: fewer than three images, coplanar lights, an empty mask, images that are black or all alike,
+            non-finite values, or sizes that differ.
     """
-    images = np.asarray(images, np.float32)
-    directions = np.asarray(light_directions, np.float64)
-    gains = np.ones(len(images)) if intensities is None else np.asarray(intensities, np.float64)
-    images = images[..., None] if images.ndim == 3 else images
-    _check(images, mask, directions, gains, shadow_threshold)
-    gains = gains[:, None] if gains.ndim == 1 else gains  # (L, 1 or 3)
-    values = images[:, mask] / gains[:, None]  # (L, P, 1 or 3)
-    grey = values @ (_GREY if values.shape[-1] == 3 else np.ones(1))  # (L, P)
-    vectors = np.linalg.lstsq(directions, grey, rcond=None)[0].T  # (P, 3), albedo times normal
+    if not 0.0 <= shadow_threshold < 1.0:
+        raise InputError(f"shadow_threshold must be in [0, 1), got {shadow_threshold}")
+    known = calibrate(images, mask, light_directions, intensities)
+    vectors = solve_plain(known.directions, known.profiles)
     if shadow_threshold > 0.0:
-        vectors = _without_shadows(directions, grey, vectors, shadow_threshold)
-    albedo = np.linalg.norm(vectors, axis=1)
-    normals = np.zeros((*mask.shape, 3), np.float32)
-    normals[mask] = np.where(albedo[:, None] > 0.0, vectors / np.maximum(albedo[:, None], 1e-12), [0.0, 0.0, 1.0])
-    albedo_map = np.zeros(mask.shape, np.float32)
-    albedo_map[mask] = albedo
-    return Estimate(
-        normals=normals,
-        light_directions=directions.astype(np.float32),
-        intensities=gains.mean(1).astype(np.float32),
-        diagnostics={"albedo": albedo_map},
-    )
+        vectors = known.in_chunks(
+            lambda profiles, start: solve_weighted(
+                known.directions, profiles, profiles >= shadow_threshold * profiles.max(1, keepdims=True), start
+            ),
+            vectors,
+        )
+    return known.conclude(vectors)
 
 
-def _without_shadows(
-    directions: np.ndarray, grey: np.ndarray, vectors: np.ndarray, threshold: float
-) -> np.ndarray:  # (P, 3)
-    """Solve again with the lit observations only, where they still fix the normal."""
-    lit = (grey >= threshold * grey.max(0)).astype(np.float64)  # (L, P)
-    # Normal equations per pixel: a batch of 3x3 systems instead of a loop over ragged ones.
-    matrices = np.einsum("lp,li,lj->pij", lit, directions, directions, optimize=True)
-    targets = np.einsum("lp,li->pi", lit * grey, directions, optimize=True)
-    eigenvalues = np.linalg.eigvalsh(matrices)
-    solvable = (lit.sum(0) >= 3) & (eigenvalues[:, 0] > _MIN_CONDITION**2 * eigenvalues[:, 2])
-    result = vectors.copy()
-    result[solvable] = np.linalg.solve(matrices[solvable], targets[solvable][..., None])[..., 0]
-    return result
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """The state in which a calibrated method starts.
+
+    Attributes:
+        observations: The images at the object's pixels.
+        profiles: (P, L) float64, Rec. 601 grey under lights of intensity 1.
+        directions: (L, 3) float64, unit.
+        gains: (L, 1) or (L, 3) float64, the intensities.
+    """
+
+    observations: Observations
+    profiles: np.ndarray
+    directions: np.ndarray
+    gains: np.ndarray
+
+    def chunks(self) -> Iterator[slice]:
+        """Yield ranges of pixels that bound the memory of per-pixel work."""
+        pixels, count = self.profiles.shape
+        step = max(_CHUNK_VALUES // count, 1)
+        yield from (slice(begin, begin + step) for begin in range(0, pixels, step))
+
+    def in_chunks(self, solve: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.ndarray) -> np.ndarray:
+        """Return `solve(profiles, start)` of all pixels, chunk by chunk; `start` and the result are (P, 3)."""
+        return np.concatenate([solve(self.profiles[part], start[part]) for part in self.chunks()])
+
+    def conclude(self, vectors: np.ndarray, diagnostics: dict[str, Any] | None = None) -> Estimate:
+        """Turn vectors (P, 3), albedo times normal, into an estimate with the given lights."""
+        albedo = np.linalg.norm(vectors, axis=1)
+        unit = np.where(albedo[:, None] > 0.0, vectors / np.maximum(albedo[:, None], 1e-12), [0.0, 0.0, 1.0])
+        to_map = self.observations.to_map
+        return Estimate(
+            normals=to_map(unit),
+            light_directions=self.directions.astype(np.float32),
+            intensities=self.gains.mean(1).astype(np.float32),
+            diagnostics={"albedo": to_map(albedo)} | (diagnostics or {}),
+        )
 
 
-def _check(images: np.ndarray, mask: np.ndarray, directions: np.ndarray, gains: np.ndarray, threshold: float) -> None:
-    """Refuse what has no answer, in one line each."""
-    count = len(images)
-    if images.ndim != 4 or images.shape[1:3] != mask.shape:
-        raise InputError(f"images of shape {images.shape} do not fit a mask of {mask.shape}; want (L, H, W, 3)")
+def calibrate(
+    images: np.ndarray, mask: np.ndarray, light_directions: np.ndarray, intensities: np.ndarray | None = None
+) -> Calibrated:
+    """Check images and lights, and divide out the intensities; arguments and errors as in `least_squares`."""
+    observations = observe(images, mask)
+    count, channels = observations.count, observations.values.shape[-1]
+    directions = np.asarray(light_directions, np.float64)
+    gains = np.ones(count) if intensities is None else np.asarray(intensities, np.float64)
     if directions.shape != (count, 3) or len(gains) != count:
         raise InputError(f"{count} images need {count} light directions and intensities, got {directions.shape}")
-    if count < 3:
-        raise InputError(f"least squares needs at least 3 images, got {count}")
-    if not mask.any():
-        raise InputError("the mask is empty; mark the object's pixels")
-    if not (np.isfinite(images[:, mask]).all() and np.isfinite(directions).all() and np.isfinite(gains).all()):
-        raise InputError("images, light directions or intensities hold NaN or infinite values; repair them first")
+    gains = gains[:, None] if gains.ndim == 1 else gains  # (L, 1 or 3)
+    if gains.shape not in ((count, 1), (count, channels)):
+        raise InputError(f"intensities of shape {gains.shape} do not fit images of {channels} channel(s)")
+    if not (np.isfinite(directions).all() and np.isfinite(gains).all()):
+        raise InputError("light directions or intensities hold NaN or infinite values; repair them first")
     if (gains <= 0.0).any():
         raise InputError("light intensities must be positive")
-    if not 0.0 <= threshold < 1.0:
-        raise InputError(f"shadow_threshold must be in [0, 1), got {threshold}")
     singular = np.linalg.svd(directions, compute_uv=False)
     if singular[2] < _MIN_CONDITION * singular[0]:
         raise InputError("the light directions are coplanar; least squares needs three that are not")
+    weights = np.array(REC601 if channels == 3 else (1.0,)) / gains  # (L, C)
+    profiles = np.einsum("lpc,lc->pl", observations.values, weights, optimize=True)
+    return Calibrated(observations, np.ascontiguousarray(profiles), directions, gains)
+
+
+def solve_plain(directions: np.ndarray, profiles: np.ndarray) -> np.ndarray:  # (P, 3)
+    """Return the least-squares vectors of profiles (P, L) with all observations."""
+    return profiles @ np.linalg.pinv(directions).T
+
+
+def solve_weighted(
+    directions: np.ndarray, profiles: np.ndarray, weights: np.ndarray, fallback: np.ndarray
+) -> np.ndarray:  # (P, 3)
+    """Return argmin_b sum_k w_k (i_k - b . l_k)^2 for every pixel.
+
+    Normal equations per pixel: a batch of 3x3 systems instead of a loop over ragged ones.
+
+    Args:
+        directions: (L, 3).
+        profiles: (P, L).
+        weights: (P, L), not negative.
+        fallback: (P, 3), for pixels where fewer than three observations, or coplanar ones, have weight.
+    """
+    weights = weights.astype(np.float64)
+    products = np.einsum("li,lj->lij", directions, directions).reshape(-1, 9)
+    matrices = (weights @ products).reshape(-1, 3, 3)
+    targets = (weights * profiles) @ directions
+    eigenvalues = np.linalg.eigvalsh(matrices)
+    solvable = ((weights > 0.0).sum(1) >= 3) & (eigenvalues[:, 0] > _MIN_CONDITION**2 * eigenvalues[:, 2])
+    result = fallback.copy()
+    result[solvable] = np.linalg.solve(matrices[solvable], targets[solvable][..., None])[..., 0]
+    return result

@@ -1,9 +1,11 @@
 """The classical methods by name, behind one call."""
 
+import hashlib
 import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,6 +103,14 @@ def method(name: str) -> ClassicalMethod:
     if name not in METHODS:
         raise unknown("classical method", name, METHODS)
     return METHODS[name]
+
+
+def source_digest() -> str:
+    """Return a digest of the methods' source, so that results of other code are told apart."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def run(

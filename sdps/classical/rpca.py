@@ -13,6 +13,9 @@ from render.progress import progress_bar
 
 _log = logging.getLogger(__name__)
 
+_BLOCK = 8192
+"""Rows handled at a time, so that intermediate results stay in the processor's cache."""
+
 
 def robust_low_rank(
     matrix: np.ndarray,
@@ -43,29 +46,37 @@ def robust_low_rank(
     if norm == 0.0:
         return data.astype(np.float64)
     dual = data / max(spectral, float(np.abs(data).max()) / gamma)
-    penalty, growth = 1.25 / spectral, 1.5
-    low, sparse = np.zeros_like(data), np.zeros_like(data)
+    penalty, growth, largest = 1.25 / spectral, 1.5, 1e7 * 1.25 / spectral
+    low, work = np.zeros_like(data), np.empty_like(data)
+    parts = [slice(start, start + _BLOCK) for start in range(0, rows, _BLOCK)]
     for _ in progress_bar(range(limit), desc="robust low rank", unit="step", disable=not progress):
-        work = data - low + dual / penalty
-        sparse = np.sign(work) * np.maximum(np.abs(work) - gamma / penalty, 0.0)
-        low = _shrink_singular_values(data - sparse + dual / penalty, 1.0 / penalty)
-        residual = data - low - sparse
-        dual += penalty * residual
-        penalty = min(penalty * growth, 1e7 * 1.25 / spectral)
-        if float(np.linalg.norm(residual)) < tolerance * norm:
+        gram = np.zeros((columns, columns))
+        for part in parts:
+            scaled = dual[part] / penalty
+            sparse = data[part] - low[part] + scaled
+            sparse -= np.clip(sparse, -gamma / penalty, gamma / penalty)  # soft threshold
+            work[part] = data[part] - sparse + scaled
+            block = work[part].astype(np.float64)  # squares of small singular values do not survive float32
+            gram += block.T @ block
+        shrink = _shrinkage(gram, 1.0 / penalty).astype(np.float32)
+        missed = 0.0
+        for part in parts:
+            low[part] = work[part] @ shrink
+            # The multiplier's update, dual + penalty (data - low - sparse), in the terms at hand.
+            updated = (work[part] - low[part]) * penalty
+            missed += float(np.square(updated - dual[part]).sum()) / penalty**2
+            dual[part] = updated
+        penalty = min(penalty * growth, largest)
+        if missed < (tolerance * norm) ** 2:
             break
     else:
         _log.warning("the robust low-rank split did not settle in %d steps; its result is approximate", limit)
     return low.astype(np.float64)
 
 
-def _shrink_singular_values(matrix: np.ndarray, threshold: float) -> np.ndarray:
-    """Lower all singular values by `threshold`, by way of the small Gram matrix: rows outnumber columns by far."""
-    values, vectors = np.linalg.eigh((matrix.T @ matrix).astype(np.float64))
+def _shrinkage(gram: np.ndarray, threshold: float) -> np.ndarray:
+    """Return K, (L, L), such that M K is M with all singular values lowered by `threshold`, from M^T M."""
+    values, vectors = np.linalg.eigh(gram)
     singular = np.sqrt(np.maximum(values, 0.0))
-    keep = singular > threshold
-    if not keep.any():
-        return np.zeros_like(matrix)
-    basis = vectors[:, keep]
-    gain = (1.0 - threshold / singular[keep])[:, None] * basis.T  # V diag(1 - t/s) V^T
-    return matrix @ (basis @ gain).astype(matrix.dtype)
+    gain = np.maximum(singular - threshold, 0.0) / np.maximum(singular, 1e-300)
+    return (vectors * gain) @ vectors.T

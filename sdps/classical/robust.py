@@ -1,0 +1,177 @@
+"""Calibrated least squares that withstands highlights and shadows: middle of the ranks, L1 norm, low rank.
+
+The variants of `least_squares` used as rivals in the literature. All take known lights and return vectors of Lambert's
+law; they differ in which observations they believe.
+"""
+
+import logging
+
+import numpy as np
+
+from render.errors import InputError
+from sdps.classical.least_squares import Calibrated, calibrate, solve_plain, solve_weighted
+from sdps.classical.rpca import robust_low_rank
+from sdps.estimate import Estimate
+
+_log = logging.getLogger(__name__)
+
+
+def position_threshold(
+    images: np.ndarray,
+    mask: np.ndarray,
+    light_directions: np.ndarray,
+    intensities: np.ndarray | None = None,
+    *,
+    drop_lowest: float = 0.2,
+    drop_highest: float = 0.2,
+) -> Estimate:
+    """Solve Lambert's law with the middle of every pixel's sorted intensities.
+
+    The lowest are taken for shadows, the highest for highlights; the position thresholding that Shi et al. (PAMI 2019,
+    the DiLiGenT benchmark) apply before least squares. Intensities are divided by the lights' before sorting.
+
+    Args:
+        images: (L, H, W, 3) or (L, H, W), linear radiance.
+        mask: (H, W) bool.
+        light_directions: (L, 3), unit, from the surface to the light.
+        intensities: (L,) or (L, 3) known intensities; equal ones when absent.
+        drop_lowest: Share of the observations dropped at the dark end, rounded down.
+        drop_highest: The same at the bright end.
+
+    Returns:
+        As `least_squares`; diagnostics `kept`, the number of observations per pixel, and `unresolved`, the share of
+        pixels whose kept lights are coplanar, where all observations are used.
+
+    Raises:
+        InputError: shares that leave fewer than three observations, or degenerate input as in `least_squares`.
+    """
+    known = calibrate(images, mask, light_directions, intensities)
+    count = len(known.directions)
+    if not (drop_lowest >= 0.0 and drop_highest >= 0.0 and drop_lowest + drop_highest < 1.0):
+        raise InputError(f"shares to drop must be at least 0 and sum to less than 1: {drop_lowest}, {drop_highest}")
+    first, last = int(drop_lowest * count), count - int(drop_highest * count)
+    if last - first < 3:
+        raise InputError(f"of {count} images only {last - first} would be kept, three are needed; lower the shares")
+
+    def solve(profiles: np.ndarray, start: np.ndarray) -> np.ndarray:
+        # Positions instead of two limits: equal intensities, such as the zeros of shadows, count one by one.
+        order = np.argsort(profiles, axis=1, kind="stable")[:, first:last]
+        weights = np.zeros(profiles.shape)
+        np.put_along_axis(weights, order, 1.0, axis=1)
+        return solve_weighted(known.directions, profiles, weights, start)
+
+    vectors = known.in_chunks(solve, np.full((len(known.profiles), 3), np.nan))
+    return _conclude(known, vectors, {"kept": last - first})
+
+
+def robust_least_squares(
+    images: np.ndarray,
+    mask: np.ndarray,
+    light_directions: np.ndarray,
+    intensities: np.ndarray | None = None,
+    *,
+    shadow_threshold: float = 0.0,
+    iterations: int = 30,
+    floor: float = 1e-3,
+) -> Estimate:
+    """Solve Lambert's law in the L1 norm, argmin_b sum_k |i_k - b . l_k|, by iteratively reweighted least squares.
+
+    Observations far from Lambert's law, highlights and shadows alike, lose weight in proportion; fewer than half of a
+    pixel's may be so. The norm is convex, so the answer does not depend on where the iteration starts.
+
+    Args:
+        images: (L, H, W, 3) or (L, H, W), linear radiance.
+        mask: (H, W) bool.
+        light_directions: (L, 3), unit, from the surface to the light.
+        intensities: (L,) or (L, 3) known intensities; equal ones when absent.
+        shadow_threshold: Observations below this share of the pixel's brightest are dropped beforehand, which helps
+            where most are shadowed (0: keep all).
+        iterations: Most reweighting steps; pixels that have settled leave earlier.
+        floor: Residual, as a share of the pixel's brightest intensity, below which the weight grows no more.
+
+    Returns:
+        As `least_squares`; diagnostics `unresolved`, the share of pixels whose lit observations are coplanar, where
+        plain least squares is used.
+
+    Raises:
+        InputError: parameters out of range, or degenerate input as in `least_squares`.
+    """
+    if not (iterations >= 1 and floor > 0.0 and 0.0 <= shadow_threshold < 1.0):
+        raise InputError("robust least squares needs iterations >= 1, floor > 0 and shadow_threshold in [0, 1)")
+    known = calibrate(images, mask, light_directions, intensities)
+
+    def solve(profiles: np.ndarray, start: np.ndarray) -> np.ndarray:
+        return _least_absolute(known.directions, profiles, start, shadow_threshold, iterations, floor)
+
+    return _conclude(known, known.in_chunks(solve, np.full((len(known.profiles), 3), np.nan)), {})
+
+
+def _least_absolute(
+    directions: np.ndarray, profiles: np.ndarray, start: np.ndarray, threshold: float, iterations: int, floor: float
+) -> np.ndarray:  # (P, 3)
+    """Reweight until the vectors change by less than a hundredth of a degree."""
+    peak = profiles.max(1, keepdims=True)
+    lit = (profiles >= threshold * peak) if threshold > 0.0 else np.ones(profiles.shape, bool)
+    result = solve_weighted(directions, profiles, lit, start)
+    active = np.flatnonzero(np.isfinite(result[:, 0]) & (peak[:, 0] > 0.0))
+    for _ in range(iterations):
+        if not len(active):
+            break
+        old, values = result[active], profiles[active]
+        residual = np.abs(values - old @ directions.T)
+        weights = lit[active] / np.maximum(residual / peak[active], floor)
+        new = solve_weighted(directions, values, weights, old)
+        result[active] = new
+        change = np.linalg.norm(new - old, axis=1)
+        active = active[change > 1.7e-4 * np.linalg.norm(new, axis=1)]
+    return result
+
+
+def low_rank_least_squares(
+    images: np.ndarray,
+    mask: np.ndarray,
+    light_directions: np.ndarray,
+    intensities: np.ndarray | None = None,
+    *,
+    sparsity: float | None = None,
+    progress: bool = False,
+) -> Estimate:
+    """Split highlights and shadows off as a sparse part, then solve Lambert's law with the low-rank rest.
+
+    Wu et al. (ACCV 2010), with shadows as part of the sparse errors instead of missing data.
+
+    Args:
+        images: (L, H, W, 3) or (L, H, W), linear radiance.
+        mask: (H, W) bool.
+        light_directions: (L, 3), unit, from the surface to the light.
+        intensities: (L,) or (L, 3) known intensities; equal ones when absent.
+        sparsity: See `robust_low_rank`.
+        progress: Show a progress bar.
+
+    Returns:
+        As `least_squares`; diagnostics `rank` of the low-rank part, and `sparse`, the mean absolute sparse part over
+        the mean intensity.
+
+    Raises:
+        InputError: degenerate input, as in `least_squares`.
+    """
+    known = calibrate(images, mask, light_directions, intensities)
+    low = robust_low_rank(known.profiles, sparsity=sparsity, progress=progress)
+    spectrum = np.sqrt(np.maximum(np.linalg.eigvalsh(low.T @ low), 0.0))
+    rank = int((spectrum > 1e-3 * spectrum[-1]).sum())
+    if rank < 3:
+        _log.warning("the low-rank part has rank %d of 3: it lost shading with the highlights; raise sparsity", rank)
+    sparse = float(np.abs(known.profiles - low).mean() / max(float(known.profiles.mean()), 1e-300))
+    return known.conclude(solve_plain(known.directions, low), {"rank": rank, "sparse": sparse})
+
+
+def _conclude(known: Calibrated, vectors: np.ndarray, diagnostics: dict[str, object]) -> Estimate:
+    """Use plain least squares where `vectors` has NaN, and say so when that is much of the object."""
+    missing = np.isnan(vectors[:, 0])
+    vectors[missing] = solve_plain(known.directions, known.profiles[missing])
+    share = float(missing.mean())
+    if share > 0.05:
+        _log.warning(
+            "at %.0f %% of the pixels the kept lights are coplanar; all observations are used there", 100 * share
+        )
+    return known.conclude(vectors, diagnostics | {"unresolved": share})
