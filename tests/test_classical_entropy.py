@@ -6,8 +6,9 @@ from classical_scenes import Scene, hills, lambertian, lights, patches
 
 from render.errors import InputError
 from sdps.classical.entropy import entropy, standard_form
-from sdps.classical.factorisation import factorisation, prepare
+from sdps.classical.front_end import prepare
 from sdps.classical.gbr import Gbr
+from sdps.classical.plain import factorisation
 
 
 def few_albedos(seed: int, count: int = 4, **options) -> Scene:
@@ -24,7 +25,7 @@ def test_few_albedos(robust):
     scene = few_albedos(0)
     normals, directions, intensities = scene.errors(entropy(scene.images, scene.mask, robust=robust))
     assert normals < 5.0 and directions < 5.0 and intensities < 0.05
-    assert normals < 0.5 * scene.errors(factorisation(scene.images, scene.mask, robust=robust))[0]
+    assert normals < 0.5 * scene.errors(factorisation(scene.images, scene.mask, front="auto" if robust else "none"))[0]
 
 
 def test_brightness_does_not_matter():
@@ -38,7 +39,7 @@ def test_brightness_does_not_matter():
 
 def test_standard_form_does_not_depend_on_the_start():
     scene = few_albedos(2)
-    factors = prepare(scene.images, scene.mask, robust=False).factors
+    factors = prepare(scene.images, scene.mask, front="none").factors
     expected = factors.transformed(standard_form(factors)).surface
     other = factors.transformed(Gbr(0.7, -1.3, 2.5))
     np.testing.assert_allclose(other.transformed(standard_form(other)).surface, expected, atol=1e-9)

@@ -8,18 +8,11 @@ import pytest
 
 from render.errors import InputError
 from sdps.classical import registry
-from sdps.classical.factorisation import (
-    Factors,
-    equal_intensity,
-    factorisation,
-    factorise,
-    impose_integrability,
-    oriented,
-    outward_score,
-    prepare,
-)
+from sdps.classical.factorisation import Factors, factorise, impose_integrability, oriented, outward_score
+from sdps.classical.front_end import prepare
 from sdps.classical.gbr import Gbr
 from sdps.classical.observations import observe
+from sdps.classical.plain import equal_intensity, factorisation
 from sdps.classical.rpca import robust_low_rank
 
 
@@ -72,7 +65,7 @@ def test_integrability_leaves_exactly_a_bas_relief_transformation(exact):
 def test_equal_lights_resolve_the_ambiguity():
     normals, mask = scenes.hills()
     scene = scenes.lambertian(normals, mask, scenes.lights(30), shadows=False)
-    normal, direction, intensity = scene.errors(factorisation(scene.images, mask, robust=False))
+    normal, direction, intensity = scene.errors(factorisation(scene.images, mask, front="none"))
     assert normal < 0.2 and direction < 0.2 and intensity < 0.01
 
 
@@ -87,7 +80,7 @@ def test_contour_tells_convex_from_concave():
     normals, mask = scenes.sphere()
     assert outward_score(normals[mask], mask) > 0.5
     scene = scenes.lambertian(normals, mask, scenes.lights(12), shadows=False)
-    prepared = prepare(scene.images, mask, robust=False)
+    prepared = prepare(scene.images, mask, front="none")
     for flip in ([1, 1, -1], [-1, -1, 1], [-1, -1, -1]):
         flipped = Factors(prepared.factors.surface * flip, prepared.factors.lights, prepared.factors.singular)
         assert np.allclose(oriented(flipped, mask).surface, prepared.factors.surface)

@@ -5,9 +5,9 @@ import pytest
 from classical_scenes import Scene, hills, lambertian, lights, patches
 
 from render.errors import InputError
-from sdps.classical.factorisation import factorisation
 from sdps.classical.gbr import Gbr
 from sdps.classical.grouping import grouping, solve_groups
+from sdps.classical.plain import factorisation
 from sdps.metrics import angle_degrees
 
 
@@ -52,7 +52,7 @@ def test_few_colours_with_shadows(robust):
     scene = coloured(1)
     normals, directions, intensities = scene.errors(grouping(scene.images, scene.mask, robust=robust))
     assert normals < 4.0 and directions < 4.0 and intensities < 0.05
-    assert normals < 0.5 * scene.errors(factorisation(scene.images, scene.mask, robust=robust))[0]
+    assert normals < 0.5 * scene.errors(factorisation(scene.images, scene.mask, front="auto" if robust else "none"))[0]
 
 
 def test_a_uniform_object_is_one_group(caplog):

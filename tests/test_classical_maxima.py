@@ -6,7 +6,7 @@ import pytest
 
 from render.errors import InputError
 from sdps.classical import diffuse_maxima as pf14
-from sdps.classical.factorisation import Prepared, conclude, prepare
+from sdps.classical.front_end import Prepared, conclude, prepare
 from sdps.classical.gbr import Gbr
 from sdps.metrics import angle_degrees
 
@@ -21,7 +21,7 @@ def scene() -> scenes.Scene:
 
 @pytest.fixture(scope="module")
 def prepared(scene: scenes.Scene) -> Prepared:
-    return prepare(scene.images, scene.mask, robust=False)
+    return prepare(scene.images, scene.mask, front="none")
 
 
 def solve(prepared: Prepared, maxima: pf14.Maxima, start: Gbr | None = None) -> np.ndarray:
@@ -71,7 +71,7 @@ def test_a_single_pair_gives_the_transformation() -> None:
     """Two exact maxima (normal = light), moved by a known transformation, give back its inverse."""
     lights = scenes.lights(2, 5)
     scene = scenes.lambertian(*scenes.sphere(48), scenes.lights(6, 1), shadows=False)
-    factors = prepare(scene.images, scene.mask, robust=False).factors
+    factors = prepare(scene.images, scene.mask, front="none").factors
     moved = Gbr(0.4, -0.6, 1.7)
     exact = type(factors)(surface=moved.surface(lights), lights=moved.lights(lights.T), singular=factors.singular)
     gbr = pf14.median_gbr(*pf14.intersect(exact, pf14.Maxima(np.array([0, 1]), np.array([0, 1]))))

@@ -23,7 +23,8 @@ from skimage.morphology import local_maxima
 from render.errors import InputError
 from render.progress import progress_bar
 from render.seeds import generator
-from sdps.classical.factorisation import Factors, conclude, prepare
+from sdps.classical.factorisation import Factors
+from sdps.classical.front_end import conclude, prepare
 from sdps.classical.gbr import Gbr
 from sdps.estimate import Estimate
 
@@ -81,7 +82,7 @@ def diffuse_maxima(
     Raises:
         InputError: degenerate input (see `prepare`), no maximum, or no two maxima that agree on any transformation.
     """
-    prepared = prepare(images, mask, robust=robust, smoothing=integrability_smoothing)
+    prepared = prepare(images, mask, front="auto" if robust else "none", smoothing=integrability_smoothing)
     maxima = find_maxima(prepared.cleaned, prepared.mask, smoothing=smoothing)
     crossings, lambdas = intersect(prepared.factors, maxima, limit=limit, seed=seed)
     gbr = median_gbr(crossings, lambdas)

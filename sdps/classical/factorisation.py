@@ -7,17 +7,12 @@ is the front end of the uncalibrated methods; each of them then finds the three 
 
 import logging
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from scipy import ndimage, optimize
+from scipy import ndimage
 
 from render.errors import InputError
 from sdps.classical.gbr import Gbr
-from sdps.classical.observations import Observations, observe
-from sdps.classical.rpca import robust_low_rank
-from sdps.classical.shadows import fit_lit
-from sdps.estimate import Estimate
 
 _log = logging.getLogger(__name__)
 
@@ -163,110 +158,3 @@ def oriented(factors: Factors, mask: np.ndarray) -> Factors:
     depth = np.sign((sign * normals[:, 2]).mean()) or 1.0
     flip = sign * np.array([1.0, 1.0, depth])
     return replace(factors, surface=factors.surface * flip, lights=flip[:, None] * factors.lights)
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """The state in which an uncalibrated method starts.
-
-    Attributes:
-        observations: The images at the object's pixels.
-        profiles: (P, L) grey intensity profiles as they are.
-        cleaned: (P, L) after the robust low-rank step; `profiles` without it.
-        factors: Integrable factors, oriented; short of a bas-relief transformation.
-    """
-
-    observations: Observations
-    profiles: np.ndarray
-    cleaned: np.ndarray
-    factors: Factors
-
-    @property
-    def mask(self) -> np.ndarray:
-        """(H, W) bool."""
-        return self.observations.mask
-
-
-def prepare(
-    images: np.ndarray, mask: np.ndarray, *, robust: bool = True, smoothing: float = 1.0, minimum: int = 4
-) -> Prepared:
-    """Run the shared front end: check, clean, factorise, make integrable, orient.
-
-    Args:
-        images: (L, H, W, 3) or (L, H, W), linear radiance.
-        mask: (H, W) bool.
-        robust: Take highlights out by `robust_low_rank` first, and leave shadows out of the fit (`fit_lit`).
-        smoothing: See `impose_integrability`.
-        minimum: Fewest images the method can work with.
-
-    Raises:
-        InputError: degenerate input; see `observe`, `factorise`, `impose_integrability`.
-    """
-    observations = observe(images, mask, minimum=minimum)
-    profiles = observations.grey()
-    cleaned = robust_low_rank(profiles, progress=True) if robust else profiles
-    factors = factorise(cleaned)
-    if robust:
-        surface, lights = fit_lit(profiles, cleaned, factors.lights)
-        factors = replace(factors, surface=surface, lights=lights)
-    factors = impose_integrability(factors, observations.mask, smoothing=smoothing)
-    return Prepared(observations, profiles, cleaned, oriented(factors, observations.mask))
-
-
-def conclude(prepared: Prepared, factors: Factors, diagnostics: dict[str, Any] | None = None) -> Estimate:
-    """Turn resolved factors into an estimate: oriented, normals of length 1, lights split into direction and intensity.
-
-    Args:
-        prepared: What `prepare` returned.
-        factors: Factors after the method's bas-relief transformation.
-        diagnostics: What the method adds to `albedo` (H, W), and `singular_values`.
-    """
-    factors = oriented(factors, prepared.mask)
-    strength = np.linalg.norm(factors.lights, axis=0)
-    directions = (factors.lights / np.maximum(strength, 1e-12)).T
-    directions[strength <= 0.0] = (0.0, 0.0, 1.0)
-    to_map = prepared.observations.to_map
-    return Estimate(
-        normals=to_map(factors.normals()),
-        light_directions=directions.astype(np.float32),
-        intensities=(strength / max(float(strength.mean()), 1e-300)).astype(np.float32),
-        diagnostics={"albedo": to_map(factors.albedo()), "singular_values": factors.singular} | (diagnostics or {}),
-    )
-
-
-def factorisation(images: np.ndarray, mask: np.ndarray, *, robust: bool = True) -> Estimate:
-    """Stop at integrability and take the bas-relief transformation of equal light intensities.
-
-    The plain rival of the methods that resolve the ambiguity: of all members of the group, the one under which the
-    intensities of the lights vary least (Hayakawa 1994, sec. 4, restricted to the group). That is right where lights
-    are equally strong.
-
-    Args:
-        images: (L, H, W, 3) or (L, H, W), linear radiance.
-        mask: (H, W) bool.
-        robust: See `prepare`.
-
-    Raises:
-        InputError: degenerate input; see `prepare`.
-    """
-    prepared = prepare(images, mask, robust=robust)
-    gbr = equal_intensity(prepared.factors)
-    return conclude(prepared, prepared.factors.transformed(gbr), {"gbr": (gbr.mu, gbr.nu, gbr.lam)})
-
-
-def equal_intensity(factors: Factors) -> Gbr:
-    """Return the transformation under which all lights are as equally strong as can be.
-
-    The spread of log |G^-1 s| is minimised from several depth scales; lambda stays within [1/8, 8].
-    """
-
-    def spread(parameters: np.ndarray) -> np.ndarray:  # (L,)
-        gbr = Gbr(parameters[0], parameters[1], float(np.exp(parameters[2])))
-        strength = np.log(np.maximum(np.linalg.norm(gbr.lights(factors.lights), axis=0), 1e-12))
-        return strength - strength.mean()
-
-    limit = np.array([8.0, 8.0, np.log(8.0)])
-    starts = [np.array([0.0, 0.0, start]) for start in (-0.7, 0.0, 0.7)]
-    found = [optimize.least_squares(spread, start, bounds=(-limit, limit)) for start in starts]
-    mu, nu, depth = min(found, key=lambda item: item.cost).x
-    return Gbr(float(mu), float(nu), float(np.exp(depth)))

@@ -64,7 +64,7 @@ METHODS: dict[str, ClassicalMethod] = {
         summary="least squares after taking highlights and shadows out of the images' low-rank part", minimum=5,
     ),
     "factorisation": ClassicalMethod(
-        module="factorisation", function="factorisation", paper="Hayakawa 1994; Yuille & Snow 1997", calibrated=False,
+        module="plain", function="factorisation", paper="Hayakawa 1994; Yuille & Snow 1997", calibrated=False,
         summary="integrable factors with the bas-relief transformation of equally strong lights", minimum=4,
     ),
     "am07": ClassicalMethod(

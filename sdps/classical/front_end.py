@@ -1,0 +1,105 @@
+"""The shared front end of the uncalibrated methods: from images to what lacks only a bas-relief transformation.
+
+Check, tell Lambert's law from highlights and shadows, factorise, impose integrability, orient.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from sdps.classical.factorisation import Factors, factorise, impose_integrability, oriented
+from sdps.classical.observations import Observations, observe
+from sdps.classical.rpca import robust_low_rank
+from sdps.classical.separation import diffuse_factors
+from sdps.classical.shadows import fit_lit
+from sdps.estimate import Estimate
+
+Front = Literal["auto", "diffuse", "low-rank", "none"]
+
+_ENOUGH = 24
+"""Images from which on three unknowns a pixel leave room to tell highlights from shading sample by sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """The state in which an uncalibrated method starts.
+
+    Attributes:
+        observations: The images at the object's pixels.
+        profiles: (P, L) grey intensity profiles as they are.
+        cleaned: (P, L) without highlights, as the front end sees them; `profiles` if it does not look.
+        factors: Integrable factors, oriented; short of a bas-relief transformation.
+    """
+
+    observations: Observations
+    profiles: np.ndarray
+    cleaned: np.ndarray
+    factors: Factors
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(H, W) bool."""
+        return self.observations.mask
+
+
+def prepare(
+    images: np.ndarray,
+    mask: np.ndarray,
+    *,
+    front: Front = "auto",
+    smoothing: float = 1.0,
+    minimum: int = 4,
+    seed: int = 0,
+) -> Prepared:
+    """Run the shared front end: check, clean, factorise, make integrable, orient.
+
+    Args:
+        images: (L, H, W, 3) or (L, H, W), linear radiance.
+        mask: (H, W) bool.
+        front: How highlights and shadows are kept out of the three dimensions. `diffuse` fits max(b . s, 0) to the
+            samples that follow it (`separation`); `low-rank` removes a sparse part (`rpca`), then leaves shadows out
+            of the fit (`shadows`); `none` factorises the images as they are; `auto` takes `diffuse` from 24 images up,
+            else `low-rank`, which needs less redundancy.
+        smoothing: See `impose_integrability`.
+        minimum: Fewest images the method can work with.
+        seed: Root seed of the pixels the lights are fitted on.
+
+    Raises:
+        InputError: degenerate input; see `observe`, `factorise`, `impose_integrability`.
+    """
+    observations = observe(images, mask, minimum=minimum)
+    profiles = observations.grey()
+    if front == "auto":
+        front = "diffuse" if observations.count >= _ENOUGH else "low-rank"
+    cleaned = robust_low_rank(profiles, progress=True) if front == "low-rank" else profiles
+    factors = factorise(cleaned)
+    if front == "low-rank":
+        surface, lights = fit_lit(profiles, cleaned, factors.lights, seed=seed)
+        factors = replace(factors, surface=surface, lights=lights)
+    elif front == "diffuse":
+        factors = replace(diffuse_factors(profiles, seed=seed), singular=factors.singular)  # of the images, not the fit
+        cleaned = np.maximum(factors.surface.astype(np.float32) @ factors.lights.astype(np.float32), 0.0)
+    factors = impose_integrability(factors, observations.mask, smoothing=smoothing)
+    return Prepared(observations, profiles, cleaned, oriented(factors, observations.mask))
+
+
+def conclude(prepared: Prepared, factors: Factors, diagnostics: dict[str, Any] | None = None) -> Estimate:
+    """Turn resolved factors into an estimate: oriented, normals of length 1, lights split into direction and intensity.
+
+    Args:
+        prepared: What `prepare` returned.
+        factors: Factors after the method's bas-relief transformation.
+        diagnostics: What the method adds to `albedo` (H, W), and `singular_values`.
+    """
+    factors = oriented(factors, prepared.mask)
+    strength = np.linalg.norm(factors.lights, axis=0)
+    directions = (factors.lights / np.maximum(strength, 1e-12)).T
+    directions[strength <= 0.0] = (0.0, 0.0, 1.0)
+    to_map = prepared.observations.to_map
+    return Estimate(
+        normals=to_map(factors.normals()),
+        light_directions=directions.astype(np.float32),
+        intensities=(strength / max(float(strength.mean()), 1e-300)).astype(np.float32),
+        diagnostics={"albedo": to_map(factors.albedo()), "singular_values": factors.singular} | (diagnostics or {}),
+    )

@@ -1,0 +1,438 @@
+"""Normals from distances between intensity profiles (Lu et al., CVPR 2013; TPAMI 2015).
+
+The profile of a pixel is its brightness over the images. Published: for isotropic reflectance under lights uniform over
+the whole sphere, the geodesic distance between two profiles is linear in the angle between their normals; the
+distribution of the intensities in a profile gives the slope; a matrix decomposition with missing data turns the angles
+of near pairs into normals, up to a rotation and convex/concave.
+
+Reconstruction: the papers' details are not public. Ours are how brightness is clipped and compressed, the gains, the
+choice of samples, the part of the contour, the form of the slope and of the decomposition, the spread to all pixels,
+and the lights.
+"""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from scipy.optimize import isotonic_regression
+from scipy.sparse import csgraph, csr_matrix, linalg
+
+from render.errors import InputError
+from render.progress import progress_bar
+from render.seeds import generator
+from sdps.classical.observations import observe
+from sdps.estimate import Estimate
+
+_log = logging.getLogger(__name__)
+
+_TRUSTED = np.radians(60.0)
+"""Largest angle taken from a geodesic; longer ones collect the errors of many steps."""
+
+_CLIP, _POWER = 0.85, 0.7
+"""Quantile of a profile above which brightness is cut, and the exponent on the rest: highlights must not rule."""
+
+_MINIMUM, _FEW = 10, 50
+"""Images below which profiles say nothing, and below which they say little."""
+
+_BINS = 40
+"""Bins of the curve over n . l in [-1, 1]."""
+
+_PRIOR = 0.02
+"""Price of an intensity e-fold off the others, as a share of an image's squared brightness: light from behind leaves
+only a dim rim, on which direction and intensity cannot be told apart without it."""
+
+
+def profile_distances(
+    images: np.ndarray,
+    mask: np.ndarray,
+    *,
+    samples: int = 1500,
+    neighbours: int = 12,
+    slope: str = "contour",
+    rounds: int = 2,
+    seed: int = 0,
+) -> Estimate:
+    """Estimate normals and lights from geodesic distances between intensity profiles.
+
+    Assumes isotropic, uniform reflectance (up to a scale per pixel), lights all around the object, no cast shadows, and
+    a contour along which the surface turns away from the camera. Lights on the camera's side alone distort the
+    distances and draw a warning.
+
+    Args:
+        images: (L, H, W, 3) or (L, H, W), linear radiance; 100 or more are wanted.
+        mask: (H, W) bool.
+        samples: Pixels embedded; all others follow from the nearest ones.
+        neighbours: Neighbours of a sample in the graph.
+        slope: Radians per unit of distance, from the `contour` (normals there are a right angle off the view) or from
+            the `distribution` of intensities (lights uniform over the sphere; no closed contour needed).
+        rounds: Passes; each divides the images by the light intensities of the one before.
+        seed: Seed of the samples.
+
+    Returns:
+        Normals, light directions, intensities of mean 1 (0 for black images), and diagnostics: `beta` (the slope used),
+        `beta_contour`, `beta_distribution`, `contour_correlation` (of distance and angle along the contour),
+        `trusted_pairs`, `residual` (rms of the trusted cosines), `spectrum` (of the cosines, relative), `samples`,
+        `light_mean` (length of the mean direction: 0 all around, 0.5 a hemisphere) and `curve` (brightness
+        over cosine).
+
+    Raises:
+        InputError: fewer than 10 images, bad options, no contour, profiles that vary along one direction only
+            (coplanar lights, a planar or cylindrical object), or that have nothing to do with the contour.
+    """
+    if slope not in ("contour", "distribution"):
+        raise InputError(f"slope must be 'contour' or 'distribution', got {slope!r}")
+    if samples < 100 or not 3 <= neighbours < 100 or rounds < 1:
+        raise InputError("profile distances need samples >= 100, 3 <= neighbours < 100 and rounds >= 1")
+    observations = observe(images, mask, minimum=_MINIMUM)
+    if observations.count < _FEW:
+        _log.warning("%d images are few for profile distances; 100 or more are wanted", observations.count)
+    profiles = np.maximum(observations.grey(), 0.0).astype(np.float32)
+    rng = generator(seed, "profile_distances")
+    gains = _first_gains(profiles)
+    for _ in progress_bar(range(rounds), desc="profile distances", unit="round", disable=rounds < 2):
+        shapes = compressed(profiles * gains)
+        rows, normals, diagnostics = _embed_samples(shapes, observations.mask, samples, neighbours, slope, rng)
+        lights = find_lights(profiles[rows], shapes[rows], normals)
+        gains = np.where(lights.intensities > 0.0, 1.0 / np.maximum(lights.intensities, 1e-3), 1.0).astype(np.float32)
+    mean = float(np.linalg.norm(lights.directions[lights.intensities > 0.0].mean(0)))
+    if mean > 0.35:
+        _log.warning(
+            "the lights found do not surround the object (mean direction of length %.2f; 0 is all around, 0.5 a "
+            "hemisphere); profile distances are then no measure of angle: expect a distorted shape", mean,
+        )  # fmt: skip
+    return Estimate(
+        normals=observations.to_map(_spread(normalised(shapes), rows, normals)),
+        light_directions=lights.directions.astype(np.float32),
+        intensities=lights.intensities.astype(np.float32),
+        diagnostics=diagnostics | {"light_mean": mean, "curve": lights.curve},
+    )
+
+
+def compressed(profiles: np.ndarray) -> np.ndarray:  # (P, L)
+    """Cut each profile (P, L) at its upper quantile, bring it to a largest value of 1 and compress it."""
+    top = np.quantile(profiles, _CLIP, axis=1, keepdims=True)
+    top = np.where(top > 0.0, top, profiles.max(1, keepdims=True))  # lit in too few images for the quantile
+    return np.minimum(profiles / np.maximum(top, 1e-30), 1.0) ** _POWER
+
+
+def normalised(profiles: np.ndarray) -> np.ndarray:  # (P, L)
+    """Return rows of zero mean and unit length: what albedo does not change."""
+    centred = profiles - profiles.mean(1, keepdims=True)
+    return centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-12)
+
+
+def contour(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the contour's rows among the mask's pixels (Q,), and outward unit vectors (Q, 2), y up.
+
+    Pixels at the image's frame do not count; what lies behind them is unknown.
+    """
+    soft = ndimage.gaussian_filter(np.pad(mask, 8, mode="edge").astype(float), 2.0)[8:-8, 8:-8]
+    inner = ndimage.binary_erosion(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1]
+    rows = np.flatnonzero((mask & ~inner)[mask])
+    outward = np.stack([-np.gradient(soft, axis=1), np.gradient(soft, axis=0)], axis=-1)[mask][rows]
+    length = np.linalg.norm(outward, axis=1)
+    clear = length > 1e-3
+    return rows[clear], outward[clear] / length[clear, None]
+
+
+def geodesics(profiles: np.ndarray, neighbours: int) -> np.ndarray:  # (S, S)
+    """Return shortest ways between normalised profiles (S, L) over nearest neighbours; inf where there is none."""
+    steps = np.arccos(np.clip(profiles @ profiles.T, -1.0, 1.0))
+    nearest = np.argpartition(steps, neighbours, axis=1)[:, : neighbours + 1]
+    rows, columns = np.repeat(np.arange(len(steps)), neighbours + 1), nearest.ravel()
+    # An explicit zero would read as "no edge".
+    graph = csr_matrix((np.maximum(steps[rows, columns], 1e-9), (rows, columns)), shape=steps.shape)
+    return csgraph.dijkstra(graph, directed=False)
+
+
+def distribution_slope(shapes: np.ndarray, step: float = 0.15) -> float:
+    """Return radians per unit of distance from the intensities in compressed profiles (S, L).
+
+    Under lights uniform over the sphere, the share of lights with n . l > u is (1 - u) / 2: sorting a profile gives its
+    brightness over n . l. The distance of two such profiles, `step` radians apart, gives the slope.
+    """
+    curve = np.sort(shapes, axis=1).mean(0)  # (L,)
+    heights = (np.arange(len(curve)) + 0.5) / len(curve) * 2.0 - 1.0
+    lights = fibonacci(4000)
+    first = np.interp(lights[:, 2], heights, curve)
+    second = np.interp(lights @ [np.sin(step), 0.0, np.cos(step)], heights, curve)
+    return float(step / max(np.arccos(np.clip(np.corrcoef(first, second)[0, 1], -1.0, 1.0)), 1e-6))
+
+
+def decompose(angles: np.ndarray, start: np.ndarray | None = None, limit: int = 60) -> np.ndarray:  # (S, 3)
+    """Return unit vectors whose trusted cosines fit those of `angles` (S, S), by alternating least squares.
+
+    Starts from `start`, or from the three largest eigenvectors of all cosines (classical scaling).
+    """
+    cosines = np.cos(np.minimum(angles, np.pi))
+    weights = (angles < _TRUSTED).astype(np.float64)
+    targets = weights * cosines
+    normals = _scaled(cosines)[0] if start is None else start
+    for _ in range(limit):
+        products = (normals[:, :, None] * normals[:, None, :]).reshape(-1, 9)
+        system = (weights @ products).reshape(-1, 3, 3) + 1e-6 * np.eye(3)
+        solved = np.linalg.solve(system, (targets @ normals)[..., None])[..., 0]
+        moved = _unit(_unit(solved) + normals)  # half steps: all rows move at once
+        change, normals = float(np.abs(moved - normals).max()), moved
+        if change < 5e-4:
+            break
+    return normals
+
+
+def oriented(normals: np.ndarray, rows: np.ndarray, outward: np.ndarray) -> np.ndarray:  # (S, 3)
+    """Rotate and reflect normals (S, 3) so that `rows` of them lean along `outward` (Q, 2) and most face the camera."""
+    targets = np.concatenate([outward, np.zeros((len(outward), 1))], axis=1)
+    left, _, right = np.linalg.svd(normals[rows].T @ targets)
+    turned = normals @ (left @ right)
+    return turned * [1.0, 1.0, np.sign(turned[:, 2].mean()) or 1.0]
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def _scaled(cosines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return classical scaling to three dimensions, (S, 3) unit, and the four largest eigenvalues, relative."""
+    values, vectors = linalg.eigsh(cosines, k=4, which="LA", v0=np.ones(len(cosines)))
+    order = np.argsort(values)[::-1]
+    values, vectors = np.maximum(values[order], 1e-12), vectors[:, order]
+    return _unit(vectors[:, :3] * np.sqrt(values[:3])), values / values[0]
+
+
+def _first_gains(profiles: np.ndarray) -> np.ndarray:  # (L,)
+    """Return rough inverse light intensities: a high quantile over pixels of equalised albedo.
+
+    Light from behind leaves only a dim rim, so no image is raised by more than a factor of two over the median.
+    """
+    equal = profiles / np.maximum(profiles.std(1, keepdims=True), 1e-12)
+    level = np.percentile(equal, 97.0, axis=0)
+    return (1.0 / np.maximum(level, 0.5 * max(float(np.median(level)), 1e-12))).astype(np.float32)
+
+
+def _spread_samples(unit: np.ndarray, usable: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return rows far from each other (farthest-point rule) among ten times as many random ones."""
+    pool = rng.permutation(usable)[: 10 * count]
+    if len(pool) <= count:
+        return pool
+    vectors = unit[pool]
+    chosen, nearest = [0], vectors @ vectors[0]
+    while len(chosen) < count:
+        chosen.append(int(nearest.argmin()))
+        nearest = np.maximum(nearest, vectors @ vectors[chosen[-1]])
+    return pool[chosen]
+
+
+def _embed_samples(
+    shapes: np.ndarray, mask: np.ndarray, count: int, neighbours: int, slope: str, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, dict]:
+    """Return the rows of samples (S,), their normals (S, 3) in the camera frame, and diagnostics."""
+    unit = normalised(shapes)
+    usable = np.flatnonzero(shapes.std(1) > 1e-3)
+    edge, outward = contour(mask)
+    keep = np.isin(edge, usable)
+    edge, outward = edge[keep], outward[keep]
+    if len(usable) < 100 or len(edge) < 12:
+        raise InputError(
+            f"profile distances need 100 pixels that vary and a contour inside the image; got {len(usable)} and "
+            f"{len(edge)} contour pixels"
+        )
+    around = np.argsort(np.arctan2(outward[:, 1], outward[:, 0]))
+    picked = around[np.unique(np.linspace(0, len(edge) - 1, min(len(edge), max(count // 8, 12))).astype(int))]
+    inside = _spread_samples(unit, usable, count - len(picked), rng)
+    rows = np.unique(np.concatenate([inside, edge[picked]]))
+    ways = geodesics(unit[rows], min(neighbours, len(rows) - 1))
+    joined = np.isfinite(ways[np.isfinite(ways).sum(1).argmax()])
+    if joined.mean() < 0.9:
+        _log.warning("only %.0f%% of the profiles hang together; raise `neighbours`", 100.0 * joined.mean())
+    rows, ways = rows[joined], ways[np.ix_(joined, joined)]
+    known = np.isin(edge[picked], rows)
+    places, outward = np.searchsorted(rows, edge[picked][known]), outward[picked][known]
+    normals, diagnostics = _solve(ways, places, outward, distribution_slope(shapes[rows]), slope, mask)
+    return rows, normals, diagnostics
+
+
+def _solve(
+    ways: np.ndarray, places: np.ndarray, outward: np.ndarray, distribution: float, slope: str, mask: np.ndarray
+) -> tuple[np.ndarray, dict]:
+    """Turn geodesics (S, S) into oriented normals (S, 3)."""
+    along, correlation = _contour_slope(ways[np.ix_(places, places)], outward)
+    if correlation < 0.5:
+        raise InputError(
+            f"profile distances do not follow the contour (correlation {correlation:.2f}); a planar object, coplanar "
+            "lights, or noise"
+        )
+    beta = along if slope == "contour" else distribution
+    spectrum = _scaled(np.cos(np.minimum(beta * ways, np.pi)))[1]
+    if spectrum[2] < 0.02:
+        raise InputError("the profiles vary along one direction only; coplanar lights or a cylindrical object")
+    normals = oriented(decompose(beta * ways), places, outward)
+    if slope == "contour":
+        # The rim alone is a poor ruler: distances along and across it differ on glossy surfaces. Instead its normals
+        # must come out a right angle off the view, less what a pixel centre half a pixel inside a disc of this area is.
+        target = np.arccos(min((np.pi / mask.sum()) ** 0.25, 0.5))
+        for _ in range(3):
+            polar = np.arccos(np.clip(normals[places, 2], -1.0, 1.0)).mean()
+            beta *= float(np.clip(target / polar, 0.7, 1.4))
+            normals = oriented(decompose(beta * ways, normals), places, outward)
+    if not 1 / 1.6 < beta / distribution < 1.6:
+        _log.warning(
+            "slope %.2f (%s) against %.2f by the distribution of intensities: the lights do not surround the object "
+            "or its contour is no occluding one", beta, slope, distribution,
+        )  # fmt: skip
+    trusted = beta * ways < _TRUSTED
+    residual = float(np.sqrt(np.mean((normals @ normals.T - np.cos(beta * ways))[trusted] ** 2)))
+    return normals, {
+        "beta": beta,
+        "beta_contour": along,
+        "beta_distribution": distribution,
+        "contour_correlation": correlation,
+        "trusted_pairs": int(np.triu(trusted, 1).sum()),
+        "residual": residual,
+        "spectrum": spectrum,
+        "samples": len(ways),
+    }
+
+
+def _contour_slope(ways: np.ndarray, outward: np.ndarray) -> tuple[float, float]:
+    """Return radians per unit of distance along the contour, and how well the two correlate."""
+    angles = np.arccos(np.clip(outward @ outward.T, -1.0, 1.0))
+    near = (angles > 0.05) & (angles < _TRUSTED)
+    if not near.any() or ways[near].std() < 1e-9:
+        raise InputError("the contour does not turn, or all profiles along it are alike; a planar object?")
+    slope = (angles[near] * ways[near]).sum() / (ways[near] ** 2).sum()
+    return float(slope), float(np.corrcoef(angles[near], ways[near])[0, 1])
+
+
+def _spread(unit: np.ndarray, rows: np.ndarray, normals: np.ndarray, nearest: int = 6) -> np.ndarray:  # (P, 3)
+    """Give every profile the mean normal of the samples with the nearest profiles, the nearer the more."""
+    sampled = unit[rows]
+    result = np.empty((len(unit), 3), np.float64)
+    for start in progress_bar(range(0, len(unit), 8192), desc="normals of all pixels", unit="block", leave=False):
+        cosine = unit[start : start + 8192] @ sampled.T  # (B, S)
+        best = np.argpartition(cosine, -nearest, axis=1)[:, -nearest:]
+        distance = np.maximum(1.0 - np.take_along_axis(cosine, best, axis=1), 0.0)
+        weight = 1.0 / (distance + 1e-4)
+        result[start : start + 8192] = (weight[..., None] * normals[best]).sum(1)
+    return _unit(result)
+
+
+@dataclass(frozen=True, eq=False)
+class Lights:
+    """Lights of a set of images.
+
+    Attributes:
+        directions: (L, 3) float64, unit; (0, 0, -1) for black images, whose light can only be behind.
+        intensities: (L,) float64, mean 1 over the others, 0 for black images.
+        curve: (B,) float64, brightness over n . l from -1 to 1, at most 1.
+    """
+
+    directions: np.ndarray
+    intensities: np.ndarray
+    curve: np.ndarray
+
+
+def fibonacci(count: int) -> np.ndarray:  # (count, 3)
+    """Return unit directions spread evenly over the whole sphere."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    angle = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
+    flat = np.sqrt(1.0 - z * z)
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=-1)
+
+
+def find_lights(profiles: np.ndarray, shapes: np.ndarray, normals: np.ndarray) -> Lights:
+    """Find direction and intensity of every light.
+
+    Directions come from the shapes, which highlights hardly touch: shape_ik = a_i s_k f(n_i . l_k) with one rising
+    curve f for all, started at Lambert's law, cut and compressed alike. Intensities come from the ratio of the images to a
+    curve of their own, by medians.
+
+    Args:
+        profiles: (S, L), linear brightness of sample pixels.
+        shapes: (S, L), the same clipped and compressed, largest value 1.
+        normals: (S, 3), unit.
+    """
+    heights = np.linspace(-1.0, 1.0, _BINS)
+    curve = (
+        np.clip(heights / (2.0 * _CLIP - 1.0), 0.0, 1.0) ** _POWER
+    )  # a share 1 - _CLIP of a sphere of lights is above
+    scales = np.ones(len(normals))
+    for _ in range(3):
+        values = shapes / scales[:, None]
+        directions, gains = _search(values, normals, heights, curve)
+        cosines = normals @ directions.T  # (S, L)
+        curve = _rising(cosines, values / np.maximum(gains, 1e-6), gains > 0.0)
+        model = np.interp(cosines, heights, curve) * gains
+        scales = (shapes * model).sum(1) / np.maximum((model**2).sum(1), 1e-12)
+        scales = np.clip(scales / max(float(np.median(scales)), 1e-12), 0.1, 10.0)
+    black = profiles.max(0) <= 0.0
+    directions[black] = (0.0, 0.0, -1.0)
+    intensities = _intensities(profiles, normals @ directions.T)
+    intensities[black] = 0.0
+    return Lights(directions, intensities / max(float(intensities[~black].mean()), 1e-30), curve)
+
+
+def _search(
+    values: np.ndarray, normals: np.ndarray, heights: np.ndarray, curve: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the best direction (L, 3) and gain (L,) of each image: on a grid, then around its best point."""
+    grid = fibonacci(2500)
+    cost, gain = _costs(values.T, np.interp(normals @ grid.T, heights, curve).T)  # (L, G)
+    best = cost.argmin(1)
+    directions, gains = grid[best], gain[np.arange(len(best)), best]
+    disc = np.concatenate([[[0.0, 0.0]], *([_ring(6 * k) * k / 3.0] for k in (1, 2, 3))], axis=None).reshape(-1, 2)
+    for radius in (0.08, 0.03, 0.01):
+        for k, centre in enumerate(directions):
+            across = np.linalg.svd(centre[None])[2][1:]  # two directions at right angles
+            near = centre + radius * disc @ across
+            near /= np.linalg.norm(near, axis=1, keepdims=True)
+            cost, gain = _costs(values[:, k][None], np.interp(normals @ near.T, heights, curve).T)
+            directions[k], gains[k] = near[cost[0].argmin()], gain[0, cost[0].argmin()]
+    return directions, gains
+
+
+def _ring(count: int) -> np.ndarray:  # (count, 2)
+    angle = np.arange(count) * 2.0 * np.pi / count
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _costs(values: np.ndarray, models: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (L, G) twice
+    """Return the misfit of images (L, S) under models (G, S), each scaled to fit, and the scales."""
+    power = np.maximum((models**2).sum(1), 1e-9)
+    gain = np.maximum(values @ models.T, 0.0) / power
+    total = np.maximum((values**2).sum(1), 1e-12)[:, None]
+    return 1.0 - gain**2 * power / total + _PRIOR * np.log(np.maximum(gain, 1e-3)) ** 2, gain
+
+
+def _rising(cosines: np.ndarray, values: np.ndarray, valid: np.ndarray) -> np.ndarray:  # (B,)
+    """Return the rising curve nearest to the mean of `values` per bin of `cosines`, both (S, L), largest value 1."""
+    bins = np.rint((cosines[:, valid] + 1.0) / 2.0 * (_BINS - 1)).astype(int).ravel()
+    count = np.bincount(bins, minlength=_BINS)
+    mean = np.bincount(bins, values[:, valid].ravel(), minlength=_BINS) / np.maximum(count, 1)
+    filled = np.interp(np.arange(_BINS), np.flatnonzero(count), mean[count > 0])
+    curve = isotonic_regression(filled, weights=count + 1e-3).x
+    return np.maximum(curve, 0.0) / max(float(curve[-1]), 1e-12)
+
+
+def _intensities(profiles: np.ndarray, cosines: np.ndarray) -> np.ndarray:  # (L,)
+    """Split log brightness into light + albedo + curve(n . l) by medians over what is clearly lit."""
+    lit = (cosines > 0.15) & (profiles > 0.0)
+    few = lit.sum(0) < 20  # light from behind: take its rim, however steep
+    lit[:, few] = (cosines[:, few] > 0.02) & (profiles[:, few] > 0.0)
+    logs = np.where(lit, np.log(np.maximum(profiles, 1e-30)), np.nan)
+    bins = np.clip((cosines * 25.0).astype(int), 0, 25)
+    light = np.zeros(profiles.shape[1])
+    albedo, curve = np.zeros(len(profiles)), np.log((np.arange(26) + 0.5) / 25.0)
+    for _ in range(4):
+        albedo = _median(logs - light - curve[bins], 1)
+        rest = logs - light - albedo[:, None]
+        curve = np.array([np.median(rest[part]) if (part := lit & (bins == b)).any() else curve[b] for b in range(26)])
+        light = _median(logs - albedo[:, None] - curve[bins], 0, light)
+    return np.exp(light - light.max())
+
+
+def _median(values: np.ndarray, axis: int, otherwise: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return the median of what is not NaN, `otherwise` where nothing is."""
+    known = np.isfinite(values).any(axis)
+    safe = np.where(np.expand_dims(known, axis), values, 0.0)
+    return np.where(known, np.nanmedian(safe, axis=axis), otherwise)
