@@ -11,6 +11,7 @@ SET ?=
 MITSUBA ?=
 MODELS ?=
 STREAM ?=
+DATA ?=
 
 VENV := .venv
 SDPS := $(VENV)/bin/sdps
@@ -19,7 +20,7 @@ ASSETS_READY := $(VENV)/.assets-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate models study demo test test-slow lint bench bench-train clean
+	regenerate models study eval-classical eval-photos demo test test-slow lint bench bench-train bench-classical clean
 .DEFAULT_GOAL := help
 
 help:
@@ -27,6 +28,7 @@ help:
 	@echo "make render-data | train | eval-merltest   PRESET=smoke|demo|small|study|paper OUT=folder SET='section.field=value ...'"
 	@echo "make train MODELS=lcnet,nenet,sdps-plus   also STREAM=1: render while training, store nothing"
 	@echo "make study   every model of the paper on equal data and steps, then tables A and B"
+	@echo "make eval-classical | bench-classical | eval-photos DATA=folder   the methods without learning"
 	@echo "make data-plan | data-status | data-validate | data-preview | data-card   PRESET=... OUT=folder"
 	@echo "make regenerate   SHAPES=bunny MATERIALS=chrome,lambertian:0.5 LIGHTS=merltest OUT=folder [MITSUBA=1]"
 
@@ -61,6 +63,14 @@ study: $(ASSETS_READY)
 	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
 	$(SDPS) train --preset $(PRESET) --out $(OUT) --models '$(or $(MODELS),all)' $(SETTINGS)
 	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
+
+eval-classical: OUT = out/classical
+eval-classical: $(ASSETS_READY)
+	$(SDPS) eval-classical --out $(OUT) $(SETTINGS)
+
+eval-photos: OUT = out/photos
+eval-photos: $(READY)
+	$(SDPS) eval-photos '$(DATA)' --out $(OUT)
 
 data-plan: $(ASSETS_READY)
 	$(SDPS) data plan --preset $(PRESET) --out $(OUT) $(SETTINGS)
@@ -99,6 +109,10 @@ bench: $(ASSETS_READY)
 bench-train: OUT = out/bench-train
 bench-train: $(READY)
 	$(SDPS) bench-train --out $(OUT)
+
+bench-classical: OUT = out/bench-classical
+bench-classical: $(READY)
+	$(SDPS) bench-classical --out $(OUT)
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

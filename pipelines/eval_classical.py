@@ -106,10 +106,15 @@ def evaluate(wanted: list[SceneSpec], folder: Path, names: Iterable[str], config
                 if key not in cache:
                     shard = shard or read_shard(folder / scene.file, scene)
                     cache.add(key, _run(name, scene, shard, config))
-                category = surfaces.load(scene.material).category
-                rows.append(Row(name, config.lights, scene.shape, category, *cache[key]))
+                rows.append(Row(name, config.lights, scene.shape, category(scene), *cache[key]))
                 bar.update()
     return rows
+
+
+def category(scene: SceneSpec) -> str:
+    """Return the kind of reflectance; `mixed` where materials vary over the surface."""
+    kinds = {component.category for component in surfaces.load(scene.material).components}
+    return kinds.pop() if len(kinds) == 1 else "mixed"
 
 
 def _run(name: str, scene: SceneSpec, shard: Shard, config: TestConfig) -> tuple[dict[str, float], float, str]:
@@ -140,22 +145,16 @@ def build_tables(rows: list[Row], names: list[str]) -> dict[str, tuple[list[str]
         for lights in dict.fromkeys(row.lights for row in rows):
             for shape in dict.fromkeys(row.shape for row in rows):
                 part = [row for row in rows if (row.lights, row.shape) == (lights, shape)]
-                categories = list(dict.fromkeys(row.category for row in part))
-                body = [
-                    [
-                        name,
-                        *(_cell([r for r in part if (r.method, r.category) == (name, c)], metric) for c in categories),
-                    ]
-                    for name in names
-                    if metric == "normal_mae" or not registry.METHODS[name].calibrated
-                ]
-                tables[f"{title}: {shape}, {lights}"] = (["method", *categories], body)
+                kinds = list(dict.fromkeys(row.category for row in part))
+                shown = [n for n in names if metric == "normal_mae" or not registry.METHODS[n].calibrated]
+                body = [[name, *(_cell(part, name, kind, metric) for kind in kinds)] for name in shown]
+                tables[f"{title}: {shape}, {lights}"] = (["method", *kinds], body)
     return tables
 
 
-def _cell(rows: list[Row], name: str, category: str, metric: str) -> str:
+def _cell(rows: list[Row], name: str, kind: str, metric: str) -> str:
     """Return a method's mean over the scenes of a category, and how many failed."""
-    rows = [row for row in rows if (row.method, row.category) == (name, category)]
+    rows = [row for row in rows if (row.method, row.category) == (name, kind)]
     values = [row.scores[metric] for row in rows if metric in row.scores]
     text = number(float(np.mean(values))) if values else "-"
     return text + (f" [{len(rows) - len(values)} failed]" if len(values) < len(rows) else "")

@@ -154,11 +154,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="calibrated method to compare with (default: %(default)s)")  # fmt: skip
     parser.add_argument("--lights", default="auto", choices=("auto", "chrome", "file"),
                         help="the reference's: chrome sphere or lights.txt (default: sphere if there)")  # fmt: skip
-    parser.add_argument("--out", type=Path, default=Path("out"), help="output folder (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("out/photos"), help="output folder (default: %(default)s)")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Compare, print the table, and write results.json and a picture per object into <out>/photos."""
+    """Compare, print the table, and write results.json and a picture per object into the output folder."""
     from sdps.classical import registry
 
     names = split_list(args.objects) or list_objects(args.folder)
@@ -170,7 +170,7 @@ def main(args: argparse.Namespace) -> int:
     objects = [read_photos(args.folder, name) for name in names]
     source = resolve_source(args.folder, args.lights)
     lights = read_lights(args.folder, source)
-    out = args.out / "photos"
+    out = args.out
     results = []
     for photos in progress_bar(objects, desc="photographs", unit="object"):
         results.append(compare(photos, lights, methods, args.reference))

@@ -32,7 +32,7 @@ def solve(prepared: Prepared, maxima: pf14.Maxima, start: Gbr | None = None) -> 
 
 
 def test_exact_on_a_smooth_lambertian_surface(scene: scenes.Scene) -> None:
-    estimate = pf14.diffuse_maxima(scene.images, scene.mask, robust=False)
+    estimate = pf14.diffuse_maxima(scene.images, scene.mask, front="none")
     normals, lights, intensities = scene.errors(estimate)
     assert normals < 1.0
     assert lights < 1.0
@@ -80,7 +80,7 @@ def test_a_single_pair_gives_the_transformation() -> None:
 
 def test_the_limit_thins_at_random_but_repeatably(scene: scenes.Scene) -> None:
     first, second, other = (
-        pf14.diffuse_maxima(scene.images, scene.mask, robust=False, limit=80, seed=seed) for seed in (0, 0, 1)
+        pf14.diffuse_maxima(scene.images, scene.mask, front="none", limit=80, seed=seed) for seed in (0, 0, 1)
     )
     assert first.diagnostics["gbr"] == second.diagnostics["gbr"] != other.diagnostics["gbr"]
     assert scene.errors(first)[0] < 3.0
@@ -114,4 +114,4 @@ def test_points_that_never_agree_are_an_error(prepared: Prepared) -> None:
 
 def test_bad_smoothing_is_an_error(scene: scenes.Scene) -> None:
     with pytest.raises(InputError, match="smoothing must be positive"):
-        pf14.diffuse_maxima(scene.images, scene.mask, robust=False, smoothing=0.0)
+        pf14.diffuse_maxima(scene.images, scene.mask, front="none", smoothing=0.0)

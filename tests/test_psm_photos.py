@@ -65,13 +65,13 @@ def test_the_command_compares_and_leaves_files(
     output = capsys.readouterr().out
     assert "pf14" in output
     assert "hill" in output
-    result = json.loads((tmp_path / "photos" / "results.json").read_text())
+    result = json.loads((tmp_path / "results.json").read_text())
     figures = result["objects"]["hill"]["methods"]
     assert set(figures) == {"pf14", "factorisation"}
     assert 0.0 < figures["pf14"]["normal_mae"] < 20.0
     assert figures["pf14"]["candidates"] > 0
     assert result["lights"] == "chrome"
-    with Image.open(tmp_path / "photos" / "hill.png") as picture:
+    with Image.open(tmp_path / "hill.png") as picture:
         assert min(picture.size) > 300
 
 
@@ -89,7 +89,7 @@ def test_a_method_that_refuses_is_a_dash(
     monkeypatch.setattr(registry, "run", refuse)
     assert cli.main(["eval-photos", str(photos), "--methods", "pf14", "--out", str(tmp_path)]) == 0
     assert " - " in capsys.readouterr().out.replace("\n", " ")
-    figures = json.loads((tmp_path / "photos" / "results.json").read_text())["objects"]["hill"]["methods"]
+    figures = json.loads((tmp_path / "results.json").read_text())["objects"]["hill"]["methods"]
     assert figures == {"pf14": {"failed": "no pixel is brightest"}}
 
 

@@ -24,7 +24,7 @@ from render.errors import InputError
 from render.progress import progress_bar
 from render.seeds import generator
 from sdps.classical.factorisation import Factors
-from sdps.classical.front_end import conclude, prepare
+from sdps.classical.front_end import Front, conclude, prepare
 from sdps.classical.gbr import Gbr
 from sdps.estimate import Estimate
 
@@ -57,7 +57,7 @@ def diffuse_maxima(
     images: np.ndarray,
     mask: np.ndarray,
     *,
-    robust: bool = True,
+    front: Front = "auto",
     smoothing: float = 2.0,
     integrability_smoothing: float = 2.5,
     limit: int = 5000,
@@ -68,7 +68,7 @@ def diffuse_maxima(
     Args:
         images: (L, H, W, 3) or (L, H, W), linear radiance.
         mask: (H, W) bool.
-        robust: Take out highlights and shadows by a robust low-rank split first.
+        front: How highlights and shadows are kept out of the factorisation; see `prepare`.
         smoothing: Standard deviation in pixels of the Gaussian before the search for maxima.
         integrability_smoothing: That of the Gaussian before integrability is imposed.
         limit: Most maxima to intersect; more are thinned at random.
@@ -82,7 +82,7 @@ def diffuse_maxima(
     Raises:
         InputError: degenerate input (see `prepare`), no maximum, or no two maxima that agree on any transformation.
     """
-    prepared = prepare(images, mask, front="auto" if robust else "none", smoothing=integrability_smoothing)
+    prepared = prepare(images, mask, front=front, smoothing=integrability_smoothing)
     maxima = find_maxima(prepared.cleaned, prepared.mask, smoothing=smoothing)
     crossings, lambdas = intersect(prepared.factors, maxima, limit=limit, seed=seed)
     gbr = median_gbr(crossings, lambdas)

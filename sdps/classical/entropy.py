@@ -12,7 +12,7 @@ from scipy import ndimage
 from render.errors import InputError
 from render.seeds import generator
 from sdps.classical.factorisation import Factors
-from sdps.classical.front_end import conclude, prepare
+from sdps.classical.front_end import Front, conclude, prepare
 from sdps.classical.gbr import Gbr
 from sdps.estimate import Estimate
 
@@ -39,7 +39,7 @@ def entropy(
     images: np.ndarray,
     mask: np.ndarray,
     *,
-    robust: bool = True,
+    front: Front = "auto",
     bins: int = 256,
     starts: int = 8,
     samples: int = 20000,
@@ -56,7 +56,7 @@ def entropy(
     Args:
         images: (L, H, W, 3) or (L, H, W), linear radiance.
         mask: (H, W) bool.
-        robust: Keep highlights and shadows out of the factorisation; see `prepare`.
+        front: How highlights and shadows are kept out of the factorisation; see `prepare`.
         bins: Bins of the histogram between 0 and 4 times the mean albedo.
         starts: Cells of the coarse grid from which the search descends.
         samples: Most pixels in the histogram, drawn at random.
@@ -72,7 +72,7 @@ def entropy(
     """
     if bins < 8 or starts < 1 or samples < 100:
         raise InputError(f"want at least 8 bins, 1 start and 100 samples, got {bins}, {starts} and {samples}")
-    prepared = prepare(images, mask, front="auto" if robust else "none")
+    prepared = prepare(images, mask, front=front)
     standard = standard_form(prepared.factors)
     surface = prepared.factors.transformed(standard).surface
     surface = generator(seed, "entropy").permutation(surface)[:samples]

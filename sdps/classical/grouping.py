@@ -12,7 +12,7 @@ from scipy.cluster.vq import kmeans2, vq
 from render.errors import InputError
 from render.seeds import generator
 from sdps.classical.entropy import standard_form
-from sdps.classical.front_end import Prepared, conclude, prepare
+from sdps.classical.front_end import Front, Prepared, conclude, prepare
 from sdps.classical.gbr import Gbr
 from sdps.estimate import Estimate
 
@@ -35,7 +35,7 @@ def grouping(
     images: np.ndarray,
     mask: np.ndarray,
     *,
-    robust: bool = True,
+    front: Front = "auto",
     normal_groups: int = 200,
     albedo_groups: int = 20,
     draws: int = 50,
@@ -56,7 +56,7 @@ def grouping(
     Args:
         images: (L, H, W, 3), linear radiance; white lights, or lights of one colour.
         mask: (H, W) bool.
-        robust: Keep highlights and shadows out of the factorisation; see `prepare`.
+        front: How highlights and shadows are kept out of the factorisation; see `prepare`.
         normal_groups: K of the profiles.
         albedo_groups: K of the chromaticities.
         draws: Random choices of pixels.
@@ -78,7 +78,7 @@ def grouping(
         raise InputError(
             f"grouping by colour needs images (L, H, W, 3), got {images.shape}; use `entropy` for grey ones"
         )
-    prepared = prepare(images, mask, front="auto" if robust else "none")
+    prepared = prepare(images, mask, front=front)
     rng = generator(seed, "grouping")
     pixels, albedo, normal = _groups(prepared, normal_groups, albedo_groups, rng)
     count = int(albedo.max()) + 1

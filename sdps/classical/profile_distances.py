@@ -344,8 +344,8 @@ def find_lights(profiles: np.ndarray, shapes: np.ndarray, normals: np.ndarray) -
     """Find direction and intensity of every light.
 
     Directions come from the shapes, which highlights hardly touch: shape_ik = a_i s_k f(n_i . l_k) with one rising
-    curve f for all, started at Lambert's law, cut and compressed alike. Intensities come from the ratio of the images to a
-    curve of their own, by medians.
+    curve f for all, started at Lambert's law, cut and compressed alike. Intensities come from the ratio of the images to
+    a curve of their own, by medians.
 
     Args:
         profiles: (S, L), linear brightness of sample pixels.

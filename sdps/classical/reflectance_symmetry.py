@@ -16,7 +16,7 @@ import numpy as np
 from render.errors import InputError
 from render.seeds import generator
 from sdps.classical.bas_relief_search import minimise_over_bas_reliefs
-from sdps.classical.front_end import Prepared, conclude, prepare
+from sdps.classical.front_end import Front, Prepared, conclude, prepare
 from sdps.classical.gbr import Gbr
 from sdps.classical.plain import equal_intensity
 from sdps.estimate import Estimate
@@ -40,7 +40,7 @@ def reflectance_symmetry(
     images: np.ndarray,
     mask: np.ndarray,
     *,
-    robust: bool = True,
+    front: Front = "diffuse",
     samples: int = 1200,
     views: int = 32,
     prior: float = 0.02,
@@ -54,7 +54,7 @@ def reflectance_symmetry(
     Args:
         images: (L, H, W, 3) or (L, H, W), linear radiance.
         mask: (H, W) bool.
-        robust: Fit the diffuse part to samples outside highlights and shadows; see `prepare`.
+        front: How highlights and shadows are kept out of the factorisation; see `prepare`.
         samples: Most pixels per image the energy is computed from.
         views: Most images it is computed from, those with the strongest highlights.
         prior: Weight of the variance of the log intensities of the lights, which decides where the energy is flat.
@@ -69,7 +69,7 @@ def reflectance_symmetry(
     """
     if samples < 2 * _FEW or views < 1 or prior < 0.0:
         raise InputError(f"need samples >= {2 * _FEW}, views >= 1 and prior >= 0, got {samples}, {views}, {prior}")
-    prepared = prepare(images, mask, front="diffuse" if robust else "none", minimum=6, seed=seed)
+    prepared = prepare(images, mask, front=front, minimum=6, seed=seed)
     start = equal_intensity(prepared.factors)
     share, chosen = highlight_images(prepared, views)
     diagnostics = {"specular_share": share, "views": len(chosen), "highlights": share >= _GLOSS and len(chosen) >= 3}

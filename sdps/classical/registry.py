@@ -79,6 +79,11 @@ METHODS: dict[str, ClassicalMethod] = {
         module="diffuse_maxima", function="diffuse_maxima", paper="Favaro & Papadhimitri CVPR 2012, IJCV 2014",
         calibrated=False, summary="at local diffuse maxima the normal points to the light", minimum=4,
     ),
+    "pf14-low-rank": ClassicalMethod(
+        module="diffuse_maxima", function="diffuse_maxima", paper="Favaro & Papadhimitri CVPR 2012, IJCV 2014",
+        calibrated=False, summary="pf14 behind the published front end, robust low rank", minimum=4,
+        options=(("front", "low-rank"),),
+    ),
     "wt13": ClassicalMethod(
         module="reflectance_symmetry", function="reflectance_symmetry", paper="Wu & Tan CVPR 2013", calibrated=False,
         summary="highlights are symmetric about the half vector", minimum=4,
