@@ -317,6 +317,10 @@ def _spread(unit: np.ndarray, rows: np.ndarray, normals: np.ndarray, nearest: in
     return _unit(result)
 
 
+_SEEN = 0.2
+"""Share of the samples a light must reach for its intensity to count in full."""
+
+
 @dataclass(frozen=True, eq=False)
 class Lights:
     """Lights of a set of images.
@@ -344,8 +348,8 @@ def find_lights(profiles: np.ndarray, shapes: np.ndarray, normals: np.ndarray) -
     """Find direction and intensity of every light.
 
     Directions come from the shapes, which highlights hardly touch: shape_ik = a_i s_k f(n_i . l_k) with one rising
-    curve f for all, started at Lambert's law, cut and compressed alike. Intensities come from the ratio of the images to
-    a curve of their own, by medians.
+    curve f for all, started at Lambert's law, cut and compressed alike. Intensities come from the ratio of the images
+    to a curve of their own, by medians; lights that reach few pixels are drawn to the median of the others.
 
     Args:
         profiles: (S, L), linear brightness of sample pixels.
@@ -428,6 +432,10 @@ def _intensities(profiles: np.ndarray, cosines: np.ndarray) -> np.ndarray:  # (L
         rest = logs - light - albedo[:, None]
         curve = np.array([np.median(rest[part]) if (part := lit & (bins == b)).any() else curve[b] for b in range(26)])
         light = _median(logs - albedo[:, None] - curve[bins], 0, light)
+    # A rim seen at grazing angles says little about strength, and on glossy surfaces it says too much.
+    trust = np.minimum((cosines > 0.15).mean(0) / _SEEN, 1.0)
+    middle = float(np.median(light[trust >= 1.0])) if (trust >= 1.0).any() else float(np.median(light))
+    light = middle + trust * (light - middle)
     return np.exp(light - light.max())
 
 
