@@ -96,13 +96,13 @@ def main(args: argparse.Namespace) -> int:
 
 def evaluate(wanted: list[SceneSpec], folder: Path, names: Iterable[str], config: TestConfig) -> list[Row]:
     """Run every method on every scene that is not in the cache yet."""
-    cache = ScoreCache(folder / "scores.jsonl", f"{registry.source_digest()} {config.seed} {config.intensity_range}")
+    cache = ScoreCache(folder / "scores.jsonl", f"{config.seed} {config.intensity_range}")
     rows = []
     with progress_bar(total=len(wanted) * len(list(names)), desc=config.lights, unit="map") as bar:
         for scene in wanted:
             shard = None
             for name in names:
-                key = (name, scene.digest())
+                key = (name, registry.source_digest(name), scene.digest())
                 if key not in cache:
                     shard = shard or read_shard(folder / scene.file, scene)
                     cache.add(key, _run(name, scene, shard, config))

@@ -103,9 +103,9 @@ def even(count: int, seed: int = 3) -> np.ndarray:
 @pytest.mark.parametrize("surface", [sphere, two_blobs])
 @pytest.mark.parametrize("shade", [lambertian, glossy])
 def test_clearly_better_than_factorisation_under_lights_all_around(surface, shade):
-    normals, mask = surface(64)
-    scene = shade(normals, mask, even(200), intensities=strengths(200))
-    ours = profile_distances(scene.images, mask, samples=500)
+    normals, mask = surface(52)
+    scene = shade(normals, mask, even(150), intensities=strengths(150))
+    ours = profile_distances(scene.images, mask, samples=350)
     normal, direction, _ = scene.errors(ours)
     assert normal < 5.0
     assert direction < 7.0

@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -110,12 +111,16 @@ def method(name: str) -> ClassicalMethod:
     return METHODS[name]
 
 
-def source_digest() -> str:
-    """Return a digest of the methods' source, so that results of other code are told apart."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
+def source_digest(name: str) -> str:
+    """Return a digest of the source a method runs, so that results of other code are told apart."""
+    folder, wanted, found = Path(__file__).parent, [method(name).module], {}
+    while wanted:
+        module = wanted.pop()
+        if module not in found:
+            found[module] = (folder / f"{module}.py").read_text(encoding="utf-8")
+            wanted += re.findall(r"^from sdps\.classical\.(\w+) import", found[module], re.MULTILINE)
+    options = repr(method(name).options)
+    return hashlib.sha256((options + "".join(found[key] for key in sorted(found))).encode()).hexdigest()[:16]
 
 
 def run(
