@@ -12,13 +12,12 @@ from sdps.classical.profile_distances import (
     compressed,
     decompose,
     distribution_slope,
-    fibonacci,
-    find_lights,
     geodesics,
     normalised,
     oriented,
     profile_distances,
 )
+from sdps.classical.profile_lights import fibonacci, find_lights
 from sdps.metrics import angle_degrees
 
 
