@@ -178,3 +178,9 @@ def test_registry_suggests_the_nearest_and_asks_for_lights():
         registry.run("pf-14", np.zeros((4, 2, 2)), np.ones((2, 2), bool))
     with pytest.raises(InputError, match="needs the light directions"):
         registry.run("least-squares", np.zeros((4, 2, 2)), np.ones((2, 2), bool))
+
+
+def test_unknown_front_end_is_refused():
+    normals, mask = scenes.hills(40)
+    with pytest.raises(InputError, match="did you mean 'low-rank'"):
+        factorisation(scenes.lambertian(normals, mask, scenes.lights(8)).images, mask, front="lowrank")

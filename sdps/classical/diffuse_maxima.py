@@ -57,7 +57,7 @@ def diffuse_maxima(
     images: np.ndarray,
     mask: np.ndarray,
     *,
-    front: Front = "auto",
+    front: Front = "low-rank",
     smoothing: float = 2.0,
     integrability_smoothing: float = 2.5,
     limit: int = 5000,

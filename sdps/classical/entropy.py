@@ -39,7 +39,7 @@ def entropy(
     images: np.ndarray,
     mask: np.ndarray,
     *,
-    front: Front = "auto",
+    front: Front = "low-rank",
     bins: int = 256,
     starts: int = 8,
     samples: int = 20000,

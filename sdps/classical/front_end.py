@@ -4,10 +4,11 @@ Check, tell Lambert's law from highlights and shadows, factorise, impose integra
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from render.errors import unknown
 from sdps.classical.factorisation import Factors, factorise, impose_integrability, oriented
 from sdps.classical.observations import Observations, observe
 from sdps.classical.rpca import robust_low_rank
@@ -15,10 +16,7 @@ from sdps.classical.separation import diffuse_factors
 from sdps.classical.shadows import fit_lit
 from sdps.estimate import Estimate
 
-Front = Literal["auto", "diffuse", "low-rank", "none"]
-
-_ENOUGH = 24
-"""Images from which on three unknowns a pixel leave room to tell highlights from shading sample by sample."""
+Front = Literal["low-rank", "diffuse", "none"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +45,7 @@ def prepare(
     images: np.ndarray,
     mask: np.ndarray,
     *,
-    front: Front = "auto",
+    front: Front = "low-rank",
     smoothing: float = 1.0,
     minimum: int = 4,
     seed: int = 0,
@@ -57,21 +55,21 @@ def prepare(
     Args:
         images: (L, H, W, 3) or (L, H, W), linear radiance.
         mask: (H, W) bool.
-        front: How highlights and shadows are kept out of the three dimensions. `diffuse` fits max(b . s, 0) to the
-            samples that follow it (`separation`); `low-rank` removes a sparse part (`rpca`), then leaves shadows out
-            of the fit (`shadows`); `none` factorises the images as they are; `auto` takes `diffuse` from 24 images up,
-            else `low-rank`, which needs less redundancy.
+        front: How highlights and shadows are kept out of the three dimensions. `low-rank`, the published way, removes a
+            sparse part (`rpca`), and leaves shadows out of the fit (`shadows`). `diffuse` fits max(b . s, 0) to the
+            samples that follow it (`separation`): better on glossy objects, worse where there are few images, cast
+            shadows or interreflections. `none` factorises the images as they are.
         smoothing: See `impose_integrability`.
         minimum: Fewest images the method can work with.
         seed: Root seed of the pixels the lights are fitted on.
 
     Raises:
-        InputError: degenerate input; see `observe`, `factorise`, `impose_integrability`.
+        InputError: an unknown front end, or degenerate input; see `observe`, `factorise`, `impose_integrability`.
     """
+    if front not in get_args(Front):
+        raise unknown("front end", front, get_args(Front))
     observations = observe(images, mask, minimum=minimum)
     profiles = observations.grey()
-    if front == "auto":
-        front = "diffuse" if observations.count >= _ENOUGH else "low-rank"
     cleaned = robust_low_rank(profiles, progress=True) if front == "low-rank" else profiles
     factors = factorise(cleaned)
     if front == "low-rank":

@@ -35,7 +35,7 @@ def grouping(
     images: np.ndarray,
     mask: np.ndarray,
     *,
-    front: Front = "auto",
+    front: Front = "low-rank",
     normal_groups: int = 200,
     albedo_groups: int = 20,
     draws: int = 50,

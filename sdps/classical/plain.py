@@ -9,7 +9,7 @@ from sdps.classical.gbr import Gbr
 from sdps.estimate import Estimate
 
 
-def factorisation(images: np.ndarray, mask: np.ndarray, *, front: Front = "auto") -> Estimate:
+def factorisation(images: np.ndarray, mask: np.ndarray, *, front: Front = "low-rank") -> Estimate:
     """Stop at integrability and take the bas-relief transformation of equal light intensities.
 
     The plain rival of the methods that resolve the ambiguity: of all members of the group, the one under which the

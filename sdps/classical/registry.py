@@ -42,9 +42,6 @@ class ClassicalMethod:
         return getattr(importlib.import_module(f"sdps.classical.{self.module}"), self.function)
 
 
-_PUBLISHED = (("front", "low-rank"),)
-"""The published front end, which is also the best one on objects with cast shadows and interreflections."""
-
 METHODS: dict[str, ClassicalMethod] = {
     "least-squares": ClassicalMethod(
         module="least_squares", function="least_squares", paper="Woodham 1980", calibrated=True,
@@ -70,22 +67,18 @@ METHODS: dict[str, ClassicalMethod] = {
     "factorisation": ClassicalMethod(
         module="plain", function="factorisation", paper="Hayakawa 1994; Yuille & Snow 1997", calibrated=False,
         summary="integrable factors with the bas-relief transformation of equally strong lights", minimum=4,
-        options=_PUBLISHED,
     ),
     "am07": ClassicalMethod(
         module="entropy", function="entropy", paper="Alldrin, Mallick & Kriegman CVPR 2007", calibrated=False,
         summary="the bas-relief transformation under which albedos have the least entropy", minimum=4,
-        options=_PUBLISHED,
     ),
     "sm10": ClassicalMethod(
         module="grouping", function="grouping", paper="Shi et al. CVPR 2010", calibrated=False,
         summary="equal albedo within groups of one colour", minimum=4,
-        options=_PUBLISHED,
     ),
     "pf14": ClassicalMethod(
         module="diffuse_maxima", function="diffuse_maxima", paper="Favaro & Papadhimitri CVPR 2012, IJCV 2014",
         calibrated=False, summary="at local diffuse maxima the normal points to the light", minimum=4,
-        options=_PUBLISHED,
     ),
     "pf14-diffuse": ClassicalMethod(
         module="diffuse_maxima", function="diffuse_maxima", paper="Favaro & Papadhimitri CVPR 2012, IJCV 2014",
