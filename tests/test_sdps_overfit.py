@@ -24,7 +24,7 @@ COMMON = {
 }  # fmt: skip
 LIGHTING = {"batch_scenes": 3, "images": 6, "learning_rate": 1e-3, "clip_gradient": 5.0, "precision": "bfloat16"}
 NORMALS = {"batch_scenes": 3, "images": 6, "size": 16, "crop": 0, "learning_rate": 2e-3, "clip_gradient": 1.0}
-STEPS = {"lighting": 300, "second": 300, "normals": 600, "pixels": 400}
+STEPS = {"lighting": 300, "second": 300, "normals": 600, "pixels": 900}
 QUICK = ("nenet",)  # the rest waits for `make test-slow`
 
 
