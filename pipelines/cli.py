@@ -23,6 +23,7 @@ COMMANDS = {
         "main",
         "score uncalibrated methods on real photographs",
     ),
+    "report": ("report", "add_arguments", "main", "collect everything evaluated into one page"),
     "regenerate": ("regenerate", "add_arguments", "main", "render test scenes of chosen shapes and materials"),
     "fit-material": ("fit_material", "add_arguments", "main", "fit the built-in model to a MERL .binary table"),
     "materials": ("catalogue", "add_material_arguments", "materials_main", "list the built-in materials"),

@@ -5,32 +5,30 @@ figure on PF14 (supplement: good on diffuse, bad on specular reflectance) is a r
 """
 
 import argparse
-import logging
 import sys
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from pipelines import presets, scenes
+from pipelines.evaluation import Evaluation
+from pipelines.lit import lit_object
 from pipelines.presets import TestConfig
 from pipelines.regenerate import split_list
 from pipelines.render_data import render_planned
-from pipelines.score_cache import ScoreCache
+from pipelines.sections import Section, SectionWriter, Table
 from pipelines.tables import number, render_text
-from render.errors import InputError
 from render.files import write_json
 from render.manifest import SceneSpec
 from render.materials import surfaces
 from render.progress import progress_bar
-from render.seeds import generator
-from render.shards import Shard, read_shard
+from sdps import weights
 from sdps.classical import registry
-from sdps.estimate import Estimate
-from sdps.metrics import score
+from sdps.methods import NONE, Method, Runner, RunnerConfig
+from sdps.models.registry import TRUE_LIGHTS
 
-_log = logging.getLogger(__name__)
 LIGHT_SETS = ("near-uniform:96", "biased:96")
 TABLES = {
     "normal_mae": "Normals, mean angular error in degrees",
@@ -77,37 +75,48 @@ def main(args: argparse.Namespace) -> int:
     """Render or reuse the scenes, run the methods, print the tables and write results.json."""
     preset, out = presets.from_arguments(args)
     names = split_list(args.methods) or list(registry.METHODS)
-    for name in names:
-        registry.method(name)
+    runners = [classical_runner(name) for name in names]
     rows: list[Row] = []
+    evaluation = Evaluation(out / "eval")
     for lights in split_list(args.light_sets) or LIGHT_SETS:
         test = replace(preset.test, lights=lights)
         wanted, folder = scenes.test_scenes(test), out / scenes.slug(lights)
         render_planned(wanted, folder, replace(preset, test=test))
-        rows += evaluate(wanted, folder, names, test)
+        rows += evaluate(wanted, folder, runners, test, evaluation)
     tables = build_tables(rows, names)
     listed = [vars(row) for row in rows]
-    rendered = {title: {"header": header, "rows": body} for title, (header, body) in tables.items()}
+    rendered = {table.title: {"header": table.header, "rows": table.rows} for table in tables}
     write_json(out / "results.json", {"definition": DEFINITION, "tables": rendered, "rows": listed})
-    sys.stdout.write("\n".join(render_text(f"\n{title}", *table) for title, table in tables.items()))
+    section = Section(name="classical", title="Classical methods on regenerated scenes", text=DEFINITION, order=50,
+                      tables=tuple(tables), command=f"sdps eval-classical --out {out}")  # fmt: skip
+    SectionWriter(section).write(out)
+    texts = (render_text(f"\n{table.title}", list(table.header), list(table.rows)) for table in tables)
+    sys.stdout.write("\n".join(texts))
     sys.stdout.write(f"\n{DEFINITION}\n{out / 'results.json'}\n")
     return 0
 
 
-def evaluate(wanted: list[SceneSpec], folder: Path, names: Iterable[str], config: TestConfig) -> list[Row]:
+def classical_runner(name: str) -> Runner:
+    """Return a classical method, told the true lights if it is a calibrated one.
+
+    Raises:
+        InputError: an unknown name, with the nearest.
+    """
+    lights = TRUE_LIGHTS if registry.method(name).calibrated else NONE
+    return Runner(Method(name=name, normals=name, lights=lights), weights.require, RunnerConfig())
+
+
+def evaluate(
+    wanted: Sequence[SceneSpec], folder: Path, runners: Sequence[Runner], config: TestConfig, evaluation: Evaluation
+) -> list[Row]:
     """Run every method on every scene that is not in the cache yet."""
-    cache = ScoreCache(folder / "scores.jsonl", f"{config.seed} {config.intensity_range}")
     rows = []
-    with progress_bar(total=len(wanted) * len(list(names)), desc=config.lights, unit="map") as bar:
-        for scene in wanted:
-            shard = None
-            for name in names:
-                key = (name, registry.source_digest(name), scene.digest())
-                if key not in cache:
-                    shard = shard or read_shard(folder / scene.file, scene)
-                    cache.add(key, _run(name, scene, shard, config))
-                rows.append(Row(name, config.lights, scene.shape, category(scene), *cache[key]))
-                bar.update()
+    for scene in progress_bar(wanted, desc=config.lights, unit="scene"):
+        item, kind = lit_object(scene, folder, config), category(scene)
+        found = evaluation.results(item, runners, [False] * len(runners))
+        for runner, result in zip(runners, found, strict=True):
+            name = runner.method.normals
+            rows.append(Row(name, config.lights, scene.shape, kind, result.scores, result.seconds, result.reason))
     return rows
 
 
@@ -117,38 +126,17 @@ def category(scene: SceneSpec) -> str:
     return kinds.pop() if len(kinds) == 1 else "mixed"
 
 
-def _run(name: str, scene: SceneSpec, shard: Shard, config: TestConfig) -> tuple[dict[str, float], float, str]:
-    """Run a method on a scene: scores of what it estimates, seconds, and why it refused."""
-    rng = generator(config.seed, scene.id, "intensities", 0)
-    gains = rng.uniform(*config.intensity_range, len(shard.images)).astype(np.float32)
-    images = shard.images.astype(np.float32) * gains[:, None, None, None] * shard.mask[..., None]
-    try:
-        estimate = registry.run(name, images, shard.mask, shard.light_directions, gains)
-    except InputError as error:
-        _log.warning("%s, %s: %s", scene.id, name, error)
-        return {}, 0.0, str(error)
-    return scores(name, estimate, shard, gains), estimate.diagnostics["seconds"], ""
-
-
-def scores(name: str, estimate: Estimate, shard: Shard, gains: np.ndarray) -> dict[str, float]:
-    """Return the metrics of what the method estimated itself."""
-    truth = {"normals": shard.normals}
-    if not registry.METHODS[name].calibrated:
-        truth |= {"light_directions": shard.light_directions, "intensities": gains}
-    return {item.name: item.value for item in score(estimate, shard.mask, **truth)}
-
-
-def build_tables(rows: list[Row], names: list[str]) -> dict[str, tuple[list[str], list[list[str]]]]:
-    """Average over the scenes of a shape, kind of reflectance and light set: {title: (header, rows)}."""
-    tables = {}
+def build_tables(rows: list[Row], names: list[str]) -> list[Table]:
+    """Average over the scenes of a shape, kind of reflectance and light set."""
+    tables = []
     for metric, title in TABLES.items():
         for lights in dict.fromkeys(row.lights for row in rows):
             for shape in dict.fromkeys(row.shape for row in rows):
                 part = [row for row in rows if (row.lights, row.shape) == (lights, shape)]
                 kinds = list(dict.fromkeys(row.category for row in part))
                 shown = [n for n in names if metric == "normal_mae" or not registry.METHODS[n].calibrated]
-                body = [[name, *(_cell(part, name, kind, metric) for kind in kinds)] for name in shown]
-                tables[f"{title}: {shape}, {lights}"] = (["method", *kinds], body)
+                body = tuple((name, *(_cell(part, name, kind, metric) for kind in kinds)) for name in shown)
+                tables.append(Table(title=f"{title}: {shape}, {lights}", header=("method", *kinds), rows=body))
     return tables
 
 

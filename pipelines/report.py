@@ -1,135 +1,131 @@
-"""The page: one self-contained HTML file with tables, curves and pictures."""
+"""`sdps report`: one self-contained page of everything that was evaluated: tables, figures, pictures, training."""
 
+import argparse
+import base64
 import html
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipelines import pictures
 from pipelines.presets import Preset
+from pipelines.sections import Picture, Section, Strip, Table, read_sections
 from render.errors import InputError
-from render.files import read_jsonl, write_text
+from render.files import read_bytes, read_jsonl, write_text
 from render.manifest import read_manifest
-
-if TYPE_CHECKING:
-    from pipelines.eval_merltest import SceneResult
 
 CURVES = (
     ("val_direction_mae", "light direction, degrees"),
     ("val_normal_mae", "normals, degrees"),
     ("loss", "training loss"),
 )
-ERROR_LIMIT = 45.0
 
 
-def write(path: Path, preset: Preset, tables: dict, results: list["SceneResult"], out: Path) -> None:
-    """Write the report of an evaluation to `path`.
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps report`."""
+    parser.add_argument("folders", nargs="+", type=Path, help="output folders of evaluations and trainings")
+    parser.add_argument("--out", type=Path, default=None, help="the page (default: <first folder>/report.html)")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Collect the sections of the folders into a page."""
+    path = args.out or args.folders[0] / "report.html"
+    if not any(read_sections(folder) for folder in args.folders):
+        raise InputError(f"{args.folders[0]}: nothing evaluated there yet; run `sdps eval-merltest` or its kin first")
+    render(path, args.folders, "Photometric stereo: evaluation", "")
+    sys.stdout.write(f"{path}\n")
+    return 0
+
+
+def write(out: Path, preset: Preset) -> Path:
+    """Write `report.html` of a run's folder and return its path."""
+    path = out / "report.html"
+    render(path, [out], f"SDPS-Net, preset {preset.name}", preset.description)
+    return path
+
+
+def render(path: Path, folders: Sequence[Path], title: str, description: str) -> None:
+    """Write a page of the sections, learning curves and training scenes of some folders.
 
     Args:
         path: The HTML file.
-        preset: What was run.
-        tables: {title: (header, rows)} from `eval_merltest.build_tables`.
-        results: `SceneResult` of every scene.
-        out: The run's folder, whose training logs and data are shown where present.
-    """
-    template = Template((Path(__file__).parent / "report.html").read_text(encoding="utf-8"))
-    from pipelines.eval_merltest import DEFINITION
+        folders: Where to look; folders without one of them are passed over for it.
+        title: Its heading.
+        description: A sentence below it.
 
+    Raises:
+        InputError: a damaged section, or a page that cannot be written.
+    """
+    sections = [item for folder in folders for item in read_sections(folder)]
+    sections.sort(key=lambda item: (item[1].order, item[1].name))
+    parts = [section_html(section, folder, number) for number, (folder, section) in enumerate(sections)]
+    links = [(f"s{number}", section.title) for number, (_, section) in enumerate(sections)]
+    for folder in folders:
+        suffix = f": {folder}" if len(folders) > 1 else ""
+        for heading, body in (("Training", _curves(folder)), ("Some training scenes", _training_scenes(folder))):
+            if body:
+                links.append((f"s{len(links)}", heading + suffix))
+                parts.append(f'<section id="{links[-1][0]}"><h2>{html.escape(links[-1][1])}</h2>{body}</section>')
+    template = Template((Path(__file__).parent / "report.html").read_text(encoding="utf-8"))
+    menu = "".join(f'<li><a href="#{anchor}">{html.escape(text)}</a></li>' for anchor, text in links)
     page = template.substitute(
-        title=html.escape(f"SDPS-Net, preset {preset.name}"),
-        description=html.escape(preset.description),
-        tables="".join(_table(title, *table) for title, table in tables.items()),
-        definition=html.escape(DEFINITION),
-        scenes="".join(_scene(result) for result in choose(results, preset.test.pictures)),
-        materials=_per_material(results),
-        curves=_curves(out),
-        training=_training_scenes(out / "data"),
-        limit=f"{ERROR_LIMIT:g}",
+        title=html.escape(title), description=html.escape(description), menu=menu, sections="\n".join(parts)
     )
     write_text(path, page)
 
 
-def choose(results: list["SceneResult"], count: int) -> list["SceneResult"]:
-    """Pick scenes of each shape spread from the best to the worst normal error, so the page shows both ends."""
-    chosen = []
-    for shape in dict.fromkeys(result.scene.shape for result in results):
-        ranked = sorted((r for r in results if r.scene.shape == shape), key=_error)
-        places = np.unique(np.linspace(0, len(ranked) - 1, count).round().astype(int))
-        chosen += [ranked[place] for place in places]
-    return chosen
+def section_html(section: Section, folder: Path, number: int) -> str:
+    """Render one section."""
+    command = f'<p class="note">Made by <code>{html.escape(section.command)}</code></p>' if section.command else ""
+    tables = "".join(table_html(table) for table in section.tables)
+    strips = "".join(strip_html(strip, folder) for strip in section.strips)
+    return (
+        f'<section id="s{number}"><h2>{html.escape(section.title)}</h2><p class="note">{html.escape(section.text)}</p>'
+        f"{command}{tables}{strips}</section>"
+    )
 
 
-def _error(result: "SceneResult") -> float:
-    return result.scores[result.shown[0]].get("normal_mae", np.inf)
-
-
-def _table(title: str, header: list[str], rows: list[list[str]]) -> str:
-    """Render one table; published rows are marked by their class."""
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
+def table_html(table: Table) -> str:
+    """Render one table; rows of published figures are marked by their class."""
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in table.header)
     body = "".join(
-        f'<tr class="{"paper" if row[0].startswith("paper") else "ours"}">'
+        f'<tr class="{"published" if number in table.published else "ours"}">'
         + "".join(f"<td>{html.escape(cell)}</td>" for cell in row)
         + "</tr>"
-        for row in rows
+        for number, row in enumerate(table.rows)
     )
-    caption = html.escape(title)
-    return f"<table><caption>{caption}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _scene(result: "SceneResult") -> str:
-    """Render the pictures of one scene: input, truth, normals and errors of the methods shown, lights."""
-    from sdps.metrics import normal_error_map
-
-    mask = result.mask
-    exposure = pictures.auto_exposure(result.picture[None], mask)
-    tiles = [
-        ("input", pictures.tone_map(result.picture, exposure)),
-        ("true normals", pictures.normal_map(result.truth, mask)),
-    ]
-    for name, normals in result.normals.items():
-        errors = normal_error_map(normals, result.truth, mask)
-        tiles += [
-            (f"normals, {name}", pictures.normal_map(normals, mask)),
-            (f"error, {np.nanmean(errors):.1f}°", pictures.error_map(errors, ERROR_LIMIT)),
-        ]
-    directions = result.scores[result.shown[0]].get("direction_mae")
-    if len(result.lights) and directions is not None:
-        text = f"lights, {directions:.1f}°"
-        tiles.append((text, pictures.light_plot(result.true_lights, result.lights)))
-    figures = "".join(
-        f'<figure><img src="{pictures.data_uri(picture)}" alt="{html.escape(text)}">'
-        f"<figcaption>{html.escape(text)}</figcaption></figure>"
-        for text, picture in tiles
+    note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
+    caption = html.escape(table.title)
+    long = " long" if len(table.rows) > 40 else ""
+    return (
+        f'<div class="wide{long}"><table><caption>{caption}</caption><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>{note}"
     )
-    name = html.escape(f"{result.scene.shape}, {result.scene.material}")
-    return f'<section class="scene"><h3>{name}</h3><div class="strip">{figures}</div></section>'
 
 
-def _per_material(results: list["SceneResult"]) -> str:
-    """Render one line per scene, worst first."""
-    wanted = [
-        (name, metric, digits)
-        for name in results[0].shown
-        for metric, digits in (("normal_mae", 2), ("direction_mae", 2), ("intensity_error", 3))
-        if any(metric in result.scores[name] for result in results)
-    ]
+def strip_html(strip: Strip, folder: Path) -> str:
+    """Render a row of pictures."""
+    figures = "".join(_figure(picture, folder) for picture in strip.pictures)
+    heading = f"<h3>{html.escape(strip.title)}</h3>" if strip.title else ""
+    return f'<div class="scene">{heading}<div class="strip">{figures}</div></div>'
 
-    def cell(scores: dict[str, float], metric: str, digits: int) -> str:
-        return f"{scores[metric]:.{digits}f}" if metric in scores else "-"
 
-    rows = [
-        [r.scene.shape, r.scene.material, *(cell(r.scores[name], metric, digits) for name, metric, digits in wanted)]
-        for r in sorted(results, key=_error, reverse=True)
-    ]
-    about = {"normal_mae": "normals", "direction_mae": "directions", "intensity_error": "intensities"}
-    header = ["shape", "material", *(f"{name}: {about[metric]}" for name, metric, _ in wanted)]
-    return _table("Per scene, worst first", header, rows)
+def _figure(picture: Picture, folder: Path) -> str:
+    data = base64.b64encode(read_bytes(folder / picture.file, "missing; run the evaluation again")).decode()
+    kind = "jpeg" if picture.file.endswith(".jpg") else "png"
+    text = html.escape(picture.caption)
+    style = "chart" if picture.wide else "tile"
+    return (
+        f'<figure class="{style}"><img src="data:image/{kind};base64,{data}" alt="{text}">'
+        f"<figcaption>{text}</figcaption></figure>"
+    )
 
 
 def _curves(out: Path) -> str:
-    """Plot the training curves found in the run's folders."""
+    """Plot the training curves found in a run's folder."""
     series: dict[str, list] = {key: [] for key, _ in CURVES}
     for path in sorted((out / "models").glob("*/metrics.jsonl")):
         rows, minutes = [], 0.0
@@ -148,15 +144,16 @@ def _curves(out: Path) -> str:
             if group:
                 title = text if len(group) > 1 else f"{group[0][0]}: {text}"
                 source = pictures.data_uri(pictures.curve_plot(group, title))
-                figures.append(f'<figure><img src="{source}" alt="{html.escape(title)} over training"></figure>')
-    return f'<div class="strip">{"".join(figures)}</div>' if figures else "<p>No training logs in this folder.</p>"
+                alt = f"{html.escape(title)} over training"
+                figures.append(f'<figure class="chart"><img src="{source}" alt="{alt}"></figure>')
+    return f'<div class="strip">{"".join(figures)}</div>' if figures else ""
 
 
-def _training_scenes(folder: Path) -> str:
-    """Show some of the training scenes rendered in this run."""
+def _training_scenes(out: Path) -> str:
+    """Show some of the training scenes rendered in a run's folder."""
     try:
-        sheet = pictures.scene_sheet(read_manifest(folder), folder, count=18)
+        sheet = pictures.scene_sheet(read_manifest(out / "data"), out / "data", count=18)
     except InputError:
-        return "<p>No training scenes in this folder.</p>"
+        return ""
     alt = "training scenes: normals and three of the images"
     return f'<img class="sheet" src="{pictures.data_uri(sheet)}" alt="{alt}">'

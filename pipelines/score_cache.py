@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from render.errors import InputError
+from render.files import read_whole_lines
 
 
 class ScoreCache:
@@ -24,23 +25,19 @@ class ScoreCache:
     def __init__(self, path: Path, identity: str) -> None:
         self.path, self.identity = path, identity
         self._found: dict[tuple[str, ...], Any] = {}
-        try:
-            lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-        for line in lines:
-            try:
-                row = json.loads(line)
-                if row["identity"] == identity:
-                    self._found[tuple(row["key"])] = row["value"]
-            except (json.JSONDecodeError, KeyError, TypeError):
-                continue
+        for row in read_whole_lines(path):
+            if isinstance(row, dict) and row.get("identity") == identity and {"key", "value"} <= row.keys():
+                self._found[tuple(row["key"])] = row["value"]
 
     def __contains__(self, key: tuple[str, ...]) -> bool:
         return key in self._found
 
     def __getitem__(self, key: tuple[str, ...]) -> Any:
         return self._found[key]
+
+    def get(self, key: tuple[str, ...]) -> Any:
+        """Return the result of a key, or None."""
+        return self._found.get(key)
 
     def add(self, key: tuple[str, ...], value: Any) -> None:
         """Keep a result, in memory and at the end of the file."""

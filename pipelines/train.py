@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from sdps.distributed import Team
     from sdps.training import TrainingResult
 
-MODELS_FOLDER = "models"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps train`."""
@@ -76,6 +74,7 @@ def train_run(
     """Train one run into its folder, and describe it there with curves and a model card."""
     from sdps.stages import create_stage
     from sdps.training import train
+    from sdps.weights import MODELS_FOLDER
 
     run = preset.run(name)
     trained = {use: required(out, needed) for use, needed in run.requires.items()}
@@ -107,18 +106,12 @@ def document(folder: Path, data: Path, result: "TrainingResult") -> None:
         write_model_card(folder / card, weights, data)
 
 
-def weights_file(out: Path, name: str) -> Path:
-    """Return where the weights of a run lie, or would lie."""
-    own = out / MODELS_FOLDER / name / f"{name}.safetensors"
-    others = sorted((out / MODELS_FOLDER).glob(f"*/{name}.safetensors"))  # one run may make several
-    return own if own.is_file() or not others else others[0]
-
-
 def required(out: Path, name: str) -> "TrainedModel":
     """Load the weights of a run that another one needs."""
     from sdps.checkpoint import load_weights
+    from sdps.weights import trained_file
 
-    return load_weights(weights_file(out, name))
+    return load_weights(trained_file(out, name))
 
 
 def describe(name: str, result: "TrainingResult") -> str:

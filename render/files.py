@@ -127,6 +127,25 @@ def read_jsonl(path: str | Path) -> list[dict]:
     return rows
 
 
+def read_whole_lines(path: Path) -> Iterator[Any]:
+    """Yield the JSON values of a file of lines that is appended to, which may be missing; a torn line is passed over.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    for line in text.splitlines():
+        try:
+            yield json.loads(line)
+        except json.JSONDecodeError:
+            continue
+
+
 def read_text(path: str | Path) -> str:
     """Read a UTF-8 text file.
 

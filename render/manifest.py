@@ -12,7 +12,7 @@ import numpy as np
 
 from render.config import build, to_plain
 from render.errors import InputError
-from render.files import read_jsonl, write_jsonl
+from render.files import read_jsonl, read_whole_lines, write_jsonl
 
 MANIFEST = "manifest.jsonl"
 FAILED = "failed.jsonl"
@@ -131,17 +131,8 @@ def read_events(path: Path) -> Iterator[dict]:
     Raises:
         InputError: the file cannot be read.
     """
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    for line in text.splitlines():
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            continue  # torn by a crash; its shard is found by its hash, its failure happens again
+    # Of a line torn by a crash, the shard is found by its hash, the failure happens again.
+    for row in read_whole_lines(path):
         if isinstance(row, dict) and {"id", "time"} <= row.keys():
             yield row
 

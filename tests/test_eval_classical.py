@@ -22,9 +22,9 @@ def test_tables_hold_scores_and_reasons_and_are_kept(tmp_path, capsys):
     assert set(rows["least-squares", "biased:24", "lambertian"]["scores"]).isdisjoint({"direction_mae"})
     assert rows["least-squares", "near-uniform:24", "lambertian"]["scores"]["normal_mae"] < 15
     assert "intensity_error" in rows["factorisation", "near-uniform:24", "lambertian"]["scores"]
-    ledger = (tmp_path / "near-uniform-24" / "scores.jsonl").read_text()
+    ledger = (tmp_path / "eval" / "scores.jsonl").read_text()
     assert cli.main([*command, "--methods", "least-squares,factorisation"]) == 0  # nothing runs twice
-    assert (tmp_path / "near-uniform-24" / "scores.jsonl").read_text() == ledger
+    assert (tmp_path / "eval" / "scores.jsonl").read_text() == ledger
 
 
 def test_unknown_method_is_one_line(capsys):

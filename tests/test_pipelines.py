@@ -246,7 +246,7 @@ def test_the_whole_line_at_smoke_scale(capsys, tmp_path):
         assert 0 < scene["scores"]["lcnet + nenet"]["normal_mae"] < 90
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") >= 4 * 6
-    assert not re.search(r"(src|href)=\"(?!data:)", page)  # self-contained
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page)  # self-contained
     for folder in ("data", "models/lcnet", "models/nenet", "merltest", "eval"):
         assert presets.load(str(tmp_path / folder / "config.yaml")).name == "smoke"
     for name in ("lcnet.safetensors", "lcnet-best.safetensors", "curves.png", "MODEL_CARD.md"):
@@ -262,6 +262,7 @@ def evaluate_combinations(capsys, flags, out):
     combinations = {
         "lcnet + psfcn": ["--lights", "lcnet", "--normals", "psfcn"],
         "lcnet + cnnps": ["--lights", "lcnet", "--normals", "cnnps"],
+        "cnnps, true lights": ["--normals", "cnnps"],
         "lcnet + nenet, true intensities": ["--normals", "sdps", "--intensities", "true"],
         "lcnet + least-squares": ["--lights", "lcnet", "--normals", "least-squares"],
     }

@@ -1,0 +1,293 @@
+"""Methods, learned and classical, behind one interface: images in, normals and lights out."""
+
+import hashlib
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from render.errors import InputError
+from sdps import weights
+from sdps.baselines import constant_estimate
+from sdps.classical import registry as classical
+from sdps.estimate import Estimate
+from sdps.image_source import ImageSource, whole
+from sdps.inference import Estimator, default_device, load_model
+from sdps.lighting import ReadOut
+from sdps.metrics import score
+from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
+
+if TYPE_CHECKING:
+    from sdps.checkpoint import TrainedModel
+
+NONE = ""
+CONSTANT = "constant"
+"""A predictor that sees nothing: what knowing nothing scores."""
+CLASSICAL = (*classical.METHODS, CONSTANT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """A way from images to lights or normals.
+
+    Attributes:
+        name: Label of its row.
+        lights: A lighting model (run or file), `true` for lights that are given, or empty for none.
+        normals: A normal model, a classical method, or empty for lighting alone.
+        second: A second lighting pass, or empty.
+        intensities: `true` where only the intensities are given, else empty.
+        read_out: How light classes become lights; None for the runner's.
+        paper: Row of the paper's table.
+    """
+
+    name: str
+    lights: str = NONE
+    normals: str = NONE
+    second: str = NONE
+    intensities: str = NONE
+    read_out: ReadOut | None = None
+    paper: str = ""
+
+    def models(self) -> set[str]:
+        """Return the runs whose weights it needs."""
+        return {self.lights, self.normals, self.second} - {NONE, TRUE_LIGHTS, *CLASSICAL}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunnerConfig:
+    """How networks are used.
+
+    Attributes:
+        read_out: How light classes become lights.
+        precision: Arithmetic of the networks.
+        rotations: Rotations about the view axis that pixel networks average over.
+    """
+
+    read_out: ReadOut = "expectation"
+    precision: Literal["float32", "bfloat16"] = "bfloat16"
+    rotations: int = 10
+
+
+@cache
+def _loaded(path: Path) -> "TrainedModel":
+    """Load a model once, however many methods use it."""
+    return load_model(path, default_device())
+
+
+class Runner:
+    """A method with its networks loaded.
+
+    Args:
+        method: What to do.
+        find: Gives the weights file of a name, or raises InputError.
+        config: Read-out, precision and rotations.
+
+    Raises:
+        InputError: weights that are missing, damaged, or of another role.
+    """
+
+    def __init__(self, method: Method, find: Callable[[str], Path], config: RunnerConfig) -> None:
+        self.method, self.config = method, config
+        self.files = {name: find(name) for name in sorted(method.models())}
+
+        def model(name: str) -> "TrainedModel | None":
+            return _loaded(self.files[name]) if name in self.files else None
+
+        lighting, normals, second = (model(name) for name in (method.lights, method.normals, method.second))
+        self.estimator = None
+        if lighting is not None or normals is not None:
+            self.estimator = Estimator(
+                lighting=lighting,
+                normals=normals,
+                second=second,
+                device=default_device(),
+                precision=config.precision,
+                read_out=method.read_out or config.read_out,
+                rotations=config.rotations,
+            )
+
+    def identity(self) -> str:
+        """Return a digest of what results depend on besides the images: weights, settings and code."""
+        method, config = self.method, self.config
+        parts = [method.lights == TRUE_LIGHTS, method.intensities, CONSTANT if method.normals == CONSTANT else ""]
+        if method.normals in classical.METHODS:
+            parts.append(classical.source_digest(method.normals))
+        if self.estimator is not None:
+            named = {place: getattr(method, place) for place in ("lights", "normals", "second")}
+            parts += [(place, _file_digest(self.files[name])) for place, name in named.items() if name in self.files]
+            parts += [method.read_out or config.read_out, config.precision, config.rotations, _inference_digest()]
+        return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+    def estimate(
+        self, images: ImageSource, mask: np.ndarray, lights: np.ndarray | None, intensities: np.ndarray | None
+    ) -> Estimate:
+        """Run the method; of the lights it sees what it is to be given.
+
+        Args:
+            images: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time.
+            mask: (H, W) bool.
+            lights: (L, 3) directions, or None where the method is given none.
+            intensities: (L,) or (L, 3), or None where they are not known.
+
+        Raises:
+            InputError: images or lights the method cannot work with, in one line.
+        """
+        method, given = self.method, {}
+        if method.lights == TRUE_LIGHTS:
+            given["lights"] = lights
+        if TRUE_LIGHTS in (method.lights, method.intensities) and intensities is not None:
+            given["intensities"] = intensities
+        if method.normals == CONSTANT:
+            return constant_estimate(len(images), mask)
+        if method.normals in classical.METHODS:
+            return self._classical(images, mask, given)
+        if not method.normals:
+            return self.estimator.estimate_lights(images, mask, given.get("intensities"))
+        return self.estimator.estimate(images, mask, **given)
+
+    def _classical(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any]) -> Estimate:
+        name = self.method.normals
+        if not classical.METHODS[name].calibrated:
+            return classical.run(name, whole(images), mask)
+        if self.method.lights == TRUE_LIGHTS:
+            return classical.run(name, whole(images), mask, given["lights"], given.get("intensities"))
+        found = self.estimator.estimate_lights(images, mask, given.get("intensities"))
+        return classical.run(name, whole(images), mask, found.light_directions, found.intensities)
+
+    def score(
+        self,
+        estimate: Estimate,
+        mask: np.ndarray,
+        normals: np.ndarray | None,
+        lights: np.ndarray | None,
+        intensities: np.ndarray | None,
+    ) -> dict[str, float]:
+        """Return the metrics of what the method estimated itself, and nothing it was given."""
+        method, truth = self.method, {}
+        if estimate.normals.size and normals is not None:
+            truth["normals"] = normals
+        if method.lights != TRUE_LIGHTS and len(estimate.light_directions) and lights is not None:
+            truth["light_directions"] = lights
+        found = len(estimate.intensities) and TRUE_LIGHTS not in (method.lights, method.intensities)
+        if found and intensities is not None:
+            truth["intensities"] = intensities
+        return {item.name: item.value for item in score(estimate, mask, **truth)}
+
+
+def label(lights: str, normals: str, second: str = NONE) -> str:
+    """Name a combination."""
+    parts = [part.removeprefix(weights.SHIPPED) for part in (lights, normals, second)]
+    suffix = " (shipped)" if any(part.startswith(weights.SHIPPED) for part in (lights, normals, second)) else ""
+    lights, normals, second = parts
+    for name, pair in COMBINATIONS.items():
+        if second and pair.members() == (lights, normals, second):
+            return f"{name} ({' + '.join(pair.members())}){suffix}"
+    if lights == TRUE_LIGHTS:
+        return f"{normals}, true lights{suffix}"
+    return " + ".join(part for part in (lights, second, normals) if part) + suffix
+
+
+def combine(
+    lights: str | None, normals: str | None, second: str | None, intensities: str | None, find: Callable[[str], Path]
+) -> Method:
+    """Return the method that a user's choice describes.
+
+    Args:
+        lights: A run or weights file, or `true`.
+        normals: A run, a weights file, a combination such as `sdps`, or a classical method.
+        second: A run or weights file.
+        intensities: `true` where only these are given.
+        find: Gives the weights file of a name, or raises InputError.
+
+    Raises:
+        InputError: a name without weights, or choices that do not go together.
+    """
+    prefix = weights.SHIPPED if normals and normals.startswith(weights.SHIPPED) else ""
+    if normals and normals.removeprefix(prefix) in COMBINATIONS:
+        pair = COMBINATIONS[normals.removeprefix(prefix)]
+        lights, second = lights or prefix + pair.lighting, second or (prefix + pair.second if pair.second else None)
+        normals = prefix + pair.normals
+    if normals is None:
+        raise InputError("--lights and --second need --normals as well; see `sdps models`")
+    lights = lights or _default_lights(normals, find)
+    if normals in CLASSICAL:
+        _check_classical(normals, lights, second, intensities)
+    if second and lights in (NONE, TRUE_LIGHTS):
+        raise InputError("--second corrects estimated lights; name a lighting model with --lights")
+    name = label(_stem(lights), _stem(normals), _stem(second or NONE))
+    if intensities:
+        name += ", true intensities"
+    method = Method(name=name, lights=lights, normals=normals, second=second or NONE, intensities=intensities or NONE)
+    for needed in sorted(method.models()):
+        find(needed)
+    return method
+
+
+def parse(text: str, find: Callable[[str], Path]) -> Method:
+    """Return the method of an expression.
+
+    Args:
+        text: A combination (`sdps`), a normal model (`nenet`), a classical method (`pf14`), or lights and normals
+            joined by a plus (`lcnet+psfcn`, `true+least-squares`); `shipped:` before a name means the shipped weights.
+            Calibrated methods are given the true lights where none are named.
+        find: Gives the weights file of a name, or raises InputError.
+
+    Raises:
+        InputError: a name without weights, or parts that do not go together.
+    """
+    parts = [part.strip() for part in text.split("+")]
+    if not all(parts) or len(parts) > 3:
+        raise InputError(f"method {text!r}: write a name, lights+normals, or lights+second+normals")
+    lights = parts[0] if len(parts) > 1 else None
+    if parts == [CONSTANT]:
+        return Method(name="constant predictor", normals=CONSTANT)
+    if lights is None and parts[-1] in classical.METHODS and classical.METHODS[parts[-1]].calibrated:
+        lights = TRUE_LIGHTS
+    return combine(lights, parts[-1], parts[1] if len(parts) == 3 else None, None, find)
+
+
+def _stem(name: str) -> str:
+    return Path(name).stem if name.endswith(".safetensors") else name
+
+
+def _default_lights(normals: str, find: Callable[[str], Path]) -> str:
+    """Return the lights a normal model was trained on; none for methods that are told none."""
+    if normals in CLASSICAL:
+        return NONE
+    prefix = weights.SHIPPED if normals.startswith(weights.SHIPPED) else ""
+    name = normals.removeprefix(prefix)
+    if name not in MODELS:
+        from sdps.checkpoint import load_weights
+
+        name = load_weights(find(normals)).name
+    lights = MODELS[name].lights
+    return prefix + lights if lights not in (NONE, TRUE_LIGHTS) else lights
+
+
+def _check_classical(normals: str, lights: str, second: str | None, intensities: str | None) -> None:
+    """Refuse what a classical method would not look at, and a calibrated one without lights."""
+    calibrated = normals in classical.METHODS and classical.METHODS[normals].calibrated
+    if calibrated and not lights:
+        raise InputError(f"{normals} is told the lights; give --lights, `true` or a lighting model")
+    if not calibrated and (lights or second or intensities):
+        raise InputError(f"{normals} finds the lights itself; leave out --lights, --second and --intensities")
+
+
+@cache
+def _file_digest(path: Path) -> str:
+    with path.open("rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+@cache
+def _inference_digest() -> str:
+    """Return a digest of the code that uses trained networks, so that results of other code are told apart."""
+    root, digest = Path(__file__).parent, hashlib.sha256()
+    names = ("inference", "chunked", "image_source", "augment", "lighting", "observation_maps")
+    for path in [*(root / f"{name}.py" for name in names), *sorted((root / "models").glob("*.py"))]:
+        digest.update(re.sub(rb"\s+", b" ", path.read_bytes()))
+    return digest.hexdigest()

@@ -1,0 +1,63 @@
+"""Where trained weights lie: in the folder of the runs that made them, or shipped with the package."""
+
+from importlib import resources
+from pathlib import Path
+
+from render.errors import InputError, unknown
+from sdps.models.registry import MODELS
+
+MODELS_FOLDER = "models"
+SHIPPED = "shipped:"
+"""Prefix of names that mean the weights shipped with the package, whatever was trained since."""
+
+_SUFFIX = ".safetensors"
+
+
+def shipped_folder() -> Path:
+    """Return the folder of the weights that travel with the package; it may be empty."""
+    return Path(str(resources.files("assets"))) / "weights"
+
+
+def shipped() -> list[str]:
+    """Return the names of the shipped weights."""
+    return sorted(path.stem for path in shipped_folder().glob(f"*{_SUFFIX}"))
+
+
+def trained_file(out: Path, name: str) -> Path:
+    """Return where the weights of a run lie, or would lie, in the folder of the runs."""
+    own = out / MODELS_FOLDER / name / f"{name}{_SUFFIX}"
+    others = sorted((out / MODELS_FOLDER).glob(f"*/{name}{_SUFFIX}"))  # one run may make several
+    return own if own.is_file() or not others else others[0]
+
+
+def locate(name: str, out: Path | None = None) -> Path:
+    """Return the file a name stands for, whether it is there or not.
+
+    Args:
+        name: A path that ends in `.safetensors`, `shipped:<name>`, or a run's name: its weights in `out` if they are
+            there, else the shipped ones if they are.
+        out: Folder of the runs; None for shipped weights only.
+    """
+    if name.endswith(_SUFFIX):
+        return Path(name)
+    kept = shipped_folder() / f"{name.removeprefix(SHIPPED)}{_SUFFIX}"
+    if name.startswith(SHIPPED) or out is None:
+        return kept
+    trained = trained_file(out, name)
+    return trained if trained.is_file() or not kept.is_file() else kept
+
+
+def require(name: str, out: Path | None = None) -> Path:
+    """Return the file a name stands for.
+
+    Raises:
+        InputError: an unknown name, or weights that are not there, with what to do.
+    """
+    path = locate(name, out)
+    if path.is_file():
+        return path
+    plain = name.removeprefix(SHIPPED)
+    if plain not in MODELS and not name.endswith(_SUFFIX):
+        runs = {path.parent.name for path in (out / MODELS_FOLDER).glob(f"*/*{_SUFFIX}")} if out else set()
+        raise unknown("trained model", name, {*runs, *shipped(), *MODELS})
+    raise InputError(f"{path}: no such weights; train them with `sdps train --models {plain}`")
