@@ -20,6 +20,10 @@ class DataConfig:
         views: Random views per shape.
         materials_per_view: Different random materials per view (each is a sample of its own; they share rays).
         materials: Names, categories, or `all`; `lambertian:<albedo>` and material files are allowed.
+        material_weights: How often a material is drawn relative to the others, which count 1, by name or category; of
+            a material that both name, the name counts.
+        validation_materials: Materials, as in `materials`, that every second validation scene has in place of its own,
+            on all of its surface; `held-out` are those the package keeps for this. Empty: none.
         spatially_varying: Share of the scenes whose surface mixes materials in a pattern, in [0, 1]. Such a scene
             keeps the material it would have had alone as its first one.
         patterns: Patterns to draw from: patches, stripes, noise, gradient, parts.
@@ -46,6 +50,8 @@ class DataConfig:
     views: int = 2
     materials_per_view: int = 2
     materials: tuple[str, ...] = ("all",)
+    material_weights: dict[str, float] = field(default_factory=dict)
+    validation_materials: tuple[str, ...] = ()
     spatially_varying: float = 0.0
     patterns: tuple[str, ...] = tuple(PATTERNS)
     mixture: tuple[int, int] = (2, 3)
@@ -91,6 +97,9 @@ class DataConfig:
         low, high = self.mixture
         if not 2 <= low <= high <= MOST_COMPONENTS:
             raise InputError(f"mixture must be two rising numbers in 2..{MOST_COMPONENTS}, got {low}, {high}")
+        for name, weight in self.material_weights.items():
+            if not 0 <= weight <= 100:
+                raise InputError(f"material_weights.{name} must be in [0, 100], got {weight}")
         if not self.patterns:
             raise InputError(f"patterns must name at least one of {', '.join(PATTERNS)}")
         for name in self.patterns:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,6 +22,7 @@ __all__ = ["DataConfig", "is_validation", "material_pool", "plan", "random_view"
 
 POSES_TRIED = 24  # per view, before the shape is given up
 SHAPES_TRIED = 8
+HELD_OUT = "held-out"  # the materials that training never sees
 EMPTY = 0.02  # share of the frame below which a tile shows nothing worth rendering
 
 
@@ -45,6 +46,10 @@ def plan(config: DataConfig, processes: int = 1) -> list[SceneSpec]:
     if most > len(pool):
         name = "materials_per_view" if most == config.materials_per_view else "mixture"
         raise InputError(f"{name} is {most}, but there are {len(pool)} materials")
+    weights = material_weights(config, pool)
+    if weights is not None and np.count_nonzero(weights) < most:
+        raise InputError(f"material_weights leave {np.count_nonzero(weights)} materials, {most} are drawn at once")
+    unseen = material_pool(config.validation_materials)
     joined = next((name for name in pool if "+" in name), None)
     if config.spatially_varying and joined:
         raise InputError(f"materials: {joined!r} has a '+' and cannot be mixed with others; leave it out or rename it")
@@ -56,9 +61,46 @@ def plan(config: DataConfig, processes: int = 1) -> list[SceneSpec]:
         raise InputError("families: no scene to render; raise a count above 0")
     framed = any(config.is_framed(family) for family, _ in shapes)
     with _mapping(processes if framed else 1) as mapping:
-        planned = mapping(partial(_plan_shape, config, pool), shapes)
+        planned = mapping(partial(_plan_shape, config, _Materials(pool, weights, unseen)), shapes)
         bar = progress_bar(planned, total=len(shapes), desc="plan", unit="shape", disable=not framed)
         return [scene for scenes in bar for scene in scenes]
+
+
+class _Materials(NamedTuple):
+    """What scenes are made of.
+
+    Attributes:
+        pool: Names.
+        weights: (M,) probability of each, or None for equal ones.
+        unseen: Names for validation scenes alone.
+    """
+
+    pool: list[str]
+    weights: np.ndarray | None
+    unseen: list[str]
+
+    def order(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Draw the numbers of `count` different materials of the pool."""
+        if self.weights is None:
+            return rng.permutation(len(self.pool))[:count]
+        return rng.choice(len(self.pool), size=count, replace=False, p=self.weights)
+
+
+def material_weights(config: DataConfig, pool: list[str]) -> np.ndarray | None:  # (M,)
+    """Return the probability of each material of a pool, or None where all are equal.
+
+    Raises:
+        InputError: a weight for what is neither a material of the pool nor a category of one.
+    """
+    if not config.material_weights:
+        return None
+    kinds = [next(iter(surfaces.load(name).components)).category for name in pool]
+    for name in config.material_weights:
+        if name not in pool and name not in kinds:
+            raise unknown("material or category in material_weights:", name, {*pool, *kinds})
+    given = config.material_weights
+    weights = np.array([given.get(name, given.get(kind, 1.0)) for name, kind in zip(pool, kinds, strict=True)])
+    return weights / max(weights.sum(), 1e-12)
 
 
 @contextmanager
@@ -86,7 +128,7 @@ def is_validation(number: int, share: float) -> bool:
 
 
 def material_pool(chosen: tuple[str, ...]) -> list[str]:
-    """Expand `all` and category names into material names, keeping everything else that can be loaded.
+    """Expand `all`, `held-out` and category names into material names, keeping everything else that can be loaded.
 
     Raises:
         InputError: a name that is neither.
@@ -95,6 +137,8 @@ def material_pool(chosen: tuple[str, ...]) -> list[str]:
     for name in chosen:
         if name == "all":
             pool += library.names()
+        elif name == HELD_OUT:
+            pool += library.held_out()
         elif name in categories:
             pool += categories[name]
         else:
@@ -103,7 +147,7 @@ def material_pool(chosen: tuple[str, ...]) -> list[str]:
     return list(dict.fromkeys(pool))
 
 
-def _plan_shape(config: DataConfig, pool: list[str], key: tuple[str, int]) -> list[SceneSpec]:
+def _plan_shape(config: DataConfig, materials: _Materials, key: tuple[str, int]) -> list[SceneSpec]:
     """Plan all views of one shape; a shape that cannot be framed as asked is replaced by another one."""
     family, number = key
     for attempt in range(SHAPES_TRIED):
@@ -114,7 +158,7 @@ def _plan_shape(config: DataConfig, pool: list[str], key: tuple[str, int]) -> li
             return [
                 scene
                 for view, pose in enumerate(views)
-                for scene in _plan_view(config, (family, number, view), shape, pose, pool)
+                for scene in _plan_view(config, (family, number, view), shape, pose, materials)
             ]
     raise InputError(
         f"{family} {number}: {SHAPES_TRIED} shapes in turn have a view without a fitting pose in {POSES_TRIED}; lower "
@@ -157,14 +201,19 @@ def _framed_view(config: DataConfig, family: str, keys: tuple, mesh: Any) -> Vie
     return None
 
 
-def _plan_view(config: DataConfig, keys: tuple, shape: str, pose: View, pool: list[str]) -> list[SceneSpec]:
+def _plan_view(config: DataConfig, keys: tuple, shape: str, pose: View, materials: _Materials) -> list[SceneSpec]:
     """Draw lights and materials of one view; each from a stream of its own."""
     family, number, view = keys
     directions = light_sets.draw(config.lights, config.light_count, generator(config.seed, *keys, "lights"))
-    order = generator(config.seed, *keys, "materials").permutation(len(pool))[: config.materials_per_view]
+    order = materials.order(generator(config.seed, *keys, "materials"), config.materials_per_view)
+    surface = [_surface(config, (*keys, "surface", slot), materials, index) for slot, index in enumerate(order)]
+    held_out = is_validation(number, config.validation)
+    if held_out and materials.unseen:
+        drawn = generator(config.seed, *keys, "unseen").permutation(len(materials.unseen))
+        surface[1::2] = [materials.unseen[index] for index in np.resize(drawn, len(surface[1::2]))]
     common = {
         "seed": derived_seed(config.seed, *keys, "sampler"),
-        "split": "val" if is_validation(number, config.validation) else "train",
+        "split": "val" if held_out else "train",
         "shape": shape,
         "view": pose,
         "lights": tuple(tuple(round(float(c), 6) for c in row) for row in directions),
@@ -173,19 +222,17 @@ def _plan_view(config: DataConfig, keys: tuple, shape: str, pose: View, pool: li
         "bounces": config.bounces,
     }
     name = f"{family}-{number:05d}-v{view}"
-    return [
-        SceneSpec(id=f"{name}-m{slot}", material=_surface(config, (*keys, "surface", slot), pool, index), **common)
-        for slot, index in enumerate(order)
-    ]
+    return [SceneSpec(id=f"{name}-m{slot}", material=material, **common) for slot, material in enumerate(surface)]
 
 
-def _surface(config: DataConfig, keys: tuple, pool: list[str], first: int) -> str:
+def _surface(config: DataConfig, keys: tuple, materials: _Materials, first: int) -> str:
     """Name the surface of a scene: material `first` alone, or mixed with others by a seeded pattern."""
-    rng = generator(config.seed, *keys)
+    rng, pool = generator(config.seed, *keys), materials.pool
     if rng.random() >= config.spatially_varying:
         return pool[first]
     count = int(rng.integers(config.mixture[0], config.mixture[1] + 1))
-    others = [index for index in rng.permutation(len(pool)) if index != first][: count - 1]
+    drawn = rng.permutation(len(pool)) if materials.weights is None else materials.order(rng, count)
+    others = [index for index in drawn if index != first][: count - 1]
     names = "+".join(pool[index] for index in (first, *others))
     pattern = config.patterns[int(rng.integers(len(config.patterns)))]
     return f"{pattern}:{int(rng.integers(2**31))}:{names}"

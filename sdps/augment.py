@@ -34,6 +34,7 @@ class Augmentation:
             highlights reach hundreds; a network that sees them learns more slowly (docs/models.md has the figures).
         intensity_range: Uniform range of the light intensity of each image; the labels of LCNet.
         noise: Full width of the uniform noise added to every pixel, background included.
+        biased: Share of the samples whose images are drawn from one half of the lights, those on one random side.
         symmetries: Mirror and quarter-turn scenes at random, with their normals and lights (not in the
             paper): eight views for the price of one rendering.
     """
@@ -45,6 +46,7 @@ class Augmentation:
     clip: float = 1.0
     intensity_range: tuple[float, float] = (0.2, 2.0)
     noise: float = 0.05
+    biased: float = 0.0
     symmetries: bool = False
 
     def __post_init__(self) -> None:
@@ -57,6 +59,8 @@ class Augmentation:
                 raise InputError(f"augmentation.{name} must be positive, got {getattr(self, name)}")
         if self.mean_level >= self.clip:
             raise InputError(f"augmentation.mean_level {self.mean_level} must be below augmentation.clip {self.clip}")
+        if not 0.0 <= self.biased <= 1.0:
+            raise InputError(f"augmentation.biased must be in [0, 1], got {self.biased}")
         if not 0.0 <= self.noise < 1.0:
             raise InputError(f"augmentation.noise must be in [0, 1), got {self.noise}")
 

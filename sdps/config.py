@@ -19,6 +19,7 @@ class TrainingConfig:
 
     Attributes:
         seed: Root seed of weights, order, image subsets and augmentation.
+        start: Run of the same network whose weights training starts from; empty for random ones.
         epochs: Passes over the training scenes, unless `steps` or `minutes` is set.
         steps: Optimiser steps to take instead.
         minutes: Minutes of training to spend instead, counted across resumed runs.
@@ -27,7 +28,9 @@ class TrainingConfig:
         images: Images drawn per scene and step.
         size: Side in pixels to which scenes of another size are resized.
         learning_rate: Peak learning rate.
-        schedule: `halving` (halve after each of `halve_after`), `cosine` (to zero) or `constant`.
+        schedule: `halving` (after each of `halve_after`), `cosine` (to zero), `constant`, or `trapezoid`: constant
+            until the last share `cooldown` of the budget, then linearly to zero; the budget may be raised until then.
+        cooldown: See `schedule`.
         halve_after: Epochs after which `halving` halves; scaled with the budget when it is not `epochs`.
         warmup: Share of the budget over which the learning rate rises linearly from zero.
         optimiser: `adam` or `adamw`; betas 0.9 and 0.999.
@@ -49,6 +52,7 @@ class TrainingConfig:
     """
 
     seed: int = 0
+    start: str = ""
     epochs: float = 20.0
     steps: int | None = None
     minutes: float | None = None
@@ -57,8 +61,9 @@ class TrainingConfig:
     images: int = 32
     size: int = 128
     learning_rate: float = 5e-4
-    schedule: Literal["halving", "cosine", "constant"] = "halving"
+    schedule: Literal["halving", "cosine", "constant", "trapezoid"] = "halving"
     halve_after: tuple[float, ...] = (5.0, 10.0, 15.0)
+    cooldown: float = 0.2
     warmup: float = 0.0
     optimiser: Literal["adam", "adamw"] = "adam"
     weight_decay: float = 0.0
@@ -92,7 +97,7 @@ class TrainingConfig:
             raise InputError(f"accumulate {self.accumulate} must divide batch_scenes {self.batch_scenes}")
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 and at least 16, got {self.size}")
-        for name in ("warmup", "ema"):
+        for name in ("warmup", "ema", "cooldown"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InputError(f"{name} must be in [0, 1), got {getattr(self, name)}")
         if self.schedule == "halving" and any(not 0.0 < epoch < self.epochs for epoch in self.halve_after):
@@ -108,6 +113,8 @@ class TrainingConfig:
         if self.schedule == "cosine":
             annealed = (min(progress, 1.0) - self.warmup) / (1.0 - self.warmup)
             return rate * 0.5 * (1.0 + math.cos(math.pi * annealed))
+        if self.schedule == "trapezoid":
+            return rate * min(1.0, max(1.0 - progress, 0.0) / max(self.cooldown, 1e-9))
         return rate
 
 
@@ -191,7 +198,7 @@ class PixelTraining(NormalTraining):
     batch_scenes: int = 8
     images: int = 64
     learning_rate: float = 1e-3
-    schedule: Literal["halving", "cosine", "constant"] = "constant"
+    schedule: Literal["halving", "cosine", "constant", "trapezoid"] = "constant"
     halve_after: tuple[float, ...] = ()
     pixels_per_scene: int = 96
     min_lights: int = 8

@@ -140,10 +140,11 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     """
     # A child of the stream, so that the number does not depend on how much the sample draws.
     seed = int(rng.spawn(1)[0].integers(2**63))
-    chosen = rng.permutation(len(stored.images))[: options.images]
+    directions = scene.light_directions()[: len(stored.images)]
+    chosen = choose_images(directions, options, rng)
     images = stored.images[chosen].astype(np.float32)  # (Q, H, W, 3)
     normals, mask = stored.normals, stored.mask
-    directions = scene.light_directions()[chosen]
+    directions = directions[chosen]
     if options.augmentation.symmetries:
         turns, mirror = int(rng.integers(4)), bool(rng.integers(2))
         images, normals, mask, directions = apply_symmetry(images, normals, mask, directions, turns, mirror)
@@ -161,6 +162,17 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
         corner=torch.tensor(corner),
         seed=torch.tensor(seed),
     )
+
+
+def choose_images(directions: np.ndarray, options: SampleOptions, rng: np.random.Generator) -> np.ndarray:  # (Q,)
+    """Draw which of a scene's images a sample has, in random order; a biased one has those of one side."""
+    share = options.augmentation.biased
+    if not share or rng.random() >= share:
+        return rng.permutation(len(directions))[: options.images]
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    reach = directions[:, :2] @ np.array([np.cos(angle), np.sin(angle)])  # (L,)
+    side = np.argsort(-reach, kind="stable")[: max(options.images, len(directions) // 2)]
+    return rng.permutation(side)[: options.images]
 
 
 def collate(samples: list[Batch | InputError]) -> Batch | InputError:

@@ -30,7 +30,7 @@ class Run(NamedTuple):
         name: Names the folder and the weights.
         model: Name in the registry, or `sdps-joint`.
         config: Resolved configuration.
-        requires: Runs whose weights it needs, by what they are for (`lighting`, `normals`).
+        requires: Runs whose weights it needs, by what they are for (`lighting`, `normals`, `start`).
     """
 
     name: str
@@ -61,7 +61,8 @@ def run(name: str, sections: Mapping[str, Mapping[str, Any]], runs: Mapping[str,
         build(_CLASSES[role], {**values, **settings}, layer)  # names the section a mistake is in
         values |= {key: _joined(values.get(key), value) for key, value in settings.items()}
     config = build(_CLASSES[role], values, where)
-    return Run(name, model, config, _requires(name, model, config))
+    requires = _requires(name, model, config)
+    return Run(name, model, config, requires | ({"start": config.start} if config.start else {}))
 
 
 def _joined(before: Any, value: Any) -> Any:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from render.errors import InputError
 from render.seeds import derived_seed
 from sdps.checkpoint import TrainedModel
 from sdps.config import LightingTraining, NormalTraining, TrainingConfig
@@ -89,7 +90,7 @@ class Stage(ABC):
     def validation_options(self) -> SampleOptions:
         """Return how validation samples are made: whole images in the pose they were rendered."""
         options = self.sample_options()
-        augmentation = replace(options.augmentation, symmetries=False)
+        augmentation = replace(options.augmentation, symmetries=False, biased=0.0)
         return replace(options, crop=0, rescale=False, augmentation=augmentation)
 
     @abstractmethod
@@ -266,8 +267,24 @@ def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping
         name: Name of the run.
         model: Name in the registry, or `sdps-joint`.
         config: The run's configuration, of the model's role.
-        trained: The models it needs, by what they are for: `lighting`, `normals`.
+        trained: The models it needs, by what they are for: `lighting`, `normals`, and `start` for the weights that
+            training starts from.
+
+    Raises:
+        InputError: a start of another network.
     """
+    stage = _stage(name, model, config, trained)
+    if "start" in trained:
+        first = trained["start"]
+        try:
+            stage.network.load_state_dict(first.network.state_dict())
+        except RuntimeError as error:
+            raise InputError(f"runs.{name}.start: {first.name!r} has another network; name one of its kind") from error
+    return stage
+
+
+def _stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
+    """Return the stage with random weights."""
     from sdps.joint import JointStage, SecondStage
     from sdps.pixel_stage import PixelStage
     from sdps.recipes import JOINT

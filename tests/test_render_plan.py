@@ -1,5 +1,6 @@
 """Configuration, seeds, light sets and the plan: strict, reproducible, and stable when something is added."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -363,3 +364,32 @@ def test_read_yaml_names_file_and_line(tmp_path: Path):
 
 def test_unknown_lists_a_few_names_when_none_is_near():
     assert "known: a, b" in str(unknown("thing", "zzz", ["a", "b"]))
+
+
+def test_weights_decide_how_often_materials_are_drawn() -> None:
+    pool = {"materials": ("chrome", "nickel", "blue-fabric", "pink-fabric", "teflon")}
+    config = DataConfig(families={"blobby": 200}, materials_per_view=1, views=2, validation=0.0, **pool)
+    weighted = replace(config, material_weights={"metal": 4.0, "nickel": 0.0, "fabric": 0.5})
+    counts = Counter(scene.material for scene in plan(weighted))
+    assert "nickel" not in counts
+    shares = {name: count / 400 for name, count in counts.items()}
+    assert shares["chrome"] == pytest.approx(4 / 6, abs=0.08)
+    assert shares["teflon"] == pytest.approx(1 / 6, abs=0.06)
+    plain = plan(replace(config, material_weights={}))
+    assert [scene.material for scene in plan(config)] == [scene.material for scene in plain]
+    with pytest.raises(InputError, match="material_weights: 'fabrics'.*did you mean 'fabric'"):
+        plan(replace(config, material_weights={"fabrics": 2.0}))
+    with pytest.raises(InputError, match="leave 1 materials, 2 are drawn at once"):
+        plan(replace(config, materials_per_view=2, materials=("chrome", "nickel"), material_weights={"nickel": 0.0}))
+
+
+def test_held_out_materials_are_seen_in_validation_only() -> None:
+    unseen = set(material_pool(("held-out",)))
+    assert len(unseen) == 16 and unseen.isdisjoint(material_pool(("all",)))
+    config = DataConfig(families={"blobby": 10}, validation=0.2, spatially_varying=0.5)
+    before = {scene.id: scene for scene in plan(config)}
+    for scene in plan(replace(config, validation_materials=("held-out",))):
+        if scene.split == "val" and scene.id.endswith("-m1"):
+            assert scene.material in unseen
+        else:
+            assert scene == before[scene.id]

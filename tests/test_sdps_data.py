@@ -1,6 +1,7 @@
 """From shards to batches: augmentation in its order, streams of random numbers, cache, and refusals."""
 
 import json
+from dataclasses import replace
 from itertools import islice
 from multiprocessing import active_children
 from pathlib import Path
@@ -15,7 +16,16 @@ from render.errors import InputError
 from render.manifest import read_manifest
 from render.shards import read_shard
 from sdps.augment import Augmentation, apply_symmetry, augment, exposure_scale, normalise_exposure
-from sdps.dataset import Batch, SampleKey, SampleOptions, SampleStream, SceneDataset, collate, make_sample
+from sdps.dataset import (
+    Batch,
+    SampleKey,
+    SampleOptions,
+    SampleStream,
+    SceneDataset,
+    choose_images,
+    collate,
+    make_sample,
+)
 from sdps.metrics import normal_mae
 from sdps.scene_store import StoredScene
 from sdps.sources import StoredScenes
@@ -382,3 +392,18 @@ def test_stored_batches_hand_on_mistakes(tmp_path: Path) -> None:
     source = StoredScenes(SceneDataset(tmp_path, "train", options(size=16)), batch=2, workers=1)
     assert "render it again" in str(next(source.batches(0)))
     source.close()
+
+
+def test_biased_samples_have_the_lights_of_one_side() -> None:
+    directions = hemisphere_lights(32, rng())
+    plain = options(augmentation=PLAIN, images=8)
+    biased = options(augmentation=replace(PLAIN, biased=1.0), images=8)
+    means, widths = [], []
+    for seed in range(50):
+        assert len(set(chosen := choose_images(directions, biased, rng(seed)))) == 8
+        centre = directions[chosen, :2].mean(0)
+        means.append(np.linalg.norm(centre))
+        widths.append(np.arctan2(centre[1], centre[0]))
+        # Without a share of biased samples the stream of the plain ones is as it was.
+        np.testing.assert_array_equal(choose_images(directions, plain, rng(seed)), rng(seed).permutation(32)[:8])
+    assert np.mean(means) > 0.4 and np.std(widths) > 1.0  # to a side, and not always the same

@@ -39,7 +39,14 @@ def stage_of(name: str, role: str) -> Stage:
     """Return the stage that trains a model on true lights where it is told lights, in few steps."""
     settings = COMMON | (LIGHTING if role in ("lighting", "second") else NORMALS) | {"steps": STEPS[role]}
     if role == "pixels":
-        settings |= {"images": 24, "clip_gradient": 0.0, "learning_rate": 1e-3, "pixels_per_scene": 64}
+        # All lights at every step: with random subsets of them the observation maps of a pixel never repeat.
+        settings |= {
+            "images": 24,
+            "min_lights": 24,
+            "clip_gradient": 0.0,
+            "learning_rate": 1e-3,
+            "pixels_per_scene": 64,
+        }
     if role in ("normals", "pixels") and entry(name).lights:
         settings["lights"] = "true"
     run = recipes.run(name, {}, {name: settings})

@@ -306,6 +306,9 @@ def test_schedules_of_the_paper() -> None:
     assert warm.learning_rate_at(0.05) == pytest.approx(2.5e-4)
     assert warm.learning_rate_at(0.55) == pytest.approx(2.5e-4)
     assert warm.learning_rate_at(1.2) == pytest.approx(0.0)
+    trapezoid = LightingTraining(schedule="trapezoid", cooldown=0.2, warmup=0.1)
+    rates = [trapezoid.learning_rate_at(progress) for progress in (0.05, 0.5, 0.79, 0.9, 1.0)]
+    np.testing.assert_allclose(rates, [2.5e-4, 5e-4, 5e-4, 2.5e-4, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -367,3 +370,16 @@ def test_lcnet_learns_the_light_intensities_of_a_few_scenes(tmp_path: Path) -> N
     assert before["intensity_error"] > 0.25
     assert after["intensity_error"] < 0.15
     assert after["direction_mae"] < 3.0
+
+
+def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
+    settings = {"runs": {"psfcn-late": {"base": "psfcn", "start": "nenet", "steps": 1}}}
+    run = recipes.run("psfcn-late", {}, settings["runs"])
+    assert run.requires == {"start": "nenet"}
+    first = TrainedModel("nenet", create("nenet"), {}, {"config": {"augmentation": {}}})
+    stage = create_stage("psfcn-late", run.model, run.config, {"start": first})
+    pairs = zip(stage.network.state_dict().values(), first.network.state_dict().values(), strict=True)
+    assert all(torch.equal(*pair) for pair in pairs)
+    other = TrainedModel("upsfcn", create("upsfcn"), {}, {"config": {"augmentation": {}}})
+    with pytest.raises(InputError, match=r"runs.psfcn-late.start: 'upsfcn' has another network"):
+        create_stage("psfcn-late", run.model, run.config, {"start": other})

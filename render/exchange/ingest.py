@@ -103,7 +103,7 @@ def ingest(tree: str | Path, out: str | Path, options: ImportOptions) -> ImportR
     if not tree.is_dir():
         raise InputError(f"{tree}: no such folder; give the root of a {options.layout} tree")
     sources = READERS[options.layout](tree)[: options.limit]
-    boxes = [_box(source.truth().mask, options.crop) for source in sources]
+    boxes = [crop_box(source.truth().mask, options.crop) for source in sources]
     scenes = _scenes(sources, boxes, options)
     _claim(out, scenes)
     written = 0
@@ -159,7 +159,7 @@ def _directions(source: Source, options: ImportOptions) -> np.ndarray:  # (L, 3)
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _box(mask: np.ndarray, margin: int | None) -> Box:
+def crop_box(mask: np.ndarray, margin: int | None) -> Box:
     """Return the mask's bounding box with its margin, its sides rounded up to multiples of 4."""
     height, width = mask.shape
     if margin is None:

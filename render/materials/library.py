@@ -31,9 +31,14 @@ def names() -> list[str]:
     return list(_names())
 
 
+def held_out() -> list[str]:
+    """Return the names of the materials that training never sees, for validation: fits to RGL and Nielsen's data."""
+    return list(_names("materials/held-out"))
+
+
 @cache
-def _names() -> tuple[str, ...]:
-    folder = resources.files("assets").joinpath("materials")
+def _names(place: str = "materials") -> tuple[str, ...]:
+    folder = resources.files("assets").joinpath(*place.split("/"))
     return tuple(sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml")))
 
 
@@ -90,9 +95,12 @@ def _builtin(name: str) -> Material:
     kind, separator, value = name.partition(":")
     if kind == "lambertian":
         return _lambertian(name, value)
-    if separator or name not in _names():
-        raise unknown("material", name, [*_names(), "lambertian:0.5"], f"or give the path of a file ending in {FILES}")
-    text = resources.files("assets").joinpath("materials", f"{name}.yaml").read_text(encoding="utf-8")
+    held = name in _names("materials/held-out")
+    if separator or not (held or name in _names()):
+        known = [*_names(), *held_out(), "lambertian:0.5"]
+        raise unknown("material", name, known, f"or give the path of a file ending in {FILES}")
+    place = ("materials", "held-out") if held else ("materials",)
+    text = resources.files("assets").joinpath(*place, f"{name}.yaml").read_text(encoding="utf-8")
     return config.build(Material, yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)))
 
 
