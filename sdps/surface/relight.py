@@ -1,0 +1,197 @@
+"""Albedo on estimated normals and lights, pictures under new lights, and how well both explain the images.
+
+Everything is Lambertian: radiance = albedo x intensity x max(n . l, 0), in the images' own scale. Images are read a few
+at a time and several times over, so that memory does not grow with their number.
+
+Legend: L images, (H, W) their sides, n mask pixels, C = 3 channels.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from render.errors import InputError
+from sdps.surface.integration import Depth, checked_normals
+
+if TYPE_CHECKING:
+    from sdps.image_source import ImageSource
+
+_READ_PIXELS = 2**20  # read at once, whole images
+_LEAST = 0.02  # of a pixel's brightness: smaller residuals do not gain more weight
+_LIFT = 1.0  # pixels by which an occluder must rise above a ray, since the depth has errors of its own
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """How far images are from Lambert's law on the estimated normals, lights and albedo.
+
+    Attributes:
+        images: (L,) float64, relative RMS of each image: |image - model| / |image| over mask pixels and channels.
+        pixels: (H, W) float32, the same of each pixel over images and channels; 0 outside the mask.
+        overall: The same over everything.
+    """
+
+    images: np.ndarray
+    pixels: np.ndarray
+    overall: float
+
+
+def fit_albedo(
+    images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray, *,
+    passes: int = 3,
+) -> np.ndarray:  # fmt: skip
+    """Estimate the Lambertian albedo of each pixel, robustly.
+
+    The first pass over the images is least squares; the others weight each observation by one over its residual in the
+    mean of the channels, which tends to the least sum of absolute residuals, so that highlights and cast shadows count
+    little. Images in which a pixel faces away from the light say nothing about it.
+
+    Args:
+        images: L linear images (H, W, 3), read `passes` times.
+        mask: (H, W) bool.
+        normals: (H, W, 3).
+        lights: (L, 3) unit, from the surface to the light.
+        intensities: (L,) or (L, 3).
+        passes: 1 for plain least squares.
+
+    Returns:
+        (H, W, 3) float32 >= 0 in units of image value per intensity; 0 outside the mask and where no light falls.
+
+    Raises:
+        InputError: sizes that do not fit, values that are not finite, `passes` under 1.
+    """
+    if passes < 1:
+        raise InputError(f"passes must be at least 1, got {passes}")
+    unit, lights, gains = _checked(images, mask, normals, lights, intensities)
+    albedo = smallest = None
+    for _ in range(passes):
+        above, below = np.zeros((2, len(unit), 3), np.float32)
+        for part, observed in _read(images, mask):
+            for light, gain, values in zip(lights[part], gains[part], observed, strict=True):
+                model = _shading(unit, light)[:, None] * gain  # (n, C)
+                weighted = model
+                if albedo is not None:
+                    off = np.abs((values - model * albedo).mean(axis=1))
+                    weighted = model / np.maximum(off, smallest)[:, None]
+                above += weighted * values
+                below += weighted * model
+        albedo = np.maximum(above, 0.0) / np.maximum(below, np.finfo(np.float32).tiny)
+        smallest = np.maximum(_LEAST * albedo.mean(axis=1), 1e-12)
+    picture = np.zeros((*mask.shape, 3), np.float32)
+    picture[mask] = albedo
+    return picture
+
+
+def relit(
+    normals: np.ndarray, albedo: np.ndarray | float, direction: np.ndarray, *, depth: Depth | None = None
+) -> np.ndarray:
+    """Return the object under one light of intensity 1, (H, W, 3) float32 linear radiance, without highlights.
+
+    Args:
+        normals: (H, W, 3), zero outside the mask.
+        albedo: (H, W, 3) of `fit_albedo`, or (H, W, 1) or a number.
+        direction: (3,) from the surface to the light, of any length.
+        depth: Of `integrate`; adds cast shadows.
+
+    Raises:
+        InputError: a direction that is none.
+    """
+    direction = np.asarray(direction, np.float64)
+    length = np.linalg.norm(direction)
+    if direction.shape != (3,) or not (np.isfinite(length) and length > 0):
+        raise InputError(f"a light direction must be three finite numbers, not all zero, got {direction.tolist()}")
+    shading = np.maximum(normals @ (direction / length), 0.0)
+    if depth is not None:
+        shading = shading * lit(depth, direction)
+    return (shading[..., None] * albedo).astype(np.float32)
+
+
+def lit(depth: Depth, direction: np.ndarray) -> np.ndarray:
+    """Return which pixels see a distant light over the depth map, (H, W) bool; nothing outside the mask occludes.
+
+    Rays march in steps of a pixel. Between components, and behind what the camera sees, shadows are a guess.
+    """
+    across, towards = np.asarray(direction[:2], np.float64), float(direction[2])
+    length = np.linalg.norm(across)
+    if length < 1e-9 * max(abs(towards), 1e-300):
+        return depth.mask.copy()
+    step = across / length * (1.0, -1.0)  # columns and rows to the light
+    inside = depth.z[depth.mask]
+    lowest = float(inside.min()) - 1e4
+    z = np.where(depth.mask, depth.z, np.float32(lowest))
+    rise = towards / length  # of the ray, per pixel
+    farthest = np.hypot(*depth.mask.shape)
+    if rise > 0:
+        farthest = min(farthest, float(np.ptp(inside)) / rise)
+    free = depth.mask.copy()
+    for distance in range(1, int(farthest) + 2):
+        shift = np.array([[1.0, 0.0, -step[0] * distance], [0.0, 1.0, -step[1] * distance]])
+        ahead = cv2.warpAffine(z, shift, z.shape[::-1], flags=cv2.INTER_LINEAR, borderValue=lowest)
+        free &= ahead <= z + rise * distance + _LIFT
+    return free
+
+
+def residuals(
+    images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray,
+    albedo: np.ndarray,
+) -> Residuals:  # fmt: skip
+    """Compare the images with Lambert's law; arguments as for `fit_albedo`, whose result `albedo` is.
+
+    Highlights, cast shadows and interreflections add to the residual as much as wrong normals and lights do.
+    """
+    unit, lights, gains = _checked(images, mask, normals, lights, intensities)
+    if albedo.shape != (*mask.shape, 3):
+        raise InputError(f"albedo must be {(*mask.shape, 3)} like the mask, got {albedo.shape}")
+    inside = albedo[mask].astype(np.float32)
+    wrong, power = np.zeros((2, len(lights))), np.zeros((2, len(unit)))
+    for part, observed in _read(images, mask):
+        for number, values in zip(range(part.start, part.stop), observed, strict=True):
+            model = _shading(unit, lights[number])[:, None] * gains[number] * inside
+            off, squared = ((values - model) ** 2).sum(axis=1), (values**2).sum(axis=1)  # (n,)
+            wrong[:, number] = off.sum(dtype=np.float64), squared.sum(dtype=np.float64)
+            power += off, squared
+    picture = np.zeros(mask.shape, np.float32)
+    picture[mask] = _relative(*power)
+    return Residuals(_relative(*wrong), picture, float(_relative(*wrong.sum(axis=1, keepdims=True))[0]))
+
+
+def _relative(off: np.ndarray, power: np.ndarray) -> np.ndarray:
+    return np.sqrt(off / np.maximum(power, np.finfo(np.float64).tiny))
+
+
+def _shading(unit: np.ndarray, light: np.ndarray) -> np.ndarray:  # (n,)
+    return np.maximum(unit @ light, 0.0)
+
+
+def _checked(
+    images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return normals (n, 3), lights (L, 3) and intensities (L, 3), all float32."""
+    unit = checked_normals(normals, mask)
+    lights, gains = np.asarray(lights, np.float32), np.asarray(intensities, np.float32)
+    count = len(images)
+    if lights.shape != (count, 3) or gains.shape not in ((count,), (count, 3)):
+        raise InputError(
+            f"{count} images need lights ({count}, 3) and intensities ({count},) or ({count}, 3), got {lights.shape} "
+            f"and {gains.shape}"
+        )
+    if not (count and np.isfinite(lights).all() and np.isfinite(gains).all()):
+        raise InputError("there must be images, and their lights and intensities must be finite")
+    return unit.astype(np.float32), lights, np.broadcast_to(gains.reshape(count, -1), (count, 3))
+
+
+def _read(images: "ImageSource", mask: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+    """Yield which images, and their mask pixels, (k, n, C)."""
+    step = max(1, _READ_PIXELS // mask.size)
+    for start in range(0, len(images), step):
+        part = slice(start, min(start + step, len(images)))
+        observed = np.asarray(images[part])
+        if observed.shape != (part.stop - start, *mask.shape, 3):
+            raise InputError(f"images must be (L, {mask.shape[0]}, {mask.shape[1]}, 3), got {observed.shape}")
+        observed = observed[:, mask].astype(np.float32)
+        if not np.isfinite(observed).all():
+            raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
+        yield part, observed
