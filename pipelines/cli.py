@@ -10,6 +10,7 @@ from render.errors import InputError, unknown
 
 # command: (module, function that adds flags, function that runs, one line of help)
 COMMANDS = {
+    "infer": ("infer", "add_arguments", "main", "find normals, lights and a surface in a folder of photographs"),
     "doctor": ("doctor", "add_arguments", "main", "show what this machine has and what is missing"),
     "render-data": ("render_data", "add_arguments", "main", "render the training scenes of a preset"),
     "data": ("data", "add_arguments", "main", "plan, check, preview, describe, export and import data folders"),

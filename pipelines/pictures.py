@@ -122,6 +122,21 @@ def light_plot(truth: np.ndarray, estimate: np.ndarray) -> Figure:
     return figure
 
 
+def light_intensity_plot(directions: np.ndarray, intensities: np.ndarray) -> Figure:
+    """Plot light directions (L, 3) on the unit disc, coloured by intensity (L,) or (L, 3) over the strongest."""
+    grey = intensities if intensities.ndim == 1 else intensities.mean(1)
+    figure = Figure(figsize=(3.0, 2.6), dpi=100, layout="tight")
+    axes = figure.add_subplot()
+    axes.add_patch(Circle((0, 0), 1, fill=False, color="0.6", lw=0.8))
+    drawn = axes.scatter(
+        directions[:, 0], directions[:, 1], s=16, c=grey / grey.max(), cmap="viridis", vmin=0.0, vmax=1.0
+    )
+    axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
+    axes.axis("off")
+    figure.colorbar(drawn, ax=axes, shrink=0.7, label="intensity / strongest")
+    return figure
+
+
 def curve_plot(series: Sequence[tuple[str, np.ndarray, np.ndarray]], ylabel: str) -> Figure:
     """Plot named (x, y) series against training minutes."""
     figure = Figure(figsize=(4.6, 2.6), dpi=100, layout="tight")

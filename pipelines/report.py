@@ -84,17 +84,20 @@ def section_html(section: Section, folder: Path, number: int) -> str:
     strips = "".join(strip_html(strip, folder) for strip in section.strips)
     return (
         f'<section id="s{number}"><h2>{html.escape(section.title)}</h2><p class="note">{html.escape(section.text)}</p>'
-        f"{command}{tables}{strips}</section>"
+        f"{command}{strips + tables if section.pictures_first else tables + strips}</section>"
     )
 
 
 def table_html(table: Table) -> str:
     """Render one table; rows of published figures are marked by their class."""
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in table.header)
+    styles = [' class="prose"' if number in table.prose else "" for number in range(len(table.header))]
+
+    def cells(row: Sequence[str], tag: str) -> str:
+        return "".join(f"<{tag}{style}>{html.escape(cell)}</{tag}>" for style, cell in zip(styles, row, strict=True))
+
+    head = cells(table.header, "th")
     body = "".join(
-        f'<tr class="{"published" if number in table.published else "ours"}">'
-        + "".join(f"<td>{html.escape(cell)}</td>" for cell in row)
-        + "</tr>"
+        f'<tr class="{"published" if number in table.published else "ours"}">{cells(row, "td")}</tr>'
         for number, row in enumerate(table.rows)
     )
     note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""

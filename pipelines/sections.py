@@ -30,6 +30,7 @@ class Table:
         header: Column names.
         rows: Cells.
         published: Numbers of the rows that hold published figures only.
+        prose: Numbers of the columns that hold sentences, which wrap.
         note: A sentence below it: what the numbers are of (mask, bit depth, images, crop).
     """
 
@@ -37,6 +38,7 @@ class Table:
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     published: tuple[int, ...] = ()
+    prose: tuple[int, ...] = ()
     note: str = ""
 
 
@@ -79,6 +81,7 @@ class Section:
         order: Sections are shown in rising order.
         tables: Tables.
         strips: Rows of pictures.
+        pictures_first: Pictures stand above the tables.
         command: The command that makes it again.
     """
 
@@ -88,6 +91,7 @@ class Section:
     order: int = 100
     tables: tuple[Table, ...] = ()
     strips: tuple[Strip, ...] = ()
+    pictures_first: bool = False
     command: str = ""
 
 

@@ -69,11 +69,6 @@ class ObjectImages:
             yield range(start, min(start + count, len(self)), step)
 
 
-def whole(source: ImageSource) -> np.ndarray:  # (L, H, W, 3)
-    """Return all images at once, for methods that compare every image with every other."""
-    return source if isinstance(source, np.ndarray) else np.asarray(source[0 : len(source)])
-
-
 def survey(source: ImageSource, mask: np.ndarray, margin: int) -> ObjectImages:
     """Go through all images once: check them, find the object's box, gather what the exposure is measured on.
 

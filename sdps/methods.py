@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,7 +15,7 @@ from sdps import weights
 from sdps.baselines import constant_estimate
 from sdps.classical import registry as classical
 from sdps.estimate import Estimate
-from sdps.image_source import ImageSource, whole
+from sdps.image_source import ImageSource, survey
 from sdps.inference import Estimator, default_device, load_model
 from sdps.lighting import ReadOut
 from sdps.metrics import score
@@ -150,13 +150,21 @@ class Runner:
         return self.estimator.estimate(images, mask, **given)
 
     def _classical(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any]) -> Estimate:
-        name = self.method.normals
-        if not classical.METHODS[name].calibrated:
-            return classical.run(name, whole(images), mask)
-        if self.method.lights == TRUE_LIGHTS:
-            return classical.run(name, whole(images), mask, given["lights"], given.get("intensities"))
-        found = self.estimator.estimate_lights(images, mask, given.get("intensities"))
-        return classical.run(name, whole(images), mask, found.light_directions, found.intensities)
+        """Run a classical method, which holds the object's box of all images at once."""
+        name, told = self.method.normals, ()
+        if classical.METHODS[name].calibrated:
+            if self.method.lights == TRUE_LIGHTS:
+                told = given["lights"], given.get("intensities")
+            else:
+                found = self.estimator.estimate_lights(images, mask, given.get("intensities"))
+                told = found.light_directions, found.intensities
+        if isinstance(images, np.ndarray):
+            return classical.run(name, images, mask, *told)
+        scene = survey(images, mask, margin=2)
+        estimate = classical.run(name, scene.read(0, len(images)), scene.mask, *told)
+        normals = np.zeros((*mask.shape, 3), np.float32)
+        normals[scene.rows, scene.columns] = estimate.normals
+        return replace(estimate, normals=normals)
 
     def score(
         self,
@@ -209,7 +217,9 @@ def combine(
     prefix = weights.SHIPPED if normals and normals.startswith(weights.SHIPPED) else ""
     if normals and normals.removeprefix(prefix) in COMBINATIONS:
         pair = COMBINATIONS[normals.removeprefix(prefix)]
-        lights, second = lights or prefix + pair.lighting, second or (prefix + pair.second if pair.second else None)
+        if pair.second and lights != TRUE_LIGHTS:  # of lights that are given nothing is left to correct
+            second = second or prefix + pair.second
+        lights = lights or prefix + pair.lighting
         normals = prefix + pair.normals
     if normals is None:
         raise InputError("--lights and --second need --normals as well; see `sdps models`")

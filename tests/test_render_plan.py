@@ -377,7 +377,7 @@ def test_weights_decide_how_often_materials_are_drawn() -> None:
     assert shares["teflon"] == pytest.approx(1 / 6, abs=0.06)
     plain = plan(replace(config, material_weights={}))
     assert [scene.material for scene in plan(config)] == [scene.material for scene in plain]
-    with pytest.raises(InputError, match="material_weights: 'fabrics'.*did you mean 'fabric'"):
+    with pytest.raises(InputError, match=r"material_weights: 'fabrics'.*did you mean 'fabric'"):
         plan(replace(config, material_weights={"fabrics": 2.0}))
     with pytest.raises(InputError, match="leave 1 materials, 2 are drawn at once"):
         plan(replace(config, materials_per_view=2, materials=("chrome", "nickel"), material_weights={"nickel": 0.0}))

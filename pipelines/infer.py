@@ -1,0 +1,178 @@
+"""`sdps infer`: a folder of photographs under moving light in, normals, lights, depth, meshes and a page out."""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines import pictures, report
+from pipelines.sections import Section, SectionWriter, Table
+from render.errors import InputError
+
+if TYPE_CHECKING:
+    from sdps.api import Inference
+    from sdps.photos import Finding
+
+_MARKS = {"error": "!!", "warning": "! ", "note": "- "}
+_MOST_LISTED = 6
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps infer`."""
+    parser.add_argument("folder", type=Path, nargs="?", help="photographs of a static object under moving light")
+    parser.add_argument("--out", type=Path, default=Path("out/infer"), help="output folder (default: %(default)s)")
+    parser.add_argument("--method", default="auto", metavar="NAME",
+                        help="any model or classical method: sdps, lcnet+psfcn, pf14, ... (default: auto)")  # fmt: skip
+    parser.add_argument("--models", type=Path, default=None, help="folder of trained runs (default: shipped weights)")
+    parser.add_argument("--mask", default=None, help="picture, bright on the object (default: mask.*, else automatic)")
+    parser.add_argument("--lights", default=None, metavar="FILE|folder", help="known light directions")
+    parser.add_argument("--intensities", default=None, metavar="FILE|folder", help="known light intensities")
+    parser.add_argument("--frame", default="y-up", help="axes of the lights file: y-up, y-down, x-left, z-away")
+    parser.add_argument("--gamma", default="auto", help="linear, srgb, or an exponent (default: by kind of file)")
+    parser.add_argument("--images", action="append", default=None, metavar="PATTERN",
+                        help="files to use, in this order; one that begins with ! leaves files out")  # fmt: skip
+    parser.add_argument("--discontinuities", action="store_true", help="let the depth jump where slopes disagree")
+    parser.add_argument("--read-out", default="expectation", choices=("centre", "expectation", "peak"))
+    parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"))
+    parser.add_argument("--self-test", action="store_true",
+                        help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
+
+
+def main(args: argparse.Namespace) -> int:
+    """Check the photographs, run the method, write the results; with `--self-test` on photographs made for it."""
+    if args.self_test:
+        from pipelines.self_test import photograph_bunny
+
+        args.folder = photograph_bunny(args.out / "photographs")
+    if args.folder is None:
+        raise InputError("name a folder of photographs, or use --self-test")
+    result = infer_folder(args)
+    made = result.save(args.out)
+    page = write_page(args.out / "report.html", result)
+    if args.self_test:
+        from pipelines.self_test import compare
+
+        sys.stdout.write(compare(args.folder, result, args.out))
+    sys.stdout.write(f"{result.method}: {result.seconds:.1f} s; {', '.join(path.name for path in made)}\n{page}\n")
+    return 0
+
+
+def infer_folder(args: argparse.Namespace) -> "Inference":
+    """Read the photographs, say what was found about them, and run the method."""
+    from sdps.api import infer, load
+    from sdps.methods import RunnerConfig
+    from sdps.photos import check
+
+    photos = load(
+        args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
+        gamma=args.gamma, names=args.images,
+    )  # fmt: skip
+    findings = tuple(check(photos))
+    height, width = photos.shape
+    sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is taken for orthographic\n")
+    sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
+    config = RunnerConfig(read_out=args.read_out, precision=args.precision)
+    return infer(
+        photos, args.method, models=args.models, config=config, discontinuities=args.discontinuities, findings=findings
+    )
+
+
+def describe(findings: "Sequence[Finding]") -> str:
+    """Write the findings, one a line, the gravest first."""
+    return "".join(f"{_MARKS[finding.level]}{finding.text}{_named(finding.images)}\n" for finding in findings)
+
+
+def _named(images: Sequence[str]) -> str:
+    if not images:
+        return ""
+    more = f", and {len(images) - _MOST_LISTED} more" if len(images) > _MOST_LISTED else ""
+    return f" ({', '.join(images[:_MOST_LISTED])}{more})"
+
+
+def write_page(path: Path, result: "Inference") -> Path:
+    """Write the self-contained page of an inference."""
+    with tempfile.TemporaryDirectory() as temporary:
+        _section(result).write(Path(temporary))
+        report.render(path, [Path(temporary)], f"Photometric stereo: {result.photos.folder.resolve().name}", "")
+    return path
+
+
+def _section(result: "Inference") -> SectionWriter:
+    """Return everything the page shows."""
+    from sdps.surface.views import strip
+
+    photos, mask = result.photos, result.photos.mask
+    text = (
+        f"{len(photos)} photographs of {photos.shape[1]}x{photos.shape[0]} pixels, {photos.bits} bits, gamma "
+        f"{photos.gamma}; mask: {photos.mask_origin}, {int(mask.sum())} pixels. Method: {result.method}. Frame: "
+        "x right, y up, z to the camera; lights from the surface to the light. The camera is taken for orthographic."
+    )
+    section = Section(
+        name="photographs", title="What was found", text=text, tables=_tables(result), pictures_first=True
+    )
+    writer = SectionWriter(section)
+    lit = photos[_brightest(result)][0]
+    exposure = pictures.auto_exposure(lit[None], mask)
+    shown = pictures.tone_map(lit, exposure)
+    normals = pictures.normal_map(result.normals, mask)
+    tiles = [("a photograph", shown), (f"mask ({photos.mask_origin})", _masked(shown, mask)), ("normals", normals)]
+    tiles.append(("depth, near is bright", _depth_picture(result)))
+    if len(result.light_directions):
+        tiles.append(
+            ("lights, seen from the camera", pictures.light_intensity_plot(result.light_directions, result._gains()))
+        )
+    writer.strip("Photograph, mask, normals, depth, lights", tiles)
+    writer.strip("The surface from the left, the front and the right", [("", strip(result.depth, 360))], wide=True)
+    relit = [(name.replace("-", " "), pictures.tone_map(view)) for name, view in result.relit().items()]
+    writer.strip("Under lights of our choice (matt, with cast shadows)", relit)
+    return writer
+
+
+def _brightest(result: "Inference") -> slice:
+    """Return the slice of the photograph whose light is nearest to 35 degrees off the camera, or of the first."""
+    if not len(result.light_directions):
+        return slice(0, 1)
+    number = int(np.argmin(np.abs(result.light_directions[:, 2] - np.cos(np.radians(35.0)))))
+    return slice(number, number + 1)
+
+
+def _masked(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
+    """Tint what lies outside the mask, so that a wrong mask is seen at once."""
+    tint = np.array([255.0, 80.0, 160.0])
+    outside = 0.45 * picture.astype(np.float32) + 0.55 * tint
+    return np.where(mask[..., None], picture, outside).astype(np.uint8)
+
+
+def _depth_picture(result: "Inference") -> np.ndarray:  # (H, W, 3) uint8
+    """Return depth as grey, from the farthest (dark) to the nearest (bright) of each component, white outside."""
+    z, mask = result.depth.z, result.photos.mask
+    low, high = np.percentile(z[mask], (0.5, 99.5))
+    grey = np.clip((z - low) / max(high - low, 1e-9), 0.0, 1.0) * 225 + 15
+    return np.repeat(np.where(mask, grey, 255.0)[..., None], 3, -1).astype(np.uint8)
+
+
+def _tables(result: "Inference") -> tuple[Table, ...]:
+    """Return the checks, the figures and the lights as tables."""
+    findings = tuple((finding.level, finding.text + _named(finding.images)) for finding in result.findings)
+    notes = tuple(("note", note) for note in result.photos.notes)
+    checks = Table(title="Checks", header=("level", "what"), rows=(*findings, *notes), prose=(1,))
+    facts = result.summary()
+    rows = [("seconds", f"{facts['seconds']:.1f}"), ("parts of the surface", str(result.depth.components)),
+            ("integrability, RMS residual", f"{result.depth.residual:.2f}°")]  # fmt: skip
+    if result.residuals is not None:
+        rows.append(("photographs against Lambert's law, relative RMS", f"{result.residuals.overall:.3f}"))
+    tables = [checks, Table(title="Figures", header=("what", "value"), rows=tuple(rows))]
+    if len(result.light_directions):
+        gains = result._gains()
+        gains = gains if gains.ndim == 1 else gains.mean(1)
+        body = tuple(
+            (name, *(f"{value:.3f}" for value in direction), f"{gain / gains.mean():.3f}")
+            for name, direction, gain in zip(result.photos.files, result.light_directions, gains, strict=True)
+        )
+        header = ("photograph", "x", "y", "z", "intensity / mean")
+        tables.append(Table(title="Lights", header=header, rows=body))
+    return tuple(tables)
