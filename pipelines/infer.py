@@ -50,6 +50,8 @@ def main(args: argparse.Namespace) -> int:
         args.folder = photograph_bunny(args.out / "photographs")
     if args.folder is None:
         raise InputError("name a folder of photographs, or use --self-test")
+    if args.out.resolve() == args.folder.resolve():
+        raise InputError(f"--out {args.out}: holds the photographs; choose another folder")
     result = infer_folder(args)
     made = result.save(args.out)
     page = write_page(args.out / "report.html", result)

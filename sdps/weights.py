@@ -4,7 +4,8 @@ from importlib import resources
 from pathlib import Path
 
 from render.errors import InputError, unknown
-from sdps.models.registry import MODELS
+from sdps.classical.registry import METHODS
+from sdps.models.registry import COMBINATIONS, MODELS
 
 MODELS_FOLDER = "models"
 SHIPPED = "shipped:"
@@ -59,5 +60,5 @@ def require(name: str, out: Path | None = None) -> Path:
     plain = name.removeprefix(SHIPPED)
     if plain not in MODELS and not name.endswith(_SUFFIX):
         runs = {path.parent.name for path in (out / MODELS_FOLDER).glob(f"*/*{_SUFFIX}")} if out else set()
-        raise unknown("trained model", name, {*runs, *shipped(), *MODELS})
+        raise unknown("model or method", name, {*runs, *shipped(), *MODELS, *COMBINATIONS, *METHODS})
     raise InputError(f"{path}: no such weights; train them with `sdps train --models {plain}`")

@@ -10,7 +10,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("render", "sdps", "pipelines")
-SHARED = {f"render.{name}" for name in ("shards", "errors", "config", "files", "seeds", "manifest", "progress")}
+SHARED = {
+    f"render.{name}"
+    for name in ("shards", "errors", "config", "files", "seeds", "manifest", "progress", "exchange.tables")
+}
 MODULES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 
 

@@ -1,0 +1,83 @@
+"""Values of picture files made linear, and the curves that colour profiles state."""
+
+import struct
+from functools import cache
+
+import numpy as np
+
+SRGB_EXPONENT = 2.224
+"""log f(1/2) / log(1/2) of sRGB's decoding curve f, by which colour profiles with that curve are recognised."""
+
+_FULL = {8: 255, 16: 65535}
+
+
+def full_scale(pixels: np.ndarray) -> float:
+    """Return the largest value of the pixels' type, 1 for floating point."""
+    return 1.0 if pixels.dtype.kind == "f" else float(_FULL[8 * pixels.dtype.itemsize])
+
+
+def to_linear(pixels: np.ndarray, gamma: str | float) -> np.ndarray:
+    """Return pixels as float32 linear radiance, full scale = 1; negative and non-finite values become 0.
+
+    Args:
+        pixels: Any shape, uint8, uint16 or float32.
+        gamma: linear, srgb, or the exponent of a power curve.
+    """
+    if pixels.dtype.kind == "f":
+        return curve(np.maximum(np.nan_to_num(pixels, nan=0.0, posinf=0.0, neginf=0.0), np.float32(0.0)), gamma)
+    return _table(8 * pixels.dtype.itemsize, gamma)[pixels]
+
+
+def brightness(image: np.ndarray) -> np.ndarray:  # (..., H, W) float32
+    """Return the mean of the channels of (..., H, W, 3) float32; four times as fast as `mean`."""
+    return image @ np.full(3, 1 / 3, np.float32)
+
+
+def curve(values: np.ndarray, gamma: str | float) -> np.ndarray:
+    """Decode values, 1 = full scale, to linear ones of the same type."""
+    if gamma == "linear":
+        return values
+    if gamma == "srgb":
+        return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(values.dtype)
+    return values**gamma
+
+
+@cache
+def _table(bits: int, gamma: str | float) -> np.ndarray:
+    return curve(np.arange(_FULL[bits] + 1) / _FULL[bits], gamma).astype(np.float32)
+
+
+def profile_exponent(profile: bytes | None) -> float | None:
+    """Return log f(1/2) / log(1/2) of the red or grey curve f of an ICC profile; None where it tells none.
+
+    Reference: ICC.1:2022, 10.6 curveType and 10.18 parametricCurveType.
+    """
+    try:
+        (count,) = struct.unpack_from(">I", profile or b"", 128)
+        tags = {bytes(tag): offset for tag, offset, _ in struct.iter_unpack(">4sII", profile[132 : 132 + 12 * count])}
+        offset = tags.get(b"rTRC", tags.get(b"kTRC"))
+        kind, _, number = struct.unpack_from(">4sII", profile, offset)
+        if kind == b"curv" and number == 0:
+            return 1.0
+        if kind == b"curv" and number == 1:
+            return struct.unpack_from(">H", profile, offset + 12)[0] / 256
+        if kind == b"curv":
+            table = np.frombuffer(profile, ">u2", number, offset + 12) / 65535
+            half = float(np.interp(0.5, np.linspace(0, 1, number), table))
+        elif kind == b"para":
+            form = number >> 16
+            names = ("g", "gab", "gabc", "gabcd", "gabcdef")[form]
+            values = np.frombuffer(profile, ">i4", len(names), offset + 12) / 65536
+            half = _parametric(dict(zip(names, values.tolist(), strict=True)))
+        else:
+            return None
+        return float(np.log(half) / np.log(0.5))
+    except (struct.error, TypeError, ValueError, IndexError, KeyError):
+        return None
+
+
+def _parametric(p: dict[str, float]) -> float:
+    """Evaluate an ICC parametric curve at 1/2, which lies in the power part of all curves in use."""
+    base = p.get("a", 1.0) * 0.5 + p.get("b", 0.0)
+    shift = p.get("e", 0.0) if "e" in p else (p.get("c", 0.0) if len(p) == 4 else 0.0)
+    return base ** p["g"] + shift

@@ -1,0 +1,54 @@
+"""Which curve lies between radiance and the values of a folder's files."""
+
+from pathlib import Path
+
+from render.errors import InputError
+from sdps.photos.curves import SRGB_EXPONENT
+from sdps.photos.listing import find_light_files
+from sdps.photos.pictures import Coding
+
+_EXPONENTS = (0.3, 4.0)
+"""Exponents that are believed to be a display curve."""
+
+
+def resolve_gamma(gamma: str | float, coding: Coding, folder: Path) -> tuple[str | float, str]:
+    """Return the curve to take off (linear, srgb or an exponent) and a sentence that says why.
+
+    Raises:
+        InputError: a gamma that is none.
+    """
+    if str(gamma) != "auto":
+        applied = _given_gamma(gamma)
+        return applied, f"values are taken as {_words(applied)}, as you said"
+    if coding.floating:
+        return "linear", f"values are taken as linear, because the files are {coding}"
+    if coding.curve is not None:
+        applied = "linear" if abs(coding.curve - 1) < 0.05 else coding.curve
+        applied = "srgb" if abs(coding.curve - SRGB_EXPONENT) < 0.015 else applied
+        return applied, f"values are taken as {_words(applied)}, because the files' colour profile says so"
+    if coding.bits == 16:
+        return "linear", "values are taken as linear, because 16-bit files without colour profile mostly are"
+    listed = find_light_files(folder)
+    if coding.kind != "JPEG" and listed:
+        return "linear", f"values are taken as linear, because {listed[0]} marks a benchmark's folder"
+    return (
+        "srgb",
+        f"values are taken as sRGB, because the files are {coding}; if they are linear, say so (gamma linear)",
+    )
+
+
+def _given_gamma(gamma: str | float) -> str | float:
+    if str(gamma) in ("linear", "srgb"):
+        return str(gamma)
+    try:
+        value = float(gamma)
+    except ValueError as error:
+        raise InputError(f"gamma {gamma!r} is none of auto, linear, srgb and no exponent like 2.2") from error
+    if not _EXPONENTS[0] <= value <= _EXPONENTS[1]:
+        raise InputError(f"gamma {value:g} is no display curve; give an exponent like 2.2, linear, srgb or auto")
+    return value
+
+
+def _words(gamma: str | float) -> str:
+    """Name a curve in a sentence."""
+    return {"linear": "linear", "srgb": "sRGB"}.get(gamma) or f"raised to the power {gamma:.3g}"

@@ -1,0 +1,140 @@
+"""Which pixels belong to the object: from a mask file, or from how much each pixel changes with the light.
+
+Under a moving lamp the object changes and a dark, distant background does not, whatever steady light the room adds.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+from skimage.filters import threshold_otsu
+
+from render.errors import InputError
+from sdps.photos.curves import full_scale
+from sdps.photos.pictures import decode, turned
+
+_LARGEST = 0.9
+"""Share of the frame above which an automatic mask has found no background."""
+
+_BORDER = 0.3
+"""Share of the frame's border above which an automatic mask is not believed."""
+
+_SEPARATION = 0.68
+"""Otsu's criterion, the between-class share of the variance, under which there are no two classes.
+
+0.64 for a Gaussian histogram, and 0.73 to 0.93 on the real photographs it was tried on (DiLiGenT's ball, six objects of
+the University of Washington's set).
+"""
+
+_SMALLEST = 1e-4
+
+
+@dataclass(eq=False)
+class Variation:
+    """Mean and variance of every pixel's brightness, gathered image by image (Welford's recurrence).
+
+    Attributes:
+        mean: (H, W) float32.
+        squares: (H, W) float32, sum of squared deviations from the mean.
+        count: Images so far.
+    """
+
+    shape: tuple[int, int]
+    mean: np.ndarray = field(init=False)
+    squares: np.ndarray = field(init=False)
+    count: int = 0
+
+    def __post_init__(self) -> None:
+        self.mean, self.squares = np.zeros(self.shape, np.float32), np.zeros(self.shape, np.float32)
+
+    def add(self, grey: np.ndarray) -> None:
+        """Take in an image, (H, W) float32, finite."""
+        self.count += 1
+        before = grey - self.mean
+        self.mean += before / np.float32(self.count)
+        self.squares += before * (grey - self.mean)
+
+    def deviation(self) -> np.ndarray:
+        """Return the standard deviation over the images so far, (H, W) float32."""
+        return np.sqrt(np.maximum(self.squares, 0) / max(self.count, 1))
+
+
+def automatic_mask(variation: Variation) -> tuple[np.ndarray, str]:
+    """Separate what the lamp changes from what it does not.
+
+    Otsu's threshold on the square root of the standard deviation over the images, of which the largest connected part
+    is kept and its holes filled.
+
+    Returns:
+        The mask (H, W) bool, the whole frame where object and background cannot be told apart, and one sentence that
+        says which.
+
+    Raises:
+        InputError: nothing changes between the images.
+    """
+    changes = np.sqrt(variation.deviation())
+    if changes.max() < 1e-3:
+        raise InputError("nothing changes between the pictures; is the lamp on and moved? otherwise give a mask")
+    threshold = threshold_otsu(changes)
+    mask = _largest_part(changes > threshold)
+    doubt = _doubt(changes, mask, float(threshold))
+    if doubt:
+        return np.ones_like(mask), (
+            f"no object could be told from the background ({doubt}), so the whole frame is taken for the object; draw "
+            "a mask.png (white object on black), or photograph against black cloth"
+        )
+    return (
+        mask,
+        f"automatic mask, {mask.mean():.0%} of the frame: the largest part that changes with the light; look at it",
+    )
+
+
+def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
+    """Read a mask (H, W) bool: more than half bright, or more than half opaque where the picture has transparency.
+
+    Raises:
+        InputError: unreadable, of another size, or empty.
+    """
+    picture = decode(path)
+    pixels = picture.pixels.max(-1)
+    if picture.alpha is not None and picture.alpha.min() < picture.alpha.max():
+        pixels = picture.alpha
+    mask = turned(pixels, picture.orientation) > full_scale(pixels) / 2
+    if mask.shape != shape:
+        raise InputError(
+            f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} pixels, the pictures are {shape[1]}x{shape[0]}; draw "
+            "it on one of the pictures"
+        )
+    if not mask.any():
+        raise InputError(f"{path}: the mask is empty; paint the object white (above half brightness) on black")
+    return np.ascontiguousarray(mask)
+
+
+def border_share(mask: np.ndarray) -> float:
+    """Return which share of the frame's outermost pixels belongs to the mask (H, W)."""
+    return float(np.concatenate([mask[0], mask[-1], mask[1:-1, 0], mask[1:-1, -1]]).mean())
+
+
+def _largest_part(mask: np.ndarray) -> np.ndarray:
+    """Keep the largest 4-connected part and fill its holes."""
+    parts, count = ndimage.label(mask)
+    if count > 1:
+        mask = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
+    return ndimage.binary_fill_holes(mask)
+
+
+def _doubt(changes: np.ndarray, mask: np.ndarray, threshold: float) -> str:
+    """Say why a mask is not to be believed; empty where it is."""
+    above = changes > threshold
+    share = above.mean()
+    between = share * (1 - share) * (changes[above].mean() - changes[~above].mean()) ** 2
+    if between < _SEPARATION * changes.var():
+        return "all parts of the frame change alike"
+    if mask.mean() > _LARGEST:
+        return f"{mask.mean():.0%} of the frame change with the light"
+    if border_share(mask) > _BORDER:
+        return f"what changes with the light covers {border_share(mask):.0%} of the frame's border"
+    if mask.mean() < _SMALLEST:
+        return "only specks change with the light"
+    return ""

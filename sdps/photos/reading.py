@@ -1,0 +1,230 @@
+"""A folder of photographs as images that are read on demand, with mask and, where given, lights.
+
+Legend: L pictures of H x W pixels.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from render.errors import InputError
+from render.progress import progress_bar
+from sdps.photos.curves import brightness, to_linear
+from sdps.photos.gamma import resolve_gamma
+from sdps.photos.lights import Lights, read_intensities, read_lights
+from sdps.photos.listing import find_mask, list_pictures
+from sdps.photos.masks import Variation, automatic_mask, read_mask
+from sdps.photos.pictures import Coding, Picture, decode, turned
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """A folder of photographs; an `ImageSource` (sdps/image_source.py) that holds no pixel in memory.
+
+    `len(photos)` is L; `photos[2:5]` reads three files anew and returns (3, H, W, 3) float32, linear radiance with 1
+    for full scale (floating-point files: as they are), 0 for what is negative or not finite.
+
+    Attributes:
+        folder: Where the files are.
+        files: (L,) names below the folder: natural order, or that of names.txt, filenames.txt or `names`.
+        shape: (H, W), once turned.
+        bits: Per channel: 8 or 16, 32 of floating-point files (16 of half ones).
+        gamma: The curve that was taken off: linear, srgb, or an exponent.
+        mask: (H, W) bool, not empty; every pixel in it is finite in all pictures.
+        mask_origin: `file` or `automatic`.
+        light_directions: (L, 3) float32, unit, x right, y up, z to the camera, from the surface to the light; or None.
+        intensities: (L,) or (L, 3) float32, relative; or None.
+        notes: What was decided, in plain sentences.
+        coding: Kind and depth of the files.
+        orientation: EXIF orientation tag that all pictures were turned by.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    shape: tuple[int, int]
+    bits: int
+    gamma: str | float
+    mask: np.ndarray
+    mask_origin: str
+    light_directions: np.ndarray | None
+    intensities: np.ndarray | None
+    notes: tuple[str, ...]
+    coding: Coding
+    orientation: int
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, part: slice, /) -> np.ndarray:
+        """Read the pictures of `part`, (n, H, W, 3) float32.
+
+        Raises:
+            InputError: a file that changed or was removed since the folder was loaded.
+        """
+        numbers = range(len(self))[part]
+        images = np.empty((len(numbers), *self.shape, 3), np.float32)
+        for image, number in zip(images, numbers, strict=True):
+            picture = decode(self.folder / self.files[number])
+            pixels = turned(picture.pixels, self.orientation)
+            if pixels.shape != image.shape or picture.coding != self.coding:
+                raise InputError(f"{self.folder / self.files[number]}: changed while it was in use; start again")
+            image[:] = to_linear(pixels, self.gamma)
+        return images
+
+    @property
+    def saturation(self) -> float:
+        """Linear value from which on a pixel of integer files counts as saturated; infinite for floating point."""
+        return float("inf") if self.coding.floating else float(to_linear(np.array([253], np.uint8), self.gamma)[0])
+
+
+def load(
+    folder: str | Path,
+    *,
+    mask: str | Path | None = None,
+    lights: str | Path | None = None,
+    intensities: str | Path | None = None,
+    frame: str = "y-up",
+    gamma: str | float = "auto",
+    names: Sequence[str] | None = None,
+) -> Photographs:
+    """Look through a folder of photographs of a static object under one distant light each, seen orthographically.
+
+    Every file is decoded once, one at a time, so that a damaged one is found now. docs/capture.md describes the folder.
+
+    Args:
+        folder: PNG, TIFF, JPEG or EXR files of one kind and size, and what may lie beside them.
+        mask: A picture, bright where the object is; None for the folder's mask.* or, without one, an automatic mask.
+        lights: A lights file, or `folder` for its lights.json or light_directions.txt; None for unknown lights.
+        intensities: A file of intensities, or `folder` for its light_intensities.txt; None for those of `lights`.
+        frame: Axes of the lights file: y-up, y-down, x-left, z-away, several joined by commas.
+        gamma: linear, srgb, the exponent of a power curve, or auto by kind of file and colour profile.
+        names: Files or glob patterns to use, in this order; one that begins with `!` leaves files out.
+
+    Raises:
+        InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
+    """
+    folder = Path(folder)
+    files, notes = list_pictures(folder, names)
+    survey = _survey(folder, files, gamma, find_mask(folder) if mask is None else Path(mask))
+    directions, strengths, told = _lights(folder, files, lights, intensities, frame)
+    photos = Photographs(
+        folder=folder, files=files, shape=survey.mask.shape, bits=survey.coding.bits, gamma=survey.gamma,
+        mask=survey.mask, mask_origin=survey.origin, light_directions=directions, intensities=strengths,
+        notes=(*notes, *survey.notes, *told), coding=survey.coding, orientation=survey.orientation,
+    )  # fmt: skip
+    if photos.mask_origin == "automatic" and photos.mask.all():
+        _LOG.warning("%s", next(note for note in photos.notes if "whole frame" in note))
+    return photos
+
+
+@dataclass(frozen=True, eq=False)
+class _Survey:
+    """What one look at all files tells."""
+
+    coding: Coding
+    gamma: str | float
+    orientation: int
+    mask: np.ndarray
+    origin: str
+    notes: tuple[str, ...]
+
+
+def _survey(folder: Path, files: tuple[str, ...], gamma: str | float, mask_file: Path | None) -> _Survey:
+    """Decode every file once: all of one kind and size, finite in the mask, and the mask if it has to be found."""
+    first = decode(folder / files[0])
+    applied, why = resolve_gamma(gamma, first.coding, folder)
+    shape = turned(first.pixels, first.orientation).shape[:2]
+    given = None if mask_file is None else read_mask(mask_file, shape)
+    variation = Variation(shape)
+    broken = np.full(shape, -1, np.int32)  # the first picture with a value that is not finite
+    turns = set()
+    for number, file in enumerate(progress_bar(files, desc="photographs", unit="picture", delay=5)):
+        picture = first if number == 0 else decode(folder / file)
+        _refuse_other(folder, files[0], first, file, picture)
+        turns.add(picture.orientation)
+        pixels = turned(picture.pixels, first.orientation)
+        if picture.coding.floating:
+            broken[(broken < 0) & ~np.isfinite(pixels).all(-1)] = number
+        if given is None:
+            variation.add(brightness(to_linear(pixels, applied)))
+    notes = [why, *_orientation_note(first.orientation, turns)]
+    try:
+        mask, said = automatic_mask(variation) if given is None else (given, f"the mask is {mask_file.name}")
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from error
+    _refuse_broken(folder, files, broken, mask)
+    if (broken >= 0).any():
+        notes.append("values that are not finite lie outside the mask and were set to 0")
+    origin = "automatic" if given is None else "file"
+    return _Survey(first.coding, applied, first.orientation, mask, origin, (*notes, said))
+
+
+def _refuse_other(folder: Path, one: str, first: Picture, other: str, picture: Picture) -> None:
+    """Refuse a picture of another size or coding than the first."""
+    if picture.pixels.shape != first.pixels.shape:
+        sizes = [f"{pixels.shape[1]}x{pixels.shape[0]}" for pixels in (picture.pixels, first.pixels)]
+        raise InputError(
+            f"{folder / other}: is {sizes[0]} pixels, {one} is {sizes[1]}; all pictures must have one size and the "
+            "camera must not move"
+        )
+    if picture.coding != first.coding:
+        raise InputError(
+            f"{folder / other}: is {picture.coding}, {one} is {first.coding}; keep one kind in the folder or name the "
+            "pictures to use"
+        )
+
+
+def _refuse_broken(folder: Path, files: tuple[str, ...], broken: np.ndarray, mask: np.ndarray) -> None:
+    """Refuse values that are not finite inside the mask."""
+    inside = broken[mask]
+    bad = inside[inside >= 0]
+    if len(bad):
+        name = files[int(bad.min())]
+        raise InputError(
+            f"{folder / name}: NaN or infinite values inside the mask ({len(bad)} pixels over all pictures); write it "
+            "again or cut them out of the mask"
+        )
+
+
+def _orientation_note(first: int, turns: set[int]) -> list[str]:
+    if len(turns) > 1:
+        return [
+            "the pictures' orientation tags differ, as happens when the camera looks down; all were turned as the first"
+        ]
+    return [] if first == 1 else ["all pictures were turned upright as their orientation tag says"]
+
+
+def _lights(
+    folder: Path, files: tuple[str, ...], lights: str | Path | None, intensities: str | Path | None, frame: str
+) -> tuple[np.ndarray | None, np.ndarray | None, tuple[str, ...]]:
+    """Read directions and intensities where asked for; frame flags without lights are checked all the same."""
+    directions = strengths = None
+    notes: tuple[str, ...] = ("lights are unknown and will be estimated, where the method can",)
+    path = _beside(folder, lights, ("lights.json", "light_directions.txt"))
+    if path is not None:
+        read: Lights = read_lights(path, files, frame)
+        directions, strengths, notes = read.directions, read.intensities, read.notes
+    second = _beside(folder, intensities, ("light_intensities.txt",))
+    if second is None and path is not None and path.name == "light_directions.txt" and str(lights) == "folder":
+        second = path.with_name("light_intensities.txt") if path.with_name("light_intensities.txt").is_file() else None
+    if second is not None:
+        if strengths is not None:
+            raise InputError(f"{second}: {path.name} holds intensities as well; keep those of one file")
+        strengths = read_intensities(second, files)
+        notes = (*notes, f"intensities are those of {second.name}")
+    return directions, strengths, notes
+
+
+def _beside(folder: Path, asked: str | Path | None, known: tuple[str, ...]) -> Path | None:
+    """Resolve `folder` to the first known file of the folder."""
+    if asked is None or str(asked) != "folder":
+        return None if asked is None else Path(asked)
+    found = next((folder / name for name in known if (folder / name).is_file()), None)
+    if found is None:
+        raise InputError(f"{folder}: no {' or '.join(known)} in it; give the file's path")
+    return found
