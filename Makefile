@@ -12,6 +12,14 @@ MITSUBA ?=
 MODELS ?=
 STREAM ?=
 DATA ?=
+RUNS ?=
+DATASET ?= gourd-apple
+BITS ?=
+BEAR ?=
+METHOD ?=
+METHODS ?=
+FIGURES ?=
+PHOTOS ?=
 
 VENV := .venv
 SDPS := $(VENV)/bin/sdps
@@ -20,7 +28,7 @@ ASSETS_READY := $(VENV)/.assets-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate models study eval-classical eval-photos demo test test-slow lint bench bench-train bench-classical clean
+	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report demo test test-slow lint bench bench-train bench-classical clean
 .DEFAULT_GOAL := help
 
 help:
@@ -29,6 +37,9 @@ help:
 	@echo "make train MODELS=lcnet,nenet,sdps-plus   also STREAM=1: render while training, store nothing"
 	@echo "make study   every model of the paper on equal data and steps, then tables A and B"
 	@echo "make eval-classical | bench-classical | eval-photos DATA=folder   the methods without learning"
+	@echo "make eval-figures PRESET=...   the paper's figures; make report OUT=folder   one page of everything evaluated"
+	@echo "make eval-diligent DATA=folder [BITS=16 BEAR=76] | eval-lights DATA=folder DATASET=gourd-apple|light-stage   [RUNS=trained]"
+	@echo "make infer PHOTOS=folder [METHOD=pf14 RUNS=trained]   normals, lights, meshes and a page from photographs"
 	@echo "make data-plan | data-status | data-validate | data-preview | data-card   PRESET=... OUT=folder"
 	@echo "make regenerate   SHAPES=bunny MATERIALS=chrome,lambertian:0.5 LIGHTS=merltest OUT=folder [MITSUBA=1]"
 
@@ -71,6 +82,25 @@ eval-classical: $(ASSETS_READY)
 eval-photos: OUT = out/photos
 eval-photos: $(READY)
 	$(SDPS) eval-photos '$(DATA)' --out $(OUT)
+
+eval-diligent eval-lights: OUT = out/real
+eval-diligent: $(READY)
+	$(SDPS) eval-diligent '$(DATA)' --out $(OUT) $(if $(RUNS),--models $(RUNS)) $(if $(BITS),--bits $(BITS)) \
+		$(if $(BEAR),--bear $(BEAR))
+
+eval-lights: $(READY)
+	$(SDPS) eval-lights '$(DATA)' --dataset $(DATASET) --out $(OUT) $(if $(RUNS),--models $(RUNS))
+
+eval-figures: $(ASSETS_READY)
+	$(SDPS) eval-figures --preset $(PRESET) --out $(OUT) $(if $(FIGURES),--figures '$(FIGURES)') \
+		$(if $(METHODS),--methods '$(METHODS)') $(SETTINGS)
+
+infer: OUT = out/infer
+infer: $(READY)
+	$(SDPS) infer '$(PHOTOS)' --out $(OUT) $(if $(METHOD),--method '$(METHOD)') $(if $(RUNS),--models $(RUNS))
+
+report: $(READY)
+	$(SDPS) report $(OUT)
 
 data-plan: $(ASSETS_READY)
 	$(SDPS) data plan --preset $(PRESET) --out $(OUT) $(SETTINGS)

@@ -17,6 +17,9 @@ COMMANDS = {
     "models": ("models", "add_arguments", "main", "list the learned models"),
     "train": ("train", "add_arguments", "main", "train models, by default LCNet, then NENet"),
     "eval-merltest": ("eval_merltest", "add_arguments", "main", "render and score MERL-Test scenes"),
+    "eval-diligent": ("eval_diligent", "add_arguments", "main", "score methods on DiLiGenT's objects, by folder"),
+    "eval-lights": ("eval_lights", "add_arguments", "main", "score lighting on Gourd&Apple or the Light Stage gallery"),
+    "eval-figures": ("eval_figures", "add_arguments", "main", "make the paper's figures on MERL-Test scenes"),
     "eval-classical": ("eval_classical", "add_arguments", "main", "compare the classical methods on rendered scenes"),
     "eval-photos": (
         "eval_photos",

@@ -39,6 +39,8 @@ class TestObject:
         intensities: (L,) or (L, 3) true intensities, or None.
     """
 
+    __test__ = False  # nothing for pytest to collect
+
     name: str
     digest: str
     load: "Callable[[], ImageSource]"

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines import eval_merltest, pictures
-from pipelines.evaluation import Evaluation, TestObject
+from pipelines import eval_merltest
+from pipelines.benchmarks.suite import ERROR_LIMIT, tiles
+from pipelines.evaluation import Evaluation
 from pipelines.lit import lit_object
 from pipelines.merltest_tables import SceneScores
 from pipelines.presets import Preset
 from pipelines.sections import Section, SectionWriter, Table
 from sdps.methods import Runner
 
-ERROR_LIMIT = 45.0
 _METRICS = (("normal_mae", "normals", 2), ("direction_mae", "directions", 2), ("intensity_error", "intensities", 3))
 
 
@@ -55,8 +55,10 @@ def write(
     writer = SectionWriter(section)
     for result in choose(results, names[0], config.pictures):
         item = lit_object(result.scene, folder, config)
-        title = f"{result.scene.shape}, {result.scene.material}"
-        writer.strip(title, object_tiles(item, evaluation, runners))
+        found = {
+            runner.method.name: {item.name: evaluation.result(item, runner, keep_normals=True)} for runner in runners
+        }
+        writer.strip(f"{result.scene.shape}, {result.scene.material}", tiles(item, found, names))
     return writer.write(out)
 
 
@@ -72,32 +74,6 @@ def choose(results: Sequence[SceneScores], name: str, count: int) -> list[SceneS
 
 def _error(result: SceneScores, name: str) -> float:
     return result.scores[name].get("normal_mae", np.inf)
-
-
-def object_tiles(item: TestObject, evaluation: Evaluation, runners: Sequence[Runner]) -> list[tuple[str, object]]:
-    """Return (caption, picture) of an object: input, truth, normals and errors of the methods, lights of the first."""
-    from sdps.metrics import direction_mae, normal_error_map
-
-    images, mask = item.load(), item.mask
-    brightest = images[int(np.argmax(images[:, mask].mean((1, 2))))]
-    tiles = [("input", pictures.tone_map(brightest, pictures.auto_exposure(brightest[None], mask)))]
-    if item.normals is not None:
-        tiles.append(("true normals", pictures.normal_map(item.normals, mask)))
-    lights = []
-    for number, runner in enumerate(runners):
-        result = evaluation.result(item, runner, keep_normals=True)
-        normals = result.normals()
-        if normals is None:
-            continue
-        tiles.append((f"normals, {runner.method.name}", pictures.normal_map(normals, mask)))
-        if item.normals is not None:
-            errors = normal_error_map(normals, item.normals, mask)
-            tiles.append((f"error, {np.nanmean(errors):.1f}°", pictures.error_map(errors, ERROR_LIMIT)))
-        if number == 0 and "direction_mae" in result.scores:
-            value = direction_mae(result.light_directions, item.light_directions)
-            plot = pictures.light_plot(item.light_directions, result.light_directions)
-            lights.append((f"lights, {value:.1f}°", plot))
-    return tiles + lights
 
 
 def _per_scene(results: Sequence[SceneScores], names: Sequence[str]) -> Table:

@@ -241,23 +241,48 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
     """Return the method of an expression.
 
     Args:
-        text: A combination (`sdps`), a normal model (`nenet`), a classical method (`pf14`), or lights and normals
-            joined by a plus (`lcnet+psfcn`, `true+least-squares`); `shipped:` before a name means the shipped weights.
-            Calibrated methods are given the true lights where none are named.
+        text: A combination (`sdps`), a normal model (`nenet`), a classical method (`pf14`), a lighting model alone
+            (`lcnet`), lights and normals (`lcnet+psfcn`, `true+least-squares`), or these with a second lighting pass in
+            the middle. Calibrated methods alone are given the true lights, networks alone what they were trained on;
+            `shipped:` before a name means the shipped weights.
         find: Gives the weights file of a name, or raises InputError.
 
     Raises:
-        InputError: a name without weights, or parts that do not go together.
+        InputError: an unknown name, weights that are not there, or parts that do not go together.
     """
     parts = [part.strip() for part in text.split("+")]
     if not all(parts) or len(parts) > 3:
-        raise InputError(f"method {text!r}: write a name, lights+normals, or lights+second+normals")
-    lights = parts[0] if len(parts) > 1 else None
-    if parts == [CONSTANT]:
+        raise InputError(f"method {text!r}: want METHOD, LIGHTS+NORMALS or LIGHTS+SECOND+NORMALS")
+    if len(parts) > 1:
+        return combine(parts[0], parts[-1], parts[1] if len(parts) == 3 else None, None, find)
+    (name,) = parts
+    if name == CONSTANT:
         return Method(name="constant predictor", normals=CONSTANT)
-    if lights is None and parts[-1] in classical.METHODS and classical.METHODS[parts[-1]].calibrated:
-        lights = TRUE_LIGHTS
-    return combine(lights, parts[-1], parts[1] if len(parts) == 3 else None, None, find)
+    if name in classical.METHODS:
+        return combine(TRUE_LIGHTS if classical.METHODS[name].calibrated else None, name, None, None, find)
+    if name.removeprefix(weights.SHIPPED) in COMBINATIONS:
+        return combine(None, name, None, None, find)
+    if name == TRUE_LIGHTS:
+        raise InputError(f"method {name}: say which normals, as in true+psfcn")
+    role = MODELS[model_of(name, find)].role
+    if role == "second":
+        raise InputError(f"method {name}: a second lighting pass needs LIGHTS+{name}+NORMALS")
+    if role == "lighting":
+        find(name)
+        return Method(name=label(_stem(name), NONE), lights=name)
+    return combine(None, name, None, None, find)
+
+
+def model_of(name: str, find: Callable[[str], Path]) -> str:
+    """Return the registry model of a run or weights file.
+
+    Raises:
+        InputError: no such weights.
+    """
+    from sdps.checkpoint import load_weights
+
+    plain = name.removeprefix(weights.SHIPPED)
+    return plain if plain in MODELS else load_weights(find(name)).name
 
 
 def _stem(name: str) -> str:
@@ -268,14 +293,9 @@ def _default_lights(normals: str, find: Callable[[str], Path]) -> str:
     """Return the lights a normal model was trained on; none for methods that are told none."""
     if normals in CLASSICAL:
         return NONE
-    prefix = weights.SHIPPED if normals.startswith(weights.SHIPPED) else ""
-    name = normals.removeprefix(prefix)
-    if name not in MODELS:
-        from sdps.checkpoint import load_weights
-
-        name = load_weights(find(normals)).name
-    lights = MODELS[name].lights
-    return prefix + lights if lights not in (NONE, TRUE_LIGHTS) else lights
+    lights = MODELS[model_of(normals, find)].lights
+    shipped = normals.startswith(weights.SHIPPED) and lights not in (NONE, TRUE_LIGHTS)
+    return weights.SHIPPED + lights if shipped else lights
 
 
 def _check_classical(normals: str, lights: str, second: str | None, intensities: str | None) -> None:

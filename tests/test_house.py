@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("render", "sdps", "pipelines")
 SHARED = {
     f"render.{name}"
-    for name in ("shards", "errors", "config", "files", "seeds", "manifest", "progress", "exchange.tables")
+    for name in ("shards", "errors", "config", "files", "seeds", "manifest", "progress", "exchange.images", "exchange.tables")
 }
 MODULES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 

@@ -1,0 +1,1 @@
+"""Real benchmarks by folder: one module a benchmark, each turning files into objects to evaluate."""

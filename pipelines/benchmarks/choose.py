@@ -1,0 +1,80 @@
+"""Which methods a benchmark runs: expressions such as `lcnet+psfcn`, or everything there is."""
+
+from pathlib import Path
+
+from pipelines import methods
+from render.errors import InputError
+from sdps import weights
+from sdps.classical import registry as classical
+from sdps.methods import CONSTANT, Method, model_of, parse
+from sdps.models.registry import COMBINATIONS, MODELS
+
+SHOWN = ("least-squares, true lights", "pf14")
+"""Classical methods whose pictures are shown, if they are run."""
+
+_MOST_SHOWN = 4
+
+
+def trained(out: Path | None) -> list[str]:
+    """Return the names of the runs whose last weights lie in a folder."""
+    files = sorted((out / weights.MODELS_FOLDER).glob("*/*.safetensors")) if out is not None else []
+    return [path.stem for path in files if not path.stem.endswith("-best")]
+
+
+def lighting_rows(out: Path | None) -> list[Method]:
+    """Return a method per lighting model, trained and shipped, that tells lights alone."""
+    find = methods.finder(out)
+
+    def tells_lights(name: str) -> bool:
+        return MODELS[model_of(name, find)].role == "lighting"
+
+    names = [name for name in trained(out) if tells_lights(name)]
+    names = sorted(names, key=lambda name: (list(MODELS).index(name) if name in MODELS else len(MODELS), name))
+    kept = [name for name in (weights.SHIPPED + name for name in weights.shipped()) if tells_lights(name)]
+    return [parse(name, find) for name in [*names, *kept]]
+
+
+def classical_rows(*, calibrated: bool) -> list[Method]:
+    """Return the methods without learning, and the constant predictor."""
+    names = [name for name, entry in classical.METHODS.items() if calibrated or not entry.calibrated]
+    return [parse(name, methods.finder(None)) for name in [*names, CONSTANT]]
+
+
+def every_method(out: Path | None) -> list[Method]:
+    """Return every method there is: lighting models, all rows of normals, all classical methods."""
+    learned = methods.normal_methods(weights.shipped_folder() if out is None else out)  # nothing is trained there
+    found = [*lighting_rows(out), *learned, *classical_rows(calibrated=True)]
+    return list({method.name: method for method in found}.values())
+
+
+def selected(expressions: list[str], out: Path | None, default: list[Method]) -> list[Method]:
+    """Return the methods of `--methods`, or the default."""
+    if not expressions:
+        return default
+    return list({method.name: method for method in (parse(text, methods.finder(out)) for text in expressions)}.values())
+
+
+def shown(chosen: list[Method]) -> list[str]:
+    """Return the names of the methods whose normals are worth a picture, the main one first."""
+    giving = [method for method in chosen if method.normals and method.normals != CONSTANT]
+    if len(giving) <= _MOST_SHOWN:
+        return [method.name for method in giving]
+    pair = COMBINATIONS["sdps"].members()
+    main = [m.name for m in giving if tuple(n.removeprefix(weights.SHIPPED) for n in (m.lights, m.normals)) == pair]
+    second = [method.name for method in giving if method.second]
+    classic = [method.name for method in giving if method.name in SHOWN]
+    return [*main[-1:], *second[-1:], *classic] or [giving[0].name]
+
+
+def runs_folder(folder: Path | None) -> Path | None:
+    """Return the folder of the runs for what a user may name: it, or the `models` folder in it.
+
+    Raises:
+        InputError: no such folder, or no weights in it.
+    """
+    if folder is None:
+        return None
+    base = folder.resolve().parent if folder.resolve().name == weights.MODELS_FOLDER else folder
+    if not trained(base):
+        raise InputError(f"{folder}: no trained weights under {weights.MODELS_FOLDER}/; give the --out of `sdps train`")
+    return base

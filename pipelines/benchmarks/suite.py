@@ -1,0 +1,198 @@
+"""Running methods on a benchmark's objects, and what is written about it: results.json and the report's section."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines import pictures
+from pipelines.benchmarks import choose
+from pipelines.evaluation import Evaluation, Result, TestObject
+from pipelines.methods import finder
+from pipelines.sections import Section, SectionWriter, Table
+from pipelines.tables import render_text
+from render.errors import unknown
+from render.files import write_json
+from render.progress import progress_bar
+from sdps.methods import Method, Runner, RunnerConfig
+
+ERROR_LIMIT = 45.0
+_SHOWN_HEIGHT = 240
+_LIT_CANDIDATES = 12
+
+Found = dict[str, dict[str, Result]]
+"""Results by method, then object."""
+
+
+def run(
+    items: Sequence[TestObject],
+    chosen: Sequence[Method],
+    models: Path | None,
+    folder: Path,
+    config: RunnerConfig,
+    shown: Sequence[str],
+) -> tuple[Found, list[Runner]]:
+    """Run methods on objects, or take their results from the cache in `folder`.
+
+    Args:
+        items: The objects, whose `load` gives a `Stack`; images are read only if a method needs them.
+        chosen: The methods.
+        models: Folder of the runs, None for shipped weights only.
+        folder: Where results are kept.
+        config: How networks are used.
+        shown: Methods whose normal maps are kept for pictures.
+    """
+    runners = [Runner(method, finder(models), config) for method in chosen]
+    evaluation = Evaluation(folder)
+    found: Found = {runner.method.name: {} for runner in runners}
+    with progress_bar(None, desc="evaluate", unit="result", total=len(items) * len(runners)) as bar:
+        for item in items:
+            once = replace(item, load=cache(lambda item=item: item.load().opened()))
+            for runner in runners:
+                name = runner.method.name
+                found[name][item.name] = evaluation.result(once, runner, keep_normals=name in shown)
+                bar.update(1)
+    return found, runners
+
+
+def tiles(item: TestObject, found: Found, shown: Sequence[str]) -> list[tuple[str, Any]]:
+    """Return (caption, picture) of an object: input, true normals, each method's normals, errors and lights."""
+    from sdps.metrics import normal_error_map
+
+    mask = item.mask
+    brightest = _brightest(item)
+    exposure = pictures.auto_exposure(brightest[None], mask)
+    result: list[tuple[str, Any]] = [("input", _fit(pictures.tone_map(brightest, exposure)))]
+    if item.normals is not None:
+        result.append(("true normals", _fit(pictures.normal_map(item.normals, mask))))
+    for name in shown:
+        if item.name not in found.get(name, {}):
+            continue
+        one = found[name][item.name]
+        normals = one.normals()
+        if normals is not None:
+            result.append((f"normals, {name}", _fit(pictures.normal_map(normals, mask))))
+            if item.normals is not None:
+                errors = normal_error_map(normals, item.normals, mask)
+                text = f"{name}: error {np.nanmean(errors):.1f}°"
+                result.append((text, _fit(pictures.error_map(errors, ERROR_LIMIT))))
+        if "direction_mae" in one.scores:
+            text = f"{name}: lights, {one.scores['direction_mae']:.1f}° (circles: true)"
+            result.append((text, pictures.light_plot(item.light_directions, one.light_directions)))
+    return result
+
+
+def _brightest(item: TestObject) -> np.ndarray:  # (H, W, 3)
+    """Return the brightest of some images spread over all."""
+    images = item.load()
+    places = np.unique(np.linspace(0, len(images) - 1, _LIT_CANDIDATES).round().astype(int))
+    candidates = [images[place : place + 1][0] for place in places]
+    return max(candidates, key=lambda image: float(image[item.mask].mean()))
+
+
+def _fit(picture: np.ndarray) -> np.ndarray:
+    return pictures.fitted(picture, _SHOWN_HEIGHT) if picture.shape[0] > _SHOWN_HEIGHT else picture
+
+
+def write(
+    out: Path,
+    section: Section,
+    items: Sequence[TestObject],
+    found: Found,
+    runners: Sequence[Runner],
+    shown: Sequence[str],
+    protocol: dict[str, Any],
+) -> None:
+    """Write `<out>/<section>/results.json` and the report's section."""
+    write_json(out / section.name / "results.json", {
+        "definition": section.text,
+        "protocol": protocol,
+        "weights": {name: str(file) for runner in runners for name, file in runner.files.items()},
+        "objects": {item.name: _about(item) for item in items},
+        "methods": {
+            name: {
+                key: {"scores": one.scores, "seconds": one.seconds, "refused": one.reason} for key, one in row.items()
+            }
+            for name, row in found.items()
+        },
+        "tables": {table.title: {"header": table.header, "rows": table.rows, "published": table.published}
+                   for table in section.tables},
+    })  # fmt: skip
+    writer = SectionWriter(section)
+    for item in items:
+        writer.strip(f"{item.name}, {len(item.light_directions)} images", tiles(item, found, shown))
+    writer.write(out)
+
+
+def _about(item: TestObject) -> dict[str, Any]:
+    height, width = item.mask.shape
+    return {
+        "images": len(item.light_directions), "pixels": int(item.mask.sum()), "height": height, "width": width,
+        "digest": item.digest,
+    }  # fmt: skip
+
+
+def text_of(tables: Sequence[Table], found: Found) -> str:
+    """Lay out tables and refusals for the terminal."""
+    parts = [
+        render_text(f"\n{table.title}", list(table.header), [list(row) for row in table.rows], left=(0, 1))
+        for table in tables
+    ]
+    refused = [
+        f"{name} refused {key}: {one.reason}" for name, row in found.items() for key, one in row.items() if one.reason
+    ]
+    return "".join(parts) + ("\n" + "\n".join(refused) + "\n" if refused else "")
+
+
+def lighting_only(found: Found, chosen: Sequence[Method]) -> Found:
+    """Leave out methods whose lights are those of another that tells lights alone."""
+    alone = {(method.lights, method.read_out) for method in chosen if method.lights and not method.normals}
+    kept = [
+        method.name
+        for method in chosen
+        if not (method.normals and not method.second and (method.lights, method.read_out) in alone)
+    ]
+    return {name: found[name] for name in kept}
+
+
+def add_arguments(parser: Any, out: str) -> None:
+    """Declare the flags every benchmark has."""
+    parser.add_argument("data", type=Path, help="folder of the benchmark, see docs/benchmarks.md")
+    parser.add_argument("--methods", action="append", metavar="METHOD,LIGHTS+NORMALS,...",
+                        help="commas or repeat, e.g. pf14,sdps,lcnet+psfcn (default: all there are)")  # fmt: skip
+    parser.add_argument("--models", type=Path, metavar="DIR",
+                        help="--out of `sdps train`, whose models are evaluated (default: shipped ones)")  # fmt: skip
+    parser.add_argument("--objects", action="append", help="commas or repeat (default: all in the folder)")
+    parser.add_argument("--read-out", default="expectation", choices=("centre", "expectation", "peak"),
+                        help="how light classes become lights (the paper: centre; default: %(default)s)")  # fmt: skip
+    parser.add_argument("--out", type=Path, default=Path(out), help="output folder (default: %(default)s)")
+
+
+def pick(items: list[TestObject], names: Sequence[str]) -> list[TestObject]:
+    """Return the objects of `--objects`, or all.
+
+    Raises:
+        InputError: a name that is not there.
+    """
+    known = {item.name: item for item in items}
+    for name in names:
+        if name not in known:
+            raise unknown("object", name, known)
+    return [known[name] for name in names] if names else items
+
+
+def describe(runners: Sequence[Runner], config: RunnerConfig) -> str:
+    """Say how networks were used, where there are any."""
+    if not any(runner.estimator for runner in runners):
+        return ""
+    return f" Networks: light classes read out by {config.read_out}, {config.precision}."
+
+
+def pictured(chosen: Sequence[Method]) -> list[str]:
+    """Return the names of the methods to show, and of the first lighting model."""
+    names = choose.shown(list(chosen))
+    lights = [method.name for method in chosen if method.lights and not method.normals][:1]
+    return names or lights

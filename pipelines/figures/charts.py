@@ -1,0 +1,105 @@
+"""The look of the charts: colours that colour-blind readers and printers tell apart, names beside the lines."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")  # Okabe & Ito
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+PUBLISHED = "0.55"
+LINE_STYLES = ("-", "--", ":", "-.")
+
+
+def colour(number: int) -> str:
+    """Return the colour of the method of this number."""
+    return COLOURS[number % len(COLOURS)]
+
+
+def marker(number: int) -> str:
+    """Return the marker of the method of this number."""
+    return MARKERS[number % len(MARKERS)]
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure (inches) that fits its contents."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def short(name: str) -> str:
+    """Return a method's name as charts show it: without the members of a combination that has a name."""
+    before, bracket, _ = name.partition(" (")
+    shipped = " (shipped)"
+    return before + (shipped if bracket and name.endswith(shipped) else "")
+
+
+def tidy(axes: Axes) -> None:
+    """Take away what carries no information, and add a light grid."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y", color="0.9", lw=0.6)
+    axes.set_axisbelow(True)
+
+
+def label_ends(axes: Axes, lines: Sequence[tuple[str, float, str]], gap: float = 0.06) -> None:
+    """Write names beside the right ends of lines, moved apart where they would overlap.
+
+    Args:
+        axes: The axes, with final limits and scale.
+        lines: (name, y of the line's end, colour).
+        gap: Least distance of two names, in heights of the axes.
+    """
+    lines = [line for line in lines if np.isfinite(line[1])]
+    to_axes = axes.transData + axes.transAxes.inverted()
+    x = axes.get_xlim()[1]
+    places = [float(to_axes.transform((x, y))[1]) for _, y, _ in lines]
+    order = np.argsort(places)
+    spread = np.array(places)[order]
+    for _ in range(200):  # neighbours that are too close give way to each other in equal parts
+        lacking = np.maximum(gap - np.diff(spread), 0.0)
+        if not (lacking > 1e-4).any():
+            break
+        spread[:-1] -= lacking / 2
+        spread[1:] += lacking / 2
+    spread += max(0.0, 0.02 - spread[0]) if len(spread) else 0.0
+    for place, number in zip(spread, order, strict=True):
+        name, _, shade = lines[number]
+        moved = abs(place - places[number]) > 0.01
+        arrow = (
+            {"arrowstyle": "-", "color": shade, "lw": 0.5, "shrinkA": 1, "shrinkB": 0, "relpos": (0, 0.5)}
+            if moved
+            else None
+        )
+        axes.annotate(
+            name, (1.0, places[number]), (1.03, place), xycoords="axes fraction", textcoords="axes fraction",
+            color=shade, fontsize=8, va="center", arrowprops=arrow, annotation_clip=False,
+        )  # fmt: skip
+
+
+def light_disc(
+    axes: Axes, directions: np.ndarray, intensities: np.ndarray, truth: np.ndarray | None = None
+) -> PathCollection:
+    """Show lights as the paper does: (x, y) on the unit disc, coloured by intensity over the highest.
+
+    Args:
+        axes: Where.
+        directions: (L, 3).
+        intensities: (L,).
+        truth: (L, 3) true directions, joined to the others by thin lines.
+    """
+    axes.add_patch(Circle((0, 0), 1, fill=False, color="0.6", lw=0.8))
+    axes.plot([-1, 1], [0, 0], color="0.92", lw=0.6, zorder=0)
+    axes.plot([0, 0], [-1, 1], color="0.92", lw=0.6, zorder=0)
+    if truth is not None:
+        pairs = np.stack([truth, directions])  # (2, L, 3)
+        axes.plot(pairs[..., 0], pairs[..., 1], color="0.55", lw=0.6, zorder=1)
+    shades = intensities / max(float(intensities.max()), 1e-12)
+    points = axes.scatter(
+        directions[:, 0], directions[:, 1], c=shades, s=16, cmap="viridis", vmin=0, vmax=1, edgecolors="0.2",
+        linewidths=0.3, zorder=2,
+    )  # fmt: skip
+    axes.set(xlim=(-1.06, 1.06), ylim=(-1.06, 1.06), aspect="equal", xticks=[], yticks=[])
+    axes.axis("off")
+    return points
