@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.bench_scenes import write_scenes
+from pipelines.memory import peak_bytes
 from pipelines.tables import number
 from render.config import to_plain
 from render.errors import InputError
@@ -340,12 +341,8 @@ def peak_memory(config: BenchTrainConfig, model: str, folder: Path, way: str) ->
             step = lambda: trainer.take_step(batch, 0.5)  # noqa: E731
         for _ in range(_MEMORY_STEPS):
             step()
-    # Not getrusage, whose maximum a child inherits from the process that started it.
-    try:
-        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) / 1000 for line in lines if line.startswith("VmHWM")), None)
+    peak = peak_bytes()
+    return None if peak is None else peak / 1e6
 
 
 def _timed(action: Callable[[], object]) -> tuple[float, object]:

@@ -97,6 +97,13 @@ def glossy(
     return Scene((np.repeat(images[..., None], 3, axis=-1) * mask[..., None]), mask, normals, lights, gains)
 
 
+def glossy_shape(name: str, size: int, count: int, *, uneven: bool = False, **options: float) -> Scene:
+    """Return a glossy `sphere` or `hills` under `count` lights, of intensities from 0.2 to 2 if `uneven`."""
+    normals, mask = sphere(size) if name == "sphere" else hills(size)
+    gains = np.random.default_rng([3, 1]).uniform(0.2, 2.0, count) if uneven else None
+    return glossy(normals, mask, lights(count, 3), intensities=gains, **options)
+
+
 def sphere(size: int = 96) -> tuple[np.ndarray, np.ndarray]:
     """Return normals and mask of a sphere."""
     return sphere_normals(size, 0.9)

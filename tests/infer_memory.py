@@ -4,11 +4,11 @@ Usage: python tests/infer_memory.py PHOTOGRAPHS MODELS
 """
 
 import json
-import resource
 import sys
 import tempfile
 import time
 
+from pipelines.memory import peak_bytes
 from sdps.api import infer, load
 
 
@@ -18,7 +18,7 @@ def main(folder: str, models: str) -> None:
     result = infer(load(folder), "sdps", models=models)
     with tempfile.TemporaryDirectory() as out:
         result.save(out)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    peak = peak_bytes() / 2**30
     print(json.dumps({"peak_gib": peak, "seconds": time.perf_counter() - began}))  # noqa: T201
 
 

@@ -86,6 +86,7 @@ def test_pixels_in_shadow_fall_back_and_say_so(caplog):
     [
         ({"count": 2}, "at least 3 images"),
         ({"lights": np.array([[0, 0, 1], [0, 1, 1], [0, -1, 1], [0, 2, 1]], float)}, "coplanar"),
+        ({"lights": np.array([[0, 0, 1], [0, 1, 1], [1, -1, 1], [0, 0, 0]], float)}, r"\(0, 0, 0\)"),
         ({"mask": False}, "mask is empty"),
         ({"value": np.nan}, "NaN"),
         ({"gains": np.ones((4, 2))}, "do not fit"),

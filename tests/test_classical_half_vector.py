@@ -1,6 +1,7 @@
 """LC18: normals by half-vector symmetry, with and without known lights."""
 
 import logging
+from functools import partial
 
 import classical_scenes as scenes
 import numpy as np
@@ -14,12 +15,7 @@ from sdps.classical.plain import factorisation
 from sdps.metrics import angle_degrees
 
 SIZE = 40
-
-
-def glossy(name: str, *, count: int = 100, uneven: bool = False, **options) -> scenes.Scene:
-    normals, mask = scenes.sphere(SIZE) if name == "sphere" else scenes.hills(SIZE)
-    gains = np.random.default_rng([3, 1]).uniform(0.2, 2.0, count) if uneven else None
-    return scenes.glossy(normals, mask, scenes.lights(count, 3), intensities=gains, **options)
+glossy = partial(scenes.glossy_shape, size=SIZE, count=100)
 
 
 def profiles(scene: scenes.Scene) -> np.ndarray:

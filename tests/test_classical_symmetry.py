@@ -1,6 +1,7 @@
 """WT13 and what it stands on: the diffuse part of glossy images, and highlights that tell the bas-relief apart."""
 
 import logging
+from functools import partial
 
 import classical_scenes as scenes
 import numpy as np
@@ -16,15 +17,7 @@ from sdps.classical.separation import diffuse_factors, diffuse_surface
 from sdps.metrics import angle_degrees
 
 SIZE = 48
-
-
-def shape(name: str) -> tuple[np.ndarray, np.ndarray]:
-    return scenes.sphere(SIZE) if name == "sphere" else scenes.hills(SIZE)
-
-
-def glossy(name: str, *, count: int = 60, uneven: bool = False, seed: int = 3, **options) -> scenes.Scene:
-    gains = np.random.default_rng([seed, 1]).uniform(0.2, 2.0, count) if uneven else None
-    return scenes.glossy(*shape(name), scenes.lights(count, seed), intensities=gains, **options)
+glossy = partial(scenes.glossy_shape, size=SIZE, count=60)
 
 
 def noisy(scene: scenes.Scene) -> np.ndarray:
@@ -136,6 +129,15 @@ def test_seeded():
     scene = glossy("sphere", count=20)
     first, second = (reflectance_symmetry(scene.images, scene.mask, samples=300, seed=1) for _ in range(2))
     np.testing.assert_array_equal(first.normals, second.normals)
+
+
+def test_a_cylinder_in_shadow_is_refused():
+    x, y = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, SIZE)])
+    normals = np.stack([x, np.zeros_like(x), np.sqrt(1.0 - x**2)], axis=-1)
+    scene = scenes.lambertian(normals, (abs(x) < 0.85) & (abs(y) < 0.8), scenes.lights(40, 1))
+    for front in ("diffuse", "low-rank"):
+        with pytest.raises(InputError, match=r"fewer than three dimensions|along one direction"):
+            prepare(scene.images, scene.mask, front=front)
 
 
 def test_bad_input():

@@ -6,7 +6,7 @@ import torch
 from render.errors import InputError
 from sdps.losses import faithful_normal_loss, masked_normal_loss
 from sdps.models.base import Lights, Observations
-from sdps.models.blocks import parameter_count
+from sdps.models.blocks import conv, parameter_count
 from sdps.models.lcnet import LCNet, LightingLogits, resize_input
 from sdps.models.lighting_variants import LCNetSecond
 from sdps.models.nenet import NENet
@@ -44,6 +44,18 @@ def test_weights_are_drawn_as_kaiming_normal_with_zero_biases() -> None:
     weight = network.extractor[4][0].weight  # 3x3, 256 -> 256
     assert float(weight.detach().std()) == pytest.approx((2.0 / (9 * 256)) ** 0.5, rel=0.02)
     assert float(network.extractor[4][0].bias.detach().abs().max()) == 0.0
+
+
+def test_convolutions_leave_autocast_for_single_pixels_only() -> None:
+    layer, plain = conv(4, 8), torch.nn.Conv2d(4, 8, 3, padding=1)
+    assert layer[0].state_dict().keys() == plain.state_dict().keys()
+    plain.load_state_dict(layer[0].state_dict())
+    point, patch = torch.rand(2, 4, 1, 1), torch.rand(2, 4, 1, 2)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert layer(point.bfloat16()).dtype == torch.float32
+        assert layer(patch).dtype == conv(4, 8, kernel=1)(point).dtype == torch.bfloat16
+    for features in (point, patch):
+        torch.testing.assert_close(layer[0](features), plain(features))
 
 
 def test_unknown_names_suggest_the_nearest() -> None:

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from render.errors import InputError
 from sdps.classical.gbr import Gbr
+from sdps.classical.geometry import outward_gradient, unit_normals
 
 _log = logging.getLogger(__name__)
 
@@ -30,7 +31,7 @@ class Factors:
     Attributes:
         surface: B, (P, 3) float64: albedo times normal, up to the ambiguity.
         lights: S, (3, L) float64: intensity times direction, up to the inverse ambiguity.
-        singular: The largest singular values of the images, (min(L, 6),), over the first.
+        singular: The largest singular values, (min(L, 6),) of the images or (3,) of B S alone, over the first.
     """
 
     surface: np.ndarray
@@ -48,8 +49,7 @@ class Factors:
 
     def normals(self) -> np.ndarray:  # (P, 3)
         """Return unit vectors; (0, 0, 1) where the pseudo-normal is zero."""
-        albedo = self.albedo()
-        return np.where(albedo[:, None] > 0.0, self.surface / np.maximum(albedo, 1e-300)[:, None], [0.0, 0.0, 1.0])
+        return unit_normals(self.surface)
 
 
 def factorise(profiles: np.ndarray) -> Factors:
@@ -83,6 +83,36 @@ def factorise(profiles: np.ndarray) -> Factors:
     lights = (singular[:3, None] / scale) * basis.T
     surface = profiles @ basis / singular[:3] * scale
     return Factors(surface=surface, lights=lights, singular=relative[:6])
+
+
+def balanced(surface: np.ndarray, lights: np.ndarray) -> Factors:
+    """Return the factors of B S in which B's columns are orthogonal, of root mean square 1, and S's rows orthogonal.
+
+    Args:
+        surface: B, (P, 3).
+        lights: S, (3, L).
+
+    Raises:
+        InputError: B has fewer than three dimensions.
+    """
+    scale = column_scale(surface)
+    left, singular, right = np.linalg.svd(scale @ lights, full_matrices=False)
+    surface = surface @ np.linalg.inv(scale) @ left
+    return Factors(surface, singular[:, None] * right, singular / max(float(singular[0]), 1e-300))
+
+
+def column_scale(surface: np.ndarray) -> np.ndarray:  # (3, 3)
+    """Return R by which B (P, 3) exceeds orthogonal columns of root mean square 1: those of B R^-1.
+
+    Raises:
+        InputError: B has fewer than three dimensions.
+    """
+    scale = np.linalg.qr(surface, mode="r") / np.sqrt(len(surface))
+    if not np.linalg.cond(scale) < 1e12:
+        raise InputError(
+            "the fit has fewer than three dimensions; the object is planar or cylindrical, or lights coplanar"
+        )
+    return scale
 
 
 def impose_integrability(factors: Factors, mask: np.ndarray, *, smoothing: float = 1.0) -> Factors:
@@ -138,8 +168,7 @@ def outward_score(normals: np.ndarray, mask: np.ndarray) -> float:
 
     Contour pixels at the image's frame do not count; what lies behind them is unknown.
     """
-    soft = ndimage.gaussian_filter(np.pad(mask, 4, mode="edge").astype(float), 1.5)[4:-4, 4:-4]
-    outward = np.stack([-np.gradient(soft, axis=1), np.gradient(soft, axis=0)], axis=-1)[mask]  # (P, 2), y up
+    outward = outward_gradient(mask, 1.5)
     total = float(np.abs(outward).sum())
     return float((normals[:, :2] * outward).sum() / total) if total > 0.0 else 0.0
 

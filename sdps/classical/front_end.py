@@ -40,6 +40,10 @@ class Prepared:
         """(H, W) bool."""
         return self.observations.mask
 
+    def specular(self, pixels: np.ndarray | slice = slice(None)) -> np.ndarray:  # (P', L)
+        """Return the specular part, what exceeds the cleaned profiles, of some pixels by index, or of all."""
+        return np.maximum(self.profiles[pixels] - self.cleaned[pixels], 0.0)
+
 
 def prepare(
     images: np.ndarray,
@@ -72,13 +76,13 @@ def prepare(
     profiles = observations.grey()
     cleaned = robust_low_rank(profiles, progress=True) if front == "low-rank" else profiles
     factors = factorise(cleaned)
+    singular = factors.singular  # of the images, not of a fit
     if front == "low-rank":
-        surface, lights = fit_lit(profiles, cleaned, factors.lights, seed=seed)
-        factors = replace(factors, surface=surface, lights=lights)
+        factors = fit_lit(profiles, cleaned, factors.lights, seed=seed)
     elif front == "diffuse":
-        factors = replace(diffuse_factors(profiles, seed=seed), singular=factors.singular)  # of the images, not the fit
+        factors = diffuse_factors(profiles, seed=seed)
         cleaned = np.maximum(factors.surface.astype(np.float32) @ factors.lights.astype(np.float32), 0.0)
-    factors = impose_integrability(factors, observations.mask, smoothing=smoothing)
+    factors = impose_integrability(replace(factors, singular=singular), observations.mask, smoothing=smoothing)
     return Prepared(observations, profiles, cleaned, oriented(factors, observations.mask))
 
 

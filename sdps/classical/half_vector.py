@@ -23,7 +23,8 @@ from sdps.classical.bas_relief_search import minimise_over_bas_reliefs
 from sdps.classical.front_end import Prepared, conclude, prepare
 from sdps.classical.gbr import Gbr
 from sdps.classical.isotropy import asymmetries, asymmetry, azimuths, intensity_corrections, log_values
-from sdps.classical.observations import MEAN, Observations, observe
+from sdps.classical.least_squares import calibrate
+from sdps.classical.observations import MEAN, Observations
 from sdps.classical.plain import equal_intensity
 from sdps.classical.separation import diffuse_surface
 from sdps.estimate import Estimate
@@ -80,12 +81,14 @@ def half_vector(
         scene = _Scene(prepared.observations, prepared.profiles, found.light_directions, found.intensities)
         start, info = found.normals[scene.observations.mask], found.diagnostics
     else:
-        scene = _given_lights(observe(images, mask, minimum=_FEWEST), light_directions, intensities)
+        known = calibrate(images, mask, light_directions, intensities, weights=MEAN, minimum=_FEWEST)
+        lights = known.directions / np.linalg.norm(known.directions, axis=1, keepdims=True)
+        scene = _Scene(known.observations, known.profiles, lights, np.ones(len(lights)))
         start, info = diffuse_surface(scene.profiles, scene.lights), {}
         updates = updates if intensities is None else 0
     normals, gains, more = _normals(scene, _visible(start), samples, updates, seed)
     if intensities is not None:
-        gains = np.asarray(intensities, np.float64).reshape(len(gains), -1).mean(1)
+        gains = known.gains.mean(1)
     relative = (gains / gains.mean()).astype(np.float32)
     return Estimate(scene.observations.to_map(normals), scene.lights.astype(np.float32), relative, info | more)
 
@@ -116,25 +119,10 @@ def _normals(
     return np.where(better[:, None], carried, start), gains, info
 
 
-def _given_lights(observations: Observations, directions: np.ndarray, intensities: np.ndarray | None) -> _Scene:
-    """Check given lights, and divide the images by their intensities per channel."""
-    directions = np.asarray(directions, np.float64)
-    gains = np.ones(observations.count) if intensities is None else np.asarray(intensities, np.float64)
-    if directions.shape != (observations.count, 3) or len(gains) != observations.count:
-        raise InputError(f"{observations.count} images need as many light directions, got {directions.shape}")
-    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
-    if not (np.isfinite(directions).all() and (lengths > 0.0).all() and np.isfinite(gains).all() and (gains > 0).all()):
-        raise InputError("light directions must be finite vectors, and intensities finite and positive")
-    gains = gains.reshape(observations.count, 1, -1)
-    grey = Observations(observations.values / gains, observations.mask).grey(MEAN)
-    return _Scene(observations, grey, directions / lengths, np.ones(observations.count))
-
-
 def _find_lights(prepared: Prepared, prior: float, seed: int) -> Estimate:
     """Choose the bas-relief transformation by the asymmetry of some pixels."""
     start = equal_intensity(prepared.factors)
-    residual = np.maximum(prepared.profiles - prepared.cleaned, 0.0).sum(1)
-    glossy = np.flatnonzero(residual > 0.05 * prepared.profiles.sum(1))
+    glossy = np.flatnonzero(prepared.specular().sum(1) > 0.05 * prepared.profiles.sum(1))
     gbr, info = start, {"highlights": len(glossy) >= 30}
     if info["highlights"]:
         pixels = generator(seed, "half_vector lights").permutation(glossy)[:150]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from render.errors import InputError
+from sdps.classical.geometry import unit_normals
 from sdps.classical.observations import REC601, Observations, observe
 from sdps.estimate import Estimate
 
@@ -40,8 +41,8 @@ def least_squares(
         surface when the intensities are absolute.
 
     Raises:
-        InputError: fewer than three images, coplanar lights, an empty mask, images that are black or all alike,
-            non-finite values, or sizes that differ.
+        InputError: fewer than three images, lights that are coplanar or zero, an empty mask, images that are black or
+            all alike, non-finite values, or sizes that differ.
     """
     if not 0.0 <= shadow_threshold < 1.0:
         raise InputError(f"shadow_threshold must be in [0, 1), got {shadow_threshold}")
@@ -63,7 +64,7 @@ class Calibrated:
 
     Attributes:
         observations: The images at the object's pixels.
-        profiles: (P, L) float64, Rec. 601 grey under lights of intensity 1.
+        profiles: (P, L) float64, grey under lights of intensity 1.
         directions: (L, 3) float64, unit.
         gains: (L, 1) or (L, 3) float64, the intensities.
     """
@@ -86,10 +87,9 @@ class Calibrated:
     def conclude(self, vectors: np.ndarray, diagnostics: dict[str, Any] | None = None) -> Estimate:
         """Turn vectors (P, 3), albedo times normal, into an estimate with the given lights."""
         albedo = np.linalg.norm(vectors, axis=1)
-        unit = np.where(albedo[:, None] > 0.0, vectors / np.maximum(albedo[:, None], 1e-12), [0.0, 0.0, 1.0])
         to_map = self.observations.to_map
         return Estimate(
-            normals=to_map(unit),
+            normals=to_map(unit_normals(vectors)),
             light_directions=self.directions.astype(np.float32),
             intensities=self.gains.mean(1).astype(np.float32),
             diagnostics={"albedo": to_map(albedo)} | (diagnostics or {}),
@@ -97,10 +97,25 @@ class Calibrated:
 
 
 def calibrate(
-    images: np.ndarray, mask: np.ndarray, light_directions: np.ndarray, intensities: np.ndarray | None = None
+    images: np.ndarray,
+    mask: np.ndarray,
+    light_directions: np.ndarray,
+    intensities: np.ndarray | None = None,
+    *,
+    weights: tuple[float, float, float] = REC601,
+    minimum: int = 3,
 ) -> Calibrated:
-    """Check images and lights, and divide out the intensities; arguments and errors as in `least_squares`."""
-    observations = observe(images, mask)
+    """Check images and lights, and divide out the intensities; errors as in `least_squares`.
+
+    Args:
+        images: (L, H, W, 3) or (L, H, W), linear radiance.
+        mask: (H, W) bool.
+        light_directions: (L, 3), unit, from the surface to the light.
+        intensities: (L,) or (L, 3) known intensities; equal ones when absent.
+        weights: What R, G and B contribute to grey.
+        minimum: Fewest images the method can work with.
+    """
+    observations = observe(images, mask, minimum=minimum)
     count, channels = observations.count, observations.values.shape[-1]
     directions = np.asarray(light_directions, np.float64)
     gains = np.ones(count) if intensities is None else np.asarray(intensities, np.float64)
@@ -113,11 +128,13 @@ def calibrate(
         raise InputError("light directions or intensities hold NaN or infinite values; repair them first")
     if (gains <= 0.0).any():
         raise InputError("light intensities must be positive")
+    if not directions.any(axis=1).all():
+        raise InputError("a light direction is (0, 0, 0); give vectors from the surface to the light")
     singular = np.linalg.svd(directions, compute_uv=False)
     if singular[2] < _MIN_CONDITION * singular[0]:
-        raise InputError("the light directions are coplanar; least squares needs three that are not")
-    weights = np.array(REC601 if channels == 3 else (1.0,)) / gains  # (L, C)
-    profiles = np.einsum("lpc,lc->pl", observations.values, weights, optimize=True)
+        raise InputError("the light directions are coplanar; three that are not are needed")
+    shares = np.array(weights if channels == 3 else (1.0,)) / gains  # (L, C)
+    profiles = np.einsum("lpc,lc->pl", observations.values, shares, optimize=True)
     return Calibrated(observations, np.ascontiguousarray(profiles), directions, gains)
 
 
@@ -126,12 +143,29 @@ def solve_plain(directions: np.ndarray, profiles: np.ndarray) -> np.ndarray:  # 
     return profiles @ np.linalg.pinv(directions).T
 
 
+def normal_equations(
+    basis: np.ndarray, values: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:  # (P, 3, 3), (P, 3)
+    """Return A and a of the systems A x = a whose solutions are argmin_x sum_k w_k (v_k - x . b_k)^2, row by row.
+
+    A batch of 3x3 systems instead of a loop over ragged ones; float64, but summed in the precision of the arguments.
+
+    Args:
+        basis: (L, 3), the b_k, the same for all rows.
+        values: (P, L).
+        weights: (P, L), not negative; floating point.
+    """
+    first, second = np.triu_indices(3)  # A is symmetric
+    moments = weights @ (basis[:, first] * basis[:, second])  # (P, 6)
+    matrices = np.empty((len(values), 3, 3))
+    matrices[:, first, second] = matrices[:, second, first] = moments
+    return matrices, ((weights * values) @ basis).astype(np.float64)
+
+
 def solve_weighted(
     directions: np.ndarray, profiles: np.ndarray, weights: np.ndarray, fallback: np.ndarray
 ) -> np.ndarray:  # (P, 3)
-    """Return argmin_b sum_k w_k (i_k - b . l_k)^2 for every pixel.
-
-    Normal equations per pixel: a batch of 3x3 systems instead of a loop over ragged ones.
+    """Return argmin_b sum_k w_k (i_k - b . l_k)^2 for every pixel, from its normal equations.
 
     Args:
         directions: (L, 3).
@@ -140,9 +174,7 @@ def solve_weighted(
         fallback: (P, 3), for pixels where fewer than three observations, or coplanar ones, have weight.
     """
     weights = weights.astype(np.float64)
-    products = np.einsum("li,lj->lij", directions, directions).reshape(-1, 9)
-    matrices = (weights @ products).reshape(-1, 3, 3)
-    targets = (weights * profiles) @ directions
+    matrices, targets = normal_equations(directions, profiles, weights)
     eigenvalues = np.linalg.eigvalsh(matrices)
     solvable = ((weights > 0.0).sum(1) >= 3) & (eigenvalues[:, 0] > _MIN_CONDITION**2 * eigenvalues[:, 2])
     result = fallback.copy()

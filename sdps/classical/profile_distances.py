@@ -19,6 +19,8 @@ from scipy.sparse import csgraph, csr_matrix, linalg
 from render.errors import InputError
 from render.progress import progress_bar
 from render.seeds import generator
+from sdps.classical.geometry import outward_gradient
+from sdps.classical.least_squares import normal_equations
 from sdps.classical.observations import observe
 from sdps.classical.profile_lights import CLIP, POWER, fibonacci, find_lights
 from sdps.estimate import Estimate
@@ -116,10 +118,9 @@ def contour(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Pixels at the image's frame do not count; what lies behind them is unknown.
     """
-    soft = ndimage.gaussian_filter(np.pad(mask, 8, mode="edge").astype(float), 2.0)[8:-8, 8:-8]
     inner = ndimage.binary_erosion(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1]
     rows = np.flatnonzero((mask & ~inner)[mask])
-    outward = np.stack([-np.gradient(soft, axis=1), np.gradient(soft, axis=0)], axis=-1)[mask][rows]
+    outward = outward_gradient(mask, 2.0)[rows]
     length = np.linalg.norm(outward, axis=1)
     clear = length > 1e-3
     return rows[clear], outward[clear] / length[clear, None]
@@ -156,12 +157,10 @@ def decompose(angles: np.ndarray, start: np.ndarray | None = None, limit: int = 
     """
     cosines = np.cos(np.minimum(angles, np.pi))
     weights = (angles < _TRUSTED).astype(np.float64)
-    targets = weights * cosines
     normals = _scaled(cosines)[0] if start is None else start
     for _ in range(limit):
-        products = (normals[:, :, None] * normals[:, None, :]).reshape(-1, 9)
-        system = (weights @ products).reshape(-1, 3, 3) + 1e-6 * np.eye(3)
-        solved = np.linalg.solve(system, (targets @ normals)[..., None])[..., 0]
+        matrices, targets = normal_equations(normals, cosines, weights)
+        solved = np.linalg.solve(matrices + 1e-6 * np.eye(3), targets[..., None])[..., 0]
         moved = _unit(_unit(solved) + normals)  # half steps: all rows move at once
         change, normals = float(np.abs(moved - normals).max()), moved
         if change < 5e-4:

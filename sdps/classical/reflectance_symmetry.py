@@ -18,6 +18,7 @@ from render.seeds import generator
 from sdps.classical.bas_relief_search import minimise_over_bas_reliefs
 from sdps.classical.front_end import Front, Prepared, conclude, prepare
 from sdps.classical.gbr import Gbr
+from sdps.classical.isotropy import half_vectors
 from sdps.classical.plain import equal_intensity
 from sdps.estimate import Estimate
 
@@ -93,7 +94,7 @@ def reflectance_symmetry(
 def highlight_images(prepared: Prepared, views: int) -> tuple[float, np.ndarray]:
     """Return the specular share of all light, and the images with the strongest highlights, (<= views,) int."""
     total = np.maximum(prepared.profiles.sum(0), 1e-300)
-    residual = np.maximum(prepared.profiles - prepared.cleaned, 0.0)
+    residual = prepared.specular()
     bright = (residual > 0.2 * prepared.cleaned.mean(0)).sum(0)
     shares = np.where(bright >= _FEW, residual.sum(0) / total, 0.0)
     order = np.argsort(-shares)[:views]
@@ -103,7 +104,7 @@ def highlight_images(prepared: Prepared, views: int) -> tuple[float, np.ndarray]
 def symmetry_energy(prepared: Prepared, pixels: np.ndarray, chosen: np.ndarray, prior: float) -> Callable[[Gbr], float]:
     """Return the energy of a bas-relief transformation: 0 for round highlights, about 1 for no order at all."""
     surface, lights = prepared.factors.surface[pixels], prepared.factors.lights
-    residual = np.maximum(prepared.profiles[pixels] - prepared.cleaned[pixels], 0.0)[:, chosen]  # (P', K)
+    residual = prepared.specular(pixels)[:, chosen]  # (P', K)
 
     def energy(gbr: Gbr) -> float:
         vectors, sources = gbr.apply(surface, lights)
@@ -111,12 +112,10 @@ def symmetry_energy(prepared: Prepared, pixels: np.ndarray, chosen: np.ndarray, 
         strength = np.maximum(np.linalg.norm(sources, axis=0), 1e-12)
         if normals[:, 2].mean() < 0.0:
             return np.inf
-        directions = sources[:, chosen] / strength[chosen]
-        half = directions + np.array([[0.0], [0.0], [1.0]])
-        half /= np.maximum(np.linalg.norm(half, axis=0), 1e-6)
-        shading = normals @ directions
+        directions = (sources[:, chosen] / strength[chosen]).T  # (K, 3)
+        shading = normals @ directions.T
         lit = (shading > _LIT) & (normals[:, 2:] > _LIT)
-        disorder = _disorder(residual / np.maximum(shading, _LIT), normals @ half, lit)
+        disorder = _disorder(residual / np.maximum(shading, _LIT), normals @ half_vectors(directions).T, lit)
         return float(disorder) + prior * float(np.var(np.log(strength)))
 
     return energy

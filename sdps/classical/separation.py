@@ -11,7 +11,8 @@ import numpy as np
 
 from render.progress import progress_bar
 from render.seeds import generator
-from sdps.classical.factorisation import Factors, factorise
+from sdps.classical.factorisation import Factors, balanced, column_scale, factorise
+from sdps.classical.least_squares import normal_equations
 
 _COARSE, _FINE = 0.4, 0.02
 """Tolerance at the start and at the end, over the typical diffuse value of a pixel."""
@@ -35,6 +36,9 @@ def diffuse_factors(profiles: np.ndarray, *, samples: int = 6000, steps: int = 4
         steps: Alternations; the tolerance reaches its end after two thirds of them.
         seed: Root seed of the draw.
 
+    Returns:
+        The factors, `balanced`.
+
     Raises:
         InputError: fewer than three dimensions; see `factorise`.
     """
@@ -50,18 +54,11 @@ def diffuse_factors(profiles: np.ndarray, *, samples: int = 6000, steps: int = 4
         progress = step / (steps - 1)
         surface = _solve(values, _weights(values, surface @ lights.T, progress), lights)
         lights = _solve(values.T, _weights(values, surface @ lights.T, progress).T, surface)
-        triangle = np.linalg.qr(surface, mode="r") / np.sqrt(len(surface))
-        surface, lights = surface @ np.linalg.inv(triangle), lights @ triangle.T  # well conditioned, same product
+        scale = column_scale(surface)
+        surface, lights = surface @ np.linalg.inv(scale), lights @ scale.T  # well conditioned, same product
     if total > len(chosen):
-        return _balanced(diffuse_surface(profiles, lights * gains[:, None]), lights.T * gains)
-    return _balanced(surface * levels[:, None], lights.T * gains)
-
-
-def _balanced(surface: np.ndarray, lights: np.ndarray) -> Factors:
-    """Return B S with orthogonal columns of B, of which the pixels' root mean square is 1."""
-    triangle = np.linalg.qr(surface, mode="r") / np.sqrt(len(surface))
-    left, values, right = np.linalg.svd(triangle @ lights, full_matrices=False)
-    return Factors(surface @ np.linalg.inv(triangle) @ left, values[:, None] * right, values / max(values[0], 1e-300))
+        return balanced(diffuse_surface(profiles, lights * gains[:, None]), lights.T * gains)
+    return balanced(surface * levels[:, None], lights.T * gains)
 
 
 def diffuse_surface(profiles: np.ndarray, lights: np.ndarray, *, steps: int = 12) -> np.ndarray:  # (P, 3)
@@ -120,11 +117,7 @@ def _weights(values: np.ndarray, model: np.ndarray, progress: float) -> np.ndarr
 
 def _solve(values: np.ndarray, weights: np.ndarray, basis: np.ndarray) -> np.ndarray:  # (P, 3)
     """Solve values (P, L) ~ x (P, 3) basis^T (3, L) row by row with weights (P, L)."""
-    pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-    moments = weights @ np.stack([basis[:, i] * basis[:, j] for i, j in pairs], axis=1)  # (P, 6)
-    matrices = np.empty((len(values), 3, 3))
-    for column, (i, j) in enumerate(pairs):
-        matrices[:, i, j] = matrices[:, j, i] = moments[:, column]
+    matrices, targets = normal_equations(basis, values, weights)
     ridge = 1e-6 * np.trace(matrices, axis1=1, axis2=2) + 1e-12  # a pixel without samples gets the zero vector
     matrices += ridge[:, None, None] * np.eye(3)
-    return np.linalg.solve(matrices, ((weights * values) @ basis).astype(np.float64)[..., None])[..., 0]
+    return np.linalg.solve(matrices, targets[..., None])[..., 0]

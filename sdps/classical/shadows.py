@@ -9,6 +9,7 @@ Reddy, PAMI 1995; Wu et al., ACCV 2010, leave shadows out of their low-rank fit 
 import numpy as np
 
 from render.seeds import generator
+from sdps.classical.factorisation import Factors, balanced
 from sdps.classical.least_squares import solve_weighted
 
 _SHADOW = 0.05
@@ -20,7 +21,7 @@ _CHUNK = 16384
 
 def fit_lit(
     profiles: np.ndarray, cleaned: np.ndarray, start: np.ndarray, *, samples: int = 8000, steps: int = 60, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Factors:
     """Fit I = B S to lit observations.
 
     A shadow says only that shading is not positive there: it counts where the fit exceeds it, and not otherwise.
@@ -36,7 +37,10 @@ def fit_lit(
         seed: Root seed of the sample.
 
     Returns:
-        B, (P, 3), and S, (3, L), float64.
+        The factors, `balanced`.
+
+    Raises:
+        InputError: the lit observations have fewer than three dimensions.
     """
     peak = profiles.max(1)
     bright = np.flatnonzero(peak > 0.05 * np.median(peak))
@@ -56,15 +60,7 @@ def fit_lit(
         for _ in range(5):
             surface = data.solve(lights, surface)
         found.append(surface)
-    return _whitened(np.concatenate(found), lights.T)
-
-
-def _whitened(surface: np.ndarray, lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the factors in the basis in which the columns of B are uncorrelated and of one size."""
-    values, basis = np.linalg.eigh(surface.T @ surface / len(surface))
-    scale = np.sqrt(np.maximum(values[::-1], 1e-12 * values[-1]))
-    basis = basis[:, ::-1]
-    return surface @ basis / scale, scale[:, None] * (basis.T @ lights)
+    return balanced(np.concatenate(found), lights.T)
 
 
 class _Lit:

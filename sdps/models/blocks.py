@@ -1,13 +1,27 @@
 """The layers both networks are made of (SDPS-Net, supplement; no normalisation layer anywhere)."""
 
+import torch
 from torch import Tensor, nn
 
 SLOPE = 0.1
 
 
+class Convolution(nn.Conv2d):
+    """A convolution that ignores autocast, and keeps the precision of its weights, on a map of a single pixel.
+
+    Torch 2.13 on CPUs leaves part of the gradient of a 3x3 convolution's weights uninitialised there in bfloat16.
+    """
+
+    def forward(self, features: Tensor) -> Tensor:
+        if features.shape[-2:] != (1, 1) or self.kernel_size == (1, 1):
+            return super().forward(features)
+        with torch.autocast(features.device.type, enabled=False):
+            return super().forward(features.to(self.weight.dtype))
+
+
 def conv(inputs: int, outputs: int, *, kernel: int = 3, stride: int = 1) -> nn.Sequential:
     """Convolution with bias that keeps the size at stride 1 (halves it at 2), then leaky ReLU."""
-    return nn.Sequential(nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2), nn.LeakyReLU(SLOPE, inplace=True))
+    return nn.Sequential(Convolution(inputs, outputs, kernel, stride, kernel // 2), nn.LeakyReLU(SLOPE, inplace=True))
 
 
 def deconv(inputs: int, outputs: int) -> nn.Sequential:

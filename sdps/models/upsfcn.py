@@ -79,16 +79,7 @@ class UPSFCNLight(MaxFusionNet):
         local = self.local(seen)  # (B, Q, 128, H/2, W/2)
         fused = max_over_images(local)
         both = torch.cat([local, fused[:, None].expand_as(local)], dim=2)
-        vector = both.flatten(0, 1)
-        for layer in self.lighting:
-            # Torch 2.13 on CPUs leaves part of the weights' gradient uninitialised where a 3x3 convolution in bfloat16
-            # sees a single pixel, as it does here for crops of 32x32.
-            single = vector.shape[-2:] == (1, 1)
-            with torch.autocast(
-                vector.device.type, enabled=torch.is_autocast_enabled(vector.device.type) and not single
-            ):
-                vector = layer(vector.float() if single else vector)
-        vector = vector.mean(dim=(2, 3), keepdim=True)  # of larger images: their average
+        vector = self.lighting(both.flatten(0, 1)).mean(dim=(2, 3), keepdim=True)  # of larger images: their average
         heads = (self.azimuth, self.elevation, self.intensity)
         logits = LightingLogits(*(part(vector).flatten(1).unflatten(0, local.shape[:2]) for part in heads))
         return NormalsAndLights(self.regress(fused), logits)
