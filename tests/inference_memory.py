@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from sdps_scenes import hemisphere_lights, shade, sphere_normals
 
+from pipelines.memory import peak_bytes
 from render.config import to_plain
 from sdps.augment import Augmentation
 from sdps.checkpoint import TrainedModel
@@ -48,11 +49,11 @@ def main(count: int, normals: str, lighting: str = "", second: str = "") -> None
     estimator = Estimator(**loaded, device=torch.device("cpu"))
     source = SphereSource(count)
     began = time.perf_counter()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = peak_bytes()
     estimate = estimator.estimate(source, source.mask)
     result = {
-        "before_mib": before / 1024,
-        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "before_mib": before / 2**20,
+        "peak_mib": peak_bytes() / 2**20,
         "seconds": time.perf_counter() - began,
         "object_share": float(source.mask.mean()),
         "finite": bool(np.isfinite(estimate.normals).all()),

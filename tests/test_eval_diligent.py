@@ -81,7 +81,8 @@ def test_exact_answers_tables_and_resuming(tree, models, tmp_path, capsys, monke
     assert directions["header"][:4] == ["method", "source", "ball", "cat"]
     assert directions["header"][-2:] == ["mean of 3", "all 10"]
     ours = [row[0] for row in directions["rows"] if row[1] == "ours"]
-    assert ours == ["lcnet", "constant predictor"]  # lights of lcnet + least-squares are lcnet's; given lights have no score
+    # The lights of lcnet + least-squares are lcnet's; lights that are given have no score.
+    assert ours == ["lcnet", "constant predictor"]
     assert next(row[0] for row in normals["rows"] if row[1] == "ours") == "least-squares, true lights"
     by_name = {row[0]: dict(zip(normals["header"], row, strict=True)) for row in normals["rows"]}
     assert by_name["SDPS-Net"]["ball"] == "2.77" and by_name["SDPS-Net"]["mean of 3"] == "-"

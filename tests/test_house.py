@@ -10,10 +10,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("render", "sdps", "pipelines")
-SHARED = {
-    f"render.{name}"
-    for name in ("shards", "errors", "config", "files", "seeds", "manifest", "progress", "exchange.images", "exchange.tables")
-}
+PLAIN = ("shards", "errors", "config", "files", "seeds", "manifest", "progress", "exchange.images", "exchange.tables")
+SHARED = {f"render.{name}" for name in PLAIN}
 MODULES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 
 

@@ -400,7 +400,8 @@ def test_biased_samples_have_the_lights_of_one_side() -> None:
     biased = options(augmentation=replace(PLAIN, biased=1.0), images=8)
     means, widths = [], []
     for seed in range(50):
-        assert len(set(chosen := choose_images(directions, biased, rng(seed)))) == 8
+        chosen = choose_images(directions, biased, rng(seed))
+        assert len(set(chosen)) == 8
         centre = directions[chosen, :2].mean(0)
         means.append(np.linalg.norm(centre))
         widths.append(np.arctan2(centre[1], centre[0]))
