@@ -10,20 +10,25 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from pipelines.pictures import normal_map
+from pipelines.methods import finder
+from pipelines.pictures import auto_exposure, error_map, fitted, normal_map, tone_map
 from pipelines.psm_photos import Photos, list_objects, read_lights, read_photos, resolve_source
 from pipelines.regenerate import split_list
+from pipelines.sections import Section, SectionWriter, Table
 from pipelines.tables import render_text
 from render.errors import InputError
 from render.files import atomic_path, write_json
 from render.progress import progress_bar
 from sdps.estimate import Estimate
 from sdps.metrics import direction_mae, normal_error_map, normal_mae
+
+if TYPE_CHECKING:
+    from sdps.methods import Runner
 
 _log = logging.getLogger(__name__)
 
@@ -34,6 +39,7 @@ DEFINITION = (
     "Mean angle in degrees between a method's normals and those of calibrated photometric stereo, over mask pixels; in "
     "brackets the published figure. The last column is the mean over objects."
 )
+_HEIGHT = 240
 _LIMIT = 30.0
 """Degrees at which the colours of error maps end."""
 
@@ -77,7 +83,7 @@ class Comparison:
         return {"pixels": int(self.photos.mask.sum()), "images": len(self.photos.images), "methods": rows}
 
 
-def compare(photos: Photos, lights: np.ndarray, methods: Sequence[str], reference: str) -> Comparison:
+def compare(photos: Photos, lights: np.ndarray, runners: "Sequence[Runner]", reference: str) -> Comparison:
     """Run the reference and the methods on an object; a method that refuses the object is noted and passed over.
 
     Raises:
@@ -89,16 +95,17 @@ def compare(photos: Photos, lights: np.ndarray, methods: Sequence[str], referenc
         raise InputError(f"{photos.name}: {len(photos.images)} images but {len(lights)} lights")
     truth = registry.run(reference, photos.images, photos.mask, lights)
     estimates, failures = {}, {}
-    for name in methods:
+    for runner in runners:
+        name = runner.method.name
         try:
-            estimates[name] = registry.run(name, photos.images, photos.mask, lights)
+            estimates[name] = runner.estimate(photos.images, photos.mask, lights, None)
         except InputError as error:
             failures[name] = str(error)
             _log.warning("%s on %s: %s", name, photos.name, error)
     return Comparison(photos, truth, estimates, failures)
 
 
-def table(results: Sequence[Comparison], methods: Sequence[str], reference: str) -> str:
+def table(results: Sequence[Comparison], methods: Sequence[str], reference: str) -> Table:
     """Lay out the errors, a method a row and an object a column."""
     rows = []
     for name in methods:
@@ -106,9 +113,9 @@ def table(results: Sequence[Comparison], methods: Sequence[str], reference: str)
         known = [PUBLISHED.get(name, {}).get(result.photos.name) for result in results]
         cells = [_cell(error, figure) for error, figure in zip(errors, known, strict=True)]
         mean = float(np.mean([figure for figure in known if figure is not None])) if all(known) else None
-        rows.append([name, *cells, _cell(float(np.mean(errors)), mean)])
-    header = ["method", *(result.photos.name for result in results), "mean"]
-    return render_text(f"Normals against {reference} (degrees)", header, rows)
+        rows.append((name, *cells, _cell(float(np.mean(errors)), mean)))
+    header = ("method", *(result.photos.name for result in results), "mean")
+    return Table(title=f"Normals against {reference} (degrees)", header=header, rows=tuple(rows))
 
 
 def _cell(error: float, published: float | None) -> str:
@@ -145,11 +152,26 @@ def write_picture(result: Comparison, path: Path) -> None:
         figure.savefig(temporary, dpi=110)
 
 
+def tiles(result: Comparison) -> list[tuple[str, np.ndarray]]:
+    """Return (caption, picture) for the report: the mean image, the reference, and each method with its errors."""
+    photos = result.photos
+    mean = photos.images.mean(0)
+    shown = [("mean image", tone_map(mean, auto_exposure(mean[None], photos.mask)))]
+    shown.append(("reference, lights known", normal_map(result.reference.normals, photos.mask)))
+    for name, estimate in result.estimates.items():
+        errors = normal_error_map(estimate.normals, result.reference.normals, photos.mask)
+        shown.append((f"normals, {name}", normal_map(estimate.normals, photos.mask)))
+        shown.append((f"{name}: {result.error(name):.1f}°, to {_LIMIT:g}°", error_map(errors, _LIMIT)))
+    return [(caption, fitted(picture, min(_HEIGHT, len(picture)))) for caption, picture in shown]
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps eval-photos`."""
     parser.add_argument("folder", type=Path, help="unpacked photographs: <object>/<object>.<k>.tga and masks")
     parser.add_argument("--objects", action="append", help="commas or repeat (default: all)")
-    parser.add_argument("--methods", action="append", help="commas or repeat (default: all uncalibrated methods)")
+    parser.add_argument("--methods", action="append", metavar="METHOD,LIGHTS+NORMALS,...",
+                        help="commas or repeat (default: all uncalibrated classical methods)")  # fmt: skip
+    parser.add_argument("--models", type=Path, default=None, help="folder of trained runs (default: shipped weights)")
     parser.add_argument("--reference", default="least-squares", metavar="METHOD",
                         help="calibrated method to compare with (default: %(default)s)")  # fmt: skip
     parser.add_argument("--lights", default="auto", choices=("auto", "chrome", "file"),
@@ -160,11 +182,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Compare, print the table, and write results.json and a picture per object into the output folder."""
     from sdps.classical import registry
+    from sdps.methods import Runner, RunnerConfig, parse
 
     names = split_list(args.objects) or list_objects(args.folder)
-    methods = split_list(args.methods) or [name for name, entry in registry.METHODS.items() if not entry.calibrated]
-    for name in methods:
-        registry.method(name)
+    chosen = split_list(args.methods) or [name for name, entry in registry.METHODS.items() if not entry.calibrated]
+    find = finder(args.models)
+    runners = [Runner(parse(name, find), find, RunnerConfig()) for name in chosen]
+    methods = [runner.method.name for runner in runners]
     if not registry.method(args.reference).calibrated:
         raise InputError(f"--reference {args.reference}: finds the lights itself; choose a calibrated method")
     objects = [read_photos(args.folder, name) for name in names]
@@ -173,12 +197,19 @@ def main(args: argparse.Namespace) -> int:
     out = args.out
     results = []
     for photos in progress_bar(objects, desc="photographs", unit="object"):
-        results.append(compare(photos, lights, methods, args.reference))
+        results.append(compare(photos, lights, runners, args.reference))
         write_picture(results[-1], out / f"{photos.name}.png")
-    text = table(results, methods, args.reference)
+    compared = table(results, methods, args.reference)
+    section = Section(name="photos", title="Photographs of the University of Washington", text=DEFINITION, order=60,
+                      tables=(compared,), command=f"sdps eval-photos {args.folder} --out {out}")  # fmt: skip
+    writer = SectionWriter(section)
+    for item in results:
+        writer.strip(item.photos.name, tiles(item))
+    writer.write(out)
     write_json(out / "results.json", {
         "definition": DEFINITION, "reference": args.reference, "lights": source,
         "light_directions": lights.tolist(), "objects": {item.photos.name: item.to_json() for item in results},
     })  # fmt: skip
+    text = render_text(compared.title, list(compared.header), [list(row) for row in compared.rows])
     sys.stdout.write(f"\n{text}\n{DEFINITION}\n{out}\n")
     return 0

@@ -4,7 +4,6 @@ Usage: python tests/inference_memory.py COUNT NORMALS [LIGHTING [SECOND]]
 """
 
 import json
-import resource
 import sys
 import time
 

@@ -97,7 +97,7 @@ def test_a_method_that_refuses_is_a_dash(
     ("flags", "message"),
     [
         (["--objects", "dog"], "unknown object"),
-        (["--methods", "pf15"], "unknown classical method"),
+        (["--methods", "pf15"], "unknown model or method"),
         (["--reference", "pf14"], "choose a calibrated method"),
     ],
 )
