@@ -34,7 +34,9 @@ class Augmentation:
             highlights reach hundreds; a network that sees them learns more slowly (docs/models.md has the figures).
         intensity_range: Uniform range of the light intensity of each image; the labels of LCNet.
         noise: Full width of the uniform noise added to every pixel, background included.
-        biased: Share of the samples whose images are drawn from one half of the lights, those on one random side.
+        biased: Share of the samples whose lights are not all around: those nearest to a random direction, at most half
+            of a scene's. Real sets are often so (DiLiGenT's lights all lie within 45 degrees of the camera), and what a
+            network fuses over the images depends on which lights there are.
         symmetries: Mirror and quarter-turn scenes at random, with their normals and lights (not in the
             paper): eight views for the price of one rendering.
     """

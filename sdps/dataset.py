@@ -165,14 +165,15 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
 
 
 def choose_images(directions: np.ndarray, options: SampleOptions, rng: np.random.Generator) -> np.ndarray:  # (Q,)
-    """Draw which of a scene's images a sample has, in random order; a biased one has those of one side."""
-    share = options.augmentation.biased
+    """Draw which of a scene's images a sample has, in random order; a biased one has those around one direction."""
+    share, count = options.augmentation.biased, len(directions)
     if not share or rng.random() >= share:
-        return rng.permutation(len(directions))[: options.images]
-    angle = rng.uniform(0.0, 2.0 * np.pi)
-    reach = directions[:, :2] @ np.array([np.cos(angle), np.sin(angle)])  # (L,)
-    side = np.argsort(-reach, kind="stable")[: max(options.images, len(directions) // 2)]
-    return rng.permutation(side)[: options.images]
+        return rng.permutation(count)[: options.images]
+    radius, angle = np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * np.pi)  # uniform over the unit disc
+    centre = np.array([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius**2)])
+    nearest = np.argsort(-(directions @ centre), kind="stable")
+    kept = rng.integers(options.images, max(options.images, count // 2), endpoint=True)
+    return rng.permutation(nearest[:kept])[: options.images]
 
 
 def collate(samples: list[Batch | InputError]) -> Batch | InputError:
