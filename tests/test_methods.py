@@ -1,0 +1,158 @@
+"""Methods by expression, weights by name, and results that are kept until something they depend on changes."""
+
+from pathlib import Path
+
+import classical_scenes as scenes
+import numpy as np
+import pytest
+from sdps_scenes import hemisphere_lights
+
+from pipelines import evaluation, methods
+from pipelines.evaluation import Evaluation, TestObject
+from render.config import to_plain
+from render.errors import InputError
+from sdps import weights
+from sdps.augment import Augmentation
+from sdps.checkpoint import TrainedModel, save_weights
+from sdps.methods import Method, Runner, RunnerConfig, combine, parse
+from sdps.models.registry import create
+
+LIGHTS = hemisphere_lights(12, np.random.default_rng(0))
+
+
+def write_weights(path: Path, name: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {"config": {"augmentation": to_plain(Augmentation())}}
+    save_weights(path, TrainedModel(name, create(name).eval(), {}, metadata), half=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    for name in ("lcnet", "nenet", "psfcn"):
+        write_weights(weights.trained_file(folder, name), name)
+    return folder
+
+
+@pytest.fixture
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder that stands in for the shipped weights, with an LCNet in it."""
+    monkeypatch.setattr(weights, "shipped_folder", lambda: tmp_path / "shipped")
+    return write_weights(tmp_path / "shipped" / "lcnet.safetensors", "lcnet")
+
+
+def hills() -> TestObject:
+    """Return matte hills in a frame they do not fill."""
+    normals, mask = scenes.hills(28)
+    images = scenes.lambertian(normals, mask, LIGHTS, albedo=0.7).images
+    images, normals, mask = (np.pad(part, [(0, 0)] * lead + [(6, 6), (6, 6)] + [(0, 0)] * last)
+                             for part, lead, last in ((images, 1, 1), (normals, 0, 1), (mask, 0, 0)))  # fmt: skip
+    return TestObject("hills", "1", lambda: images, mask, normals, LIGHTS, np.ones(12))
+
+
+def test_trained_weights_come_before_shipped_ones(runs: Path, kept: Path, tmp_path: Path) -> None:
+    assert weights.require("lcnet", runs) == weights.trained_file(runs, "lcnet")
+    assert weights.require("shipped:lcnet", runs) == kept
+    assert weights.require("lcnet", tmp_path) == kept
+    assert weights.require("lcnet") == kept and weights.shipped() == ["lcnet"]
+    with pytest.raises(
+        InputError, match=r"nenet.safetensors: no such weights; train them with `sdps train --models nenet`"
+    ):
+        weights.require("shipped:nenet", runs)
+    with pytest.raises(InputError, match="unknown model or method 'lcnot'; did you mean 'lcnet'"):
+        weights.require("lcnot", runs)
+
+
+@pytest.mark.parametrize(
+    ("text", "lights", "normals", "name"),
+    [
+        ("sdps", "lcnet", "nenet", "lcnet + nenet"),
+        ("lcnet+psfcn", "lcnet", "psfcn", "lcnet + psfcn"),
+        ("psfcn", "true", "psfcn", "psfcn, true lights"),
+        ("lcnet", "lcnet", "", "lcnet"),
+        ("least-squares", "true", "least-squares", "least-squares, true lights"),
+        ("lcnet + least-squares", "lcnet", "least-squares", "lcnet + least-squares"),
+        ("pf14", "", "pf14", "pf14"),
+        ("constant", "", "constant", "constant predictor"),
+    ],
+)
+def test_expressions(runs: Path, text: str, lights: str, normals: str, name: str) -> None:
+    method = parse(text, methods.finder(runs))
+    assert (method.lights, method.normals, method.name) == (lights, normals, name)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("true", "say which normals"),
+        ("a+b+c+d", r"want METHOD, LIGHTS\+NORMALS"),
+        ("lcnet++psfcn", r"want METHOD"),
+        ("lcnet+pf14", "pf14 finds the lights itself; leave out --lights"),
+        ("lcnet+lcnet-second+nenet", "lcnet-second.*no such weights"),
+        ("lcnet-second", "needs LIGHTS.lcnet-second.NORMALS"),
+    ],
+)
+def test_expressions_that_do_not_fit(runs: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        parse(text, methods.finder(runs))
+
+
+def test_flags_that_a_classical_method_would_not_look_at(runs: Path) -> None:
+    find = methods.finder(runs)
+    with pytest.raises(InputError, match="least-squares is told the lights; give --lights"):
+        combine(None, "least-squares", None, None, find)
+    for flags in (("lcnet", None, None), (None, None, "true")):
+        with pytest.raises(InputError, match="leave out --lights, --second and --intensities"):
+            combine(flags[0], "pf14", flags[1], flags[2], find)
+    given = combine("true", "sdps-plus", None, None, lambda name: Path(name))
+    assert given.second == ""  # of lights that are given nothing is left to correct
+
+
+def test_a_lazy_source_gives_a_classical_method_what_an_array_does() -> None:
+    item = hills()
+
+    class Lazy:
+        def __len__(self) -> int:
+            return 12
+
+        def __getitem__(self, part: slice) -> np.ndarray:
+            return item.load()[part]
+
+    runner = Runner(parse("robust-least-squares", weights.require), weights.require, RunnerConfig())
+    whole = runner.estimate(item.load(), item.mask, LIGHTS, np.ones(12))
+    lazy = runner.estimate(Lazy(), item.mask, LIGHTS, np.ones(12))
+    np.testing.assert_allclose(lazy.normals, whole.normals, atol=1e-5)
+
+
+def test_results_are_kept_until_something_changes(tmp_path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    item = hills()
+    runner = Runner(parse("least-squares", weights.require), weights.require, RunnerConfig())
+    first = Evaluation(tmp_path).result(item, runner, keep_normals=True)
+    assert first.scores["normal_mae"] < 10 and first.normals().shape == (40, 40, 3)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("ran again")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Runner, "estimate", refuse)
+        again = Evaluation(tmp_path).result(item, runner)
+        assert again.scores == first.scores
+        np.testing.assert_array_equal(again.normals(), first.normals())
+        changed = TestObject("hills", "2", item.load, item.mask, item.normals, LIGHTS, np.ones(12))
+        with pytest.raises(AssertionError, match="ran again"):
+            Evaluation(tmp_path).result(changed, runner)
+    networks = [Runner(parse(text, methods.finder(runs)), methods.finder(runs), config)
+                for text, config in (("sdps", RunnerConfig()), ("sdps", RunnerConfig(read_out="centre")),
+                                     ("true+nenet", RunnerConfig()), ("lcnet+psfcn", RunnerConfig()))]  # fmt: skip
+    assert len({item.identity() for item in networks}) == 4
+
+
+def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    item = hills()
+    dark = TestObject("dark", "1", lambda: np.zeros((12, 40, 40, 3), np.float32), item.mask, item.normals, LIGHTS)
+    runner = Runner(Method(name="pf14", normals="pf14"), weights.require, RunnerConfig())
+    result = Evaluation(tmp_path).result(dark, runner)
+    assert result.scores == {} and "black inside the mask" in result.reason
+    assert Evaluation(tmp_path).result(dark, runner).reason == result.reason
+    assert evaluation._FORMAT in (tmp_path / "scores.jsonl").read_text()
