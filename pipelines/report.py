@@ -90,7 +90,11 @@ def section_html(section: Section, folder: Path, number: int) -> str:
 
 def table_html(table: Table) -> str:
     """Render one table; rows of published figures are marked by their class."""
-    styles = [' class="prose"' if number in table.prose else "" for number in range(len(table.header))]
+    columns = list(zip(*table.rows, strict=True)) or [()] * len(table.header)
+    styles = [
+        ' class="prose"' if number in table.prose else ' class="text"' if _is_text(cells) else ""
+        for number, cells in enumerate(columns)
+    ]
 
     def cells(row: Sequence[str], tag: str) -> str:
         return "".join(f"<{tag}{style}>{html.escape(cell)}</{tag}>" for style, cell in zip(styles, row, strict=True))
@@ -107,6 +111,11 @@ def table_html(table: Table) -> str:
         f'<div class="wide{long}"><table><caption>{caption}</caption><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>{note}"
     )
+
+
+def _is_text(cells: Sequence[str]) -> bool:
+    """Return whether a column holds words rather than figures, and is set flush left."""
+    return any(cell[:1].isalpha() for cell in cells) and not any(cell[:1].isdigit() for cell in cells)
 
 
 def strip_html(strip: Strip, folder: Path) -> str:

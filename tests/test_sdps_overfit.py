@@ -89,7 +89,7 @@ def test_a_handful_of_scenes_is_learned(name: str, role: str, tmp_path: Path) ->
 def test_a_pair_is_learned_together(tmp_path: Path) -> None:
     write_data(tmp_path, ("train",) * 3, lights=6, size=128)
     settings = COMMON | {"batch_scenes": 3, "images": 6, "crop": 32, "learning_rate": 1.5e-3, "clip_gradient": 1.0}
-    config = build(JointTraining, settings | {"steps": 700, "precision": "bfloat16", "min_object": 0.5})
+    config = build(JointTraining, settings | {"steps": 1400, "precision": "bfloat16", "min_object": 0.5})
     torch.manual_seed(0)
     options = lighting_options("lcnet", recipes.run("lcnet", {}, {}).config)
     stage = create_stage(
