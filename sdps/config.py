@@ -33,7 +33,7 @@ class TrainingConfig:
         cooldown: See `schedule`.
         halve_after: Epochs after which `halving` halves; scaled with the budget when it is not `epochs`.
         warmup: Share of the budget over which the learning rate rises linearly from zero.
-        optimiser: `adam` or `adamw`; betas 0.9 and 0.999.
+        optimiser: `adam` or `adamw`, betas 0.9 and 0.999; or `muon` (`sdps.muon`), with AdamW for what is no matrix.
         weight_decay: Weight decay (0 in the paper: its 4e-4 is parsed but never used).
         clip_gradient: Largest gradient norm; 0 leaves gradients alone.
         ema: Decay of an exponential moving average of the weights, which is then validated and saved (0: none).
@@ -65,7 +65,7 @@ class TrainingConfig:
     halve_after: tuple[float, ...] = (5.0, 10.0, 15.0)
     cooldown: float = 0.2
     warmup: float = 0.0
-    optimiser: Literal["adam", "adamw"] = "adam"
+    optimiser: Literal["adam", "adamw", "muon"] = "adam"
     weight_decay: float = 0.0
     clip_gradient: float = 0.0
     ema: float = 0.0

@@ -25,10 +25,12 @@ from render.errors import InputError
 from render.manifest import read_manifest
 from render.progress import progress_bar
 from sdps.checkpoint import TrainedModel, code_version, load_state, save_state, save_weights
+from sdps.config import TrainingConfig
 from sdps.dataset import Batch, SampleKey, SceneDataset, collate
 from sdps.distributed import Team, team
 from sdps.interrupts import StopRequest, stop_on_signal
 from sdps.loggers import JsonlLogger, Logger, Meter, TensorBoardLogger
+from sdps.muon import Muon
 from sdps.sources import BatchSource, StoredScenes
 from sdps.stages import Stage
 
@@ -194,10 +196,7 @@ class Trainer:
         self.validation = None
         if config.validation_scenes and here.leads and any(scene.split == "val" for scene in read_manifest(data)):
             self.validation = SceneDataset(data, "val", stage.validation_options(), **options)
-        kind = torch.optim.Adam if config.optimiser == "adam" else torch.optim.AdamW
-        self.optimiser = kind(
-            stage.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
-        )
+        self.optimiser = _optimiser(stage.network, config)
         average = get_ema_multi_avg_fn(config.ema)
         self.average = AveragedModel(stage.network, multi_avg_fn=average) if config.ema else None
         if config.compile:
@@ -364,6 +363,15 @@ class Trainer:
         names = [part.name for part in self.stage.parts(self.stage.network)]
         weights = None if interrupted else {name: self.folder / f"{name}.safetensors" for name in names}
         return TrainingResult(weights, self.step, self.seconds(), metrics, waiting_share, interrupted)
+
+
+def _optimiser(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer | Muon:
+    """Return the optimiser that a configuration names."""
+    options = {"lr": config.learning_rate, "weight_decay": config.weight_decay}
+    if config.optimiser == "muon":
+        return Muon(network, **options)
+    kind = torch.optim.Adam if config.optimiser == "adam" else torch.optim.AdamW
+    return kind(network.parameters(), **options, fused=True)
 
 
 def _parts(batch: Batch, count: int) -> list[Batch]:

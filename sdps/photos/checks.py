@@ -20,7 +20,6 @@ _BLACK, _DARK = 0.01, 0.05
 _SAME, _ALIKE = 0.02, 0.1
 _LINE = 0.25
 _CONE = np.cos(np.radians(15.0))
-_CAST = 0.12
 _SMALL_MASK, _LARGE_MASK = 1000, 4_000_000
 
 
@@ -176,21 +175,13 @@ def _duplicates(photos: Photographs, measures: Measures) -> Iterator[Finding]:
 
 
 def _colour(photos: Photographs, measures: Measures) -> Iterator[Finding]:
-    colours = measures.colours
-    if photos.intensities is not None and photos.intensities.ndim == 2:
-        colours = colours / (photos.intensities / photos.intensities.mean(1, keepdims=True))
-    known = np.isfinite(colours).all(1)
-    if known.sum() < 2:
-        return
-    typical = np.maximum(np.median(colours[known], axis=0), 0.05)
-    off = np.abs(colours / typical - 1).max(1)
-    cast = known & (off > _CAST)
+    cast = measures.casts > 0
     if cast.any():
         names = _named(photos, cast)
         yield Finding(
             "warning",
-            f"The colour changes by up to {off[cast].max():.0%} in {_pictures(names)}. Lock the white balance, use "
-            "one lamp only, and keep daylight out.",
+            f"The colour changes by up to {measures.casts.max():.0%} in {_pictures(names)}. Lock the white balance, "
+            "use one lamp only, and keep daylight out.",
             names,
         )
 

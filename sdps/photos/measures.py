@@ -12,12 +12,13 @@ from PIL import Image
 
 from render.errors import InputError
 from render.progress import progress_bar
+from sdps.photos.colours import colour_casts
 from sdps.photos.curves import brightness
-from sdps.photos.motion import START, Shift, Tracker
+from sdps.photos.motion import Shift, Tracker, second_look
 from sdps.photos.reading import Photographs
 
 _PIXELS = 2048
-_FEW = 20
+_COLOUR_PIXELS = 512
 _EXPOSURE = {33434: "exposure time", 33437: "aperture", 34855: "ISO", 37386: "focal length"}
 _EXIF = 0x8769
 
@@ -31,7 +32,7 @@ class Measures:
         levels: (L,) 95th percentile of the brightness.
         outside: Mean brightness outside the mask over that inside; 0 where the mask is the frame.
         saturated: (L,) share of the pixels with a channel at full scale.
-        colours: (L, 3) colour of the light, see `light_colours`.
+        casts: (L,) change of the light's colour, see `colour_casts`.
         digests: (L,) of the brightness of all pixels.
         settings: (L,) what the camera wrote about its exposure, by name.
         shifts: (L,) against the other images; of zero length unless the image moved.
@@ -41,7 +42,7 @@ class Measures:
     levels: np.ndarray
     outside: float
     saturated: np.ndarray
-    colours: np.ndarray
+    casts: np.ndarray
     digests: list[bytes]
     settings: list[dict[str, float]]
     shifts: list[Shift]
@@ -73,41 +74,26 @@ def measure(photos: Photographs) -> Measures:
         if len(pixels) < grey.size:
             rest = (grey.sum(dtype=np.float64) - bright.sum(dtype=np.float64)) / (grey.size - len(pixels))
             outside[number] = rest / max(float(bright.mean()), 1e-6)
+
+    def again(number: int) -> np.ndarray:
+        return brightness(photos[number : number + 1][0])
+
     return Measures(
         observations, levels, float(np.median(outside)), saturated,
-        light_colours(observations, photos.saturation), digests, settings,
-        _second_look(photos, tracker, shifts),
+        _casts(photos, observations), digests, settings, second_look(tracker, shifts, again),
     )  # fmt: skip
 
 
-def _second_look(photos: Photographs, tracker: Tracker, shifts: list[Shift]) -> list[Shift]:
-    """Measure suspects again against all others, and the first images, which had little to be compared with."""
-    final = list(shifts)
-    for number, shift in enumerate(shifts):
-        if number < START or shift.length:
-            again = tracker.compare(brightness(photos[number : number + 1][0]), shift)
-            final[number] = again if tracker.moved(again) else Shift()
-    return final
-
-
-def light_colours(observations: np.ndarray, saturation: float) -> np.ndarray:
-    """Compare every image's colours with those of the same pixels in all images.
-
-    Not the images' mean colours: those change when light falls on differently painted parts.
-
-    Returns:
-        (L, 3), mean 1 for white; median over the pixels that are bright and not saturated, NaN where there are few.
-    """
-    mean = np.maximum(observations.sum(0), 1e-6)
-    own = mean / mean.mean(-1, keepdims=True)  # (P, 3), the paint's colour
-    colours = np.full((len(observations), 3), np.nan)
-    for colour, image in zip(colours, observations, strict=True):
-        grey = image.mean(-1)
-        good = (grey > 0.3 * np.percentile(grey, 95)) & (grey > 1e-3) & (image < saturation).all(-1)
-        if good.sum() >= _FEW:
-            colour[:] = np.median(image[good] / (grey[good, None] * own[good]), axis=0)
-            colour /= colour.mean()
-    return colours
+def _casts(photos: Photographs, observations: np.ndarray) -> np.ndarray:  # (L,)
+    """Find changes of colour that the given intensities do not explain, on a few hundred pixels."""
+    some = observations[:, :: max(1, observations.shape[1] // _COLOUR_PIXELS)]
+    saturation = photos.saturation
+    if photos.intensities is not None and photos.intensities.ndim == 2:
+        gains = photos.intensities / photos.intensities.mean(1, keepdims=True)
+        full = (some >= saturation).any(-1, keepdims=True)
+        some = np.where(full, np.inf, some / gains[:, None]).astype(np.float32)
+        some[full[..., 0]] = saturation
+    return colour_casts(some, saturation)
 
 
 def spread(observations: np.ndarray) -> np.ndarray:

@@ -1,24 +1,36 @@
 """Did the camera or the object move between photographs? Told from edges that no light can move.
 
-Outlines and paint have their edges in the same place, with the same sign, under every light; edges of shading and
-shadows wander with it. So every image's field of edge directions is laid over the sum of the fields before it, in which
-the former add up and the latter do not (after the orientation correlation of Fitch, Kadyrov, Christmas, Kittler 2002).
+Outlines and paint have their edges in the same place, with the same sign, under every light; edges of shading, shadows
+and highlights wander with it. So every image's field of edge directions is laid over the sum of the fields of the
+others, in which the former add up and the latter do not (after the orientation correlation of Fitch, Kadyrov, Christmas,
+Kittler 2002), and the places where the others disagree count little.
+
+Highlights have sharp edges as well, and may fit the outline at some shift. So the silhouette must agree: an object that
+moved is lit where the others show background, and shows background where it was. An image that is dark there tells
+nothing and passes, unless it lies where another surely does. Without a dark background there is no silhouette, and the edges decide alone.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy import fft
+from scipy import fft, ndimage
 
 START = 6
 """Images at the beginning that are taken to lie still: fewer, of opposite lights, may have no edge in common."""
 
 LEAD = 0.08
-"""Least lead in fit by which a shift is believed; static scenes without hard shadows on the ground stay under 0.02."""
+"""Least lead in fit by which a shift is believed."""
 
 FIT = 0.22
-"""Least correlation with the other images by which a shift is believed."""
+"""Least correlation with the other images by which a shift is believed without a silhouette."""
+
+FIT_WITH_OUTLINE = 0.1
+"""The same where the silhouette agrees."""
+
+LIT_AHEAD, LIT_BEHIND = 0.1, 0.05
+"""Least share of the pixels newly covered that is lit, and largest share of those uncovered, if the object moved."""
 
 STEP = 1.9
 """Least shift that is believed, in pixels of the reduced window."""
@@ -28,6 +40,10 @@ _MARGIN = 0.15  # of the object's size, kept around it for its outline
 _REACH = 0.15  # longest shift looked for, as a part of the window's side
 _STEEP = 0.4  # step of log brightness per pixel at which an edge counts half
 _FLOOR = 0.05  # of the bright parts' level; what is darker hardly counts
+_AGREEMENT = 4  # power of the agreement between the images by which an edge counts
+_LIT = 0.02  # of the bright parts' level, above the background: a pixel is lit
+_COVERED = 0.05  # share of the images that light a pixel of the object at least
+_FULL = 0.85  # share of the window that a silhouette may cover
 
 
 @dataclass(frozen=True)
@@ -38,12 +54,16 @@ class Shift:
         rows, columns: In pixels of the photographs, positive down and to the right.
         lead: How much better the edges fit there than unmoved, as a part of the fit there.
         fit: Correlation of the edges with those of the others, at most 1.
+        ahead: Share of the background that the shifted silhouette covers which is lit; NaN without silhouette.
+        behind: Share of the object that the shifted silhouette uncovers which is lit; NaN without silhouette.
     """
 
     rows: float = 0.0
     columns: float = 0.0
     lead: float = 0.0
     fit: float = 0.0
+    ahead: float = np.nan
+    behind: float = np.nan
 
     @property
     def length(self) -> float:
@@ -51,10 +71,23 @@ class Shift:
         return float(np.hypot(self.rows, self.columns))
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the tracker sees of an image, in the reduced window of h x w pixels.
+
+    Attributes:
+        edges: (h, w) complex64, right + i down, towards the brighter side, shorter than 1 where the edge is faint.
+        lit: (h, w) bool, brighter than the background.
+    """
+
+    edges: np.ndarray
+    lit: np.ndarray
+
+
 class Tracker:
     """Follows the edges of the object through a series of images.
 
-    Its memory does not depend on their number: one spectrum of the reduced window.
+    Its memory does not depend on their number: three fields of the reduced window.
 
     Args:
         mask: (H, W) bool, where the object is.
@@ -73,63 +106,134 @@ class Tracker:
         self._reach = [max(2, round(_REACH * side)) for side in self._size]
         # Room for the longest shift, or what leaves at one side would come back in at the other.
         self._padded = [fft.next_fast_len(a + b) for a, b in zip(self._size, self._reach, strict=True)]
-        self._sum = np.zeros(self._padded, np.complex64)
+        self._edges = np.zeros(self._size, np.complex64)  # sums over the images, each where it lies
+        self._strength = np.zeros(self._size, np.float32)
+        self._lit = np.zeros(self._size, np.int32)
         self._count = 0
+
+    def __len__(self) -> int:
+        """Return how many images were taken in."""
+        return self._count
 
     def add(self, grey: np.ndarray) -> Shift:
         """Measure an image (H, W) float32 against those before, and take it in where it lies."""
-        spectrum = self._spectrum(grey)
-        shift = self._compare(spectrum, self._sum)
-        if self._count < START or not self.moved(shift):
+        view = self.view(grey)
+        shift = self.compare(view) if self._count >= START else Shift()
+        if not self.moved(shift):
             shift = Shift()
-        self._sum += self._at(spectrum, shift)
-        self._count += 1
+        self.take(view, shift)
         return shift
 
-    def compare(self, grey: np.ndarray, before: Shift) -> Shift:
-        """Measure an image that `add` took in with the shift `before` against all others."""
-        spectrum = self._spectrum(grey)
-        return self._compare(spectrum, self._sum - self._at(spectrum, before))
-
-    def moved(self, shift: Shift) -> bool:
-        """Whether a shift is longer and surer than what changing light alone brings about."""
-        return shift.length >= STEP * self._scale and shift.lead >= LEAD and shift.fit >= FIT
-
-    def _spectrum(self, grey: np.ndarray) -> np.ndarray:
-        """Transform the field of edge directions, whose vectors are shorter than 1 where the edge is faint."""
+    def view(self, grey: np.ndarray) -> View:
+        """Reduce an image (H, W) float32 to its edges and its lit part."""
         part = cv2.resize(grey[self._window], self._size[::-1], interpolation=cv2.INTER_AREA)
         part = cv2.GaussianBlur(part, (0, 0), 0.8)
+        level = float(np.percentile(part, 99)) + 1e-6
         # The logarithm makes paint's edges equally steep in bright and in dim light.
-        bright = np.log(part / (np.percentile(part, 99) + 1e-6) + _FLOOR)
-        down, right = np.gradient(bright)
+        down, right = np.gradient(np.log(part / level + _FLOOR))
         edges = right + 1j * down
         edges /= np.abs(edges) + _STEEP
         edges[[0, -1]] = edges[:, [0, -1]] = 0
-        return fft.fft2(edges.astype(np.complex64), self._padded)
+        rim = np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]])
+        ground = float(np.median(rim))
+        noise = 1.48 * float(np.median(np.abs(rim - ground)))
+        return View(edges.astype(np.complex64), part > ground + max(_LIT * level, 6 * noise))
 
-    def _at(self, spectrum: np.ndarray, shift: Shift) -> np.ndarray:
-        """Move a field back by a shift."""
-        if not shift.length:
-            return spectrum
-        rows, columns = (
-            np.exp(2j * np.pi * fft.fftfreq(side) * step / self._scale).astype(np.complex64)
-            for side, step in zip(self._padded, (shift.rows, shift.columns), strict=True)
-        )
-        return spectrum * rows[:, None] * columns
+    def take(self, view: View, shift: Shift, sign: int = 1) -> None:
+        """Add an image's view, moved back by its shift, to those of the others; with `sign` -1, take it out again."""
+        edges, lit = (_moved(field, *self._steps(shift, -1)) for field in (view.edges, view.lit))
+        self._edges += sign * edges
+        self._strength += sign * np.abs(edges)
+        self._lit += sign * lit.astype(np.int32)
+        self._count += sign
 
-    def _compare(self, spectrum: np.ndarray, reference: np.ndarray) -> Shift:
-        """Find where two fields agree best, to a pixel of the window, and how much better than within one pixel."""
-        fit = fft.ifft2(spectrum * reference.conj()).real
+    def compare(self, view: View) -> Shift:
+        """Find where a view that is not taken in agrees best with those that are, to a pixel of the window."""
+        agreement = np.abs(self._edges) / (self._strength + 0.02 * max(self._count, 1))
+        reference = self._edges * agreement**_AGREEMENT
+        product = fft.fft2(view.edges, self._padded) * fft.fft2(reference, self._padded).conj()
         down, right = self._reach
-        near = np.roll(fit, (down, right), (0, 1))[: 2 * down + 1, : 2 * right + 1]
+        near = np.roll(fft.ifft2(product).real, (down, right), (0, 1))[: 2 * down + 1, : 2 * right + 1]
         best = float(near.max())
         if best <= 0:
             return Shift()
         place = np.unravel_index(int(near.argmax()), near.shape)
         still = float(near[down - 1 : down + 2, right - 1 : right + 2].max())
+        steps = int(place[0]) - down, int(place[1]) - right
         return Shift(
-            float(place[0] - down) * self._scale,
-            float(place[1] - right) * self._scale,
+            steps[0] * self._scale,
+            steps[1] * self._scale,
             (best - still) / best,
-            best * fit.size / float(np.linalg.norm(spectrum) * np.linalg.norm(reference)),
+            best / float(np.linalg.norm(view.edges) * np.linalg.norm(reference)),
+            *self._silhouette(view.lit, *steps),
         )
+
+    def suspicious(self, shift: Shift) -> bool:
+        """Whether the edges alone speak for a shift."""
+        return shift.length >= STEP * self._scale and shift.lead >= LEAD and shift.fit >= FIT_WITH_OUTLINE
+
+    def moved(self, shift: Shift) -> bool:
+        """Whether a shift is longer and surer than what changing light alone brings about."""
+        if np.isnan(shift.ahead):
+            return self.suspicious(shift) and shift.fit >= FIT
+        return self.suspicious(shift) and shift.ahead >= LIT_AHEAD and shift.behind <= LIT_BEHIND
+
+    def alike(self, shift: Shift, sure: Shift) -> bool:
+        """Whether a shift is one that was believed, or the same movement seen with its front side in the dark."""
+        apart = np.hypot(shift.rows - sure.rows, shift.columns - sure.columns)
+        return shift == sure or (self.suspicious(shift) and apart < STEP * self._scale and shift.behind <= LIT_BEHIND)
+
+    def _silhouette(self, lit: np.ndarray, rows: int, columns: int) -> tuple[float, float]:
+        """Return which share is lit of what a shifted silhouette newly covers and of what it uncovers."""
+        outline = self._lit >= max(2, _COVERED * self._count)
+        if not 0 < outline.mean() < _FULL:
+            return np.nan, np.nan
+        shifted = _moved(outline, rows, columns)
+        covered = shifted & ~ndimage.binary_dilation(outline)
+        uncovered = outline & ~ndimage.binary_dilation(shifted)
+        return tuple(float(lit[part].mean()) if part.any() else 0.0 for part in (covered, uncovered))
+
+    def _steps(self, shift: Shift, sign: int) -> tuple[int, int]:
+        """Return a shift in pixels of the window."""
+        return sign * round(shift.rows / self._scale), sign * round(shift.columns / self._scale)
+
+
+def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np.ndarray]) -> list[Shift]:
+    """Measure suspects again, and the first images, which had little to be compared with.
+
+    All that still look moved are taken out first, then each is measured against the rest: images that moved together
+    would speak for each other.
+
+    Args:
+        tracker: Has taken in all images.
+        shifts: What `add` returned for each.
+        image: Returns the brightness (H, W) of the image of a number, once or twice.
+
+    Returns:
+        A shift per image, of zero length unless it moved.
+    """
+    apart = []
+    for number, shift in enumerate(shifts):
+        if (number < START or shift.length) and len(tracker) > START:
+            view = tracker.view(image(number))
+            tracker.take(view, shift, -1)
+            if tracker.suspicious(tracker.compare(view)):
+                apart.append(number)
+            else:
+                tracker.take(view, Shift())
+    again = {number: tracker.compare(tracker.view(image(number))) for number in apart}
+    sure = [shift for shift in again.values() if tracker.moved(shift)]
+    believed = {number: shift for number, shift in again.items() if any(tracker.alike(shift, one) for one in sure)}
+    return [believed.get(number, Shift()) for number in range(len(shifts))]
+
+
+def _moved(field: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Move a field (h, w) down and to the right, zero where nothing came from."""
+    if not rows and not columns:
+        return field
+    out = np.zeros_like(field)
+    height, width = field.shape
+    out[max(rows, 0) : height + min(rows, 0), max(columns, 0) : width + min(columns, 0)] = field[
+        max(-rows, 0) : height + min(-rows, 0), max(-columns, 0) : width + min(-columns, 0)
+    ]
+    return out
