@@ -28,7 +28,7 @@ ASSETS_READY := $(VENV)/.assets-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report demo test test-slow lint bench bench-train bench-classical clean
+	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report demo test test-slow lint bench bench-train bench-classical bench-infer clean
 .DEFAULT_GOAL := help
 
 help:
@@ -143,6 +143,10 @@ bench-train: $(READY)
 bench-classical: OUT = out/bench-classical
 bench-classical: $(READY)
 	$(SDPS) bench-classical --out $(OUT)
+
+bench-infer: OUT = out/bench-infer
+bench-infer: $(READY)
+	$(SDPS) bench-infer --out $(OUT) $(if $(METHODS),--methods '$(METHODS)') $(if $(RUNS),--models $(RUNS))
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

@@ -15,6 +15,7 @@ import pytest
 import trimesh
 from sdps_scenes import hemisphere_lights
 
+from pipelines import bench_infer
 from pipelines.cli import main
 from render.config import to_plain
 from sdps import weights
@@ -188,3 +189,12 @@ def test_many_photographs_do_not_need_more_memory(tmp_path: Path) -> None:
         peaks[count] = json.loads(done.stdout.splitlines()[-1])["peak_gib"]
     assert peaks[1000] < 1.3 * peaks[100]
     assert peaks[1000] < 3.0
+
+
+def test_the_bench_measures_every_step(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    flags = ["--height", "48", "--width", "64", "--images", "12", "--many", "20", "--out", str(tmp_path)]
+    assert main(["bench-infer", *flags, "--methods", "factorisation"]) == 0
+    runs = json.loads((tmp_path / "bench_infer.json").read_text())["runs"]
+    assert runs["factorisation, 20 pictures"]["peak_gib"] > 0 and runs["factorisation, 12 pictures"]["seconds"] > 0
+    assert "within 180 s, 3 GiB" in capsys.readouterr().out
+    assert "too dark" in bench_infer.table({"pf14": {"error": "too dark"}}, bench_infer.BenchClassicalConfig())
