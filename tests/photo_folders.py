@@ -8,10 +8,10 @@ import numpy as np
 import OpenEXR
 
 NOISE = 0.003
-PAD = 24
+PAD = 16
 
 
-def matte(lights: np.ndarray, *, shape: str = "hills", paint: bool = False, size: int = 96, seed: int = 0):
+def matte(lights: np.ndarray, *, shape: str = "hills", paint: bool = False, size: int = 72, seed: int = 0):
     """Return images (L, H, W, 3) with noise and a faint background, and the mask (H, W), of a matte object."""
     normals, mask = getattr(scenes, shape)(size)
     albedo = scenes.patches(mask, 12, np.random.default_rng(seed)) if paint else 0.8
@@ -34,7 +34,7 @@ def write(path: Path, image: np.ndarray, bits: int = 8) -> None:
         return
     if bits < 32:
         image = np.rint(np.clip(image, 0, 1) * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
-    options = [cv2.IMWRITE_JPEG_QUALITY, 98] if path.suffix == ".jpg" else []
+    options = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 98], ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1]}.get(path.suffix, [])
     assert cv2.imwrite(str(path), image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]), options)
 
 

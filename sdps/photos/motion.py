@@ -2,12 +2,13 @@
 
 Outlines and paint have their edges in the same place, with the same sign, under every light; edges of shading, shadows
 and highlights wander with it. So every image's field of edge directions is laid over the sum of the fields of the
-others, in which the former add up and the latter do not (after the orientation correlation of Fitch, Kadyrov, Christmas,
-Kittler 2002), and the places where the others disagree count little.
+others, in which the former add up and the latter do not (after the orientation correlation of Fitch, Kadyrov,
+Christmas, Kittler 2002), and the places where the others disagree count little.
 
 Highlights have sharp edges as well, and may fit the outline at some shift. So the silhouette must agree: an object that
 moved is lit where the others show background, and shows background where it was. An image that is dark there tells
-nothing and passes, unless it lies where another surely does. Without a dark background there is no silhouette, and the edges decide alone.
+nothing and passes, unless it lies where another surely does. Without a dark background there is no silhouette, and the
+edges decide alone.
 """
 
 from collections.abc import Callable
@@ -91,6 +92,10 @@ class Tracker:
 
     Args:
         mask: (H, W) bool, where the object is.
+
+    Attributes:
+        suspects: Numbers of the images to measure again: whose edges seem to have moved, and the first, which had
+            little to be compared with.
     """
 
     def __init__(self, mask: np.ndarray) -> None:
@@ -110,6 +115,7 @@ class Tracker:
         self._strength = np.zeros(self._size, np.float32)
         self._lit = np.zeros(self._size, np.int32)
         self._count = 0
+        self.suspects: list[int] = []
 
     def __len__(self) -> int:
         """Return how many images were taken in."""
@@ -119,6 +125,8 @@ class Tracker:
         """Measure an image (H, W) float32 against those before, and take it in where it lies."""
         view = self.view(grey)
         shift = self.compare(view) if self._count >= START else Shift()
+        if self._count < START or self.suspicious(shift):
+            self.suspects.append(self._count)
         if not self.moved(shift):
             shift = Shift()
         self.take(view, shift)
@@ -199,7 +207,7 @@ class Tracker:
 
 
 def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np.ndarray]) -> list[Shift]:
-    """Measure suspects again, and the first images, which had little to be compared with.
+    """Measure the suspects again.
 
     All that still look moved are taken out first, then each is measured against the rest: images that moved together
     would speak for each other.
@@ -213,14 +221,15 @@ def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np
         A shift per image, of zero length unless it moved.
     """
     apart = []
-    for number, shift in enumerate(shifts):
-        if (number < START or shift.length) and len(tracker) > START:
-            view = tracker.view(image(number))
-            tracker.take(view, shift, -1)
-            if tracker.suspicious(tracker.compare(view)):
-                apart.append(number)
-            else:
-                tracker.take(view, Shift())
+    for number in tracker.suspects:
+        if len(tracker) <= START:
+            break
+        view = tracker.view(image(number))
+        tracker.take(view, shifts[number], -1)
+        if tracker.suspicious(tracker.compare(view)):
+            apart.append(number)
+        else:
+            tracker.take(view, Shift())
     again = {number: tracker.compare(tracker.view(image(number))) for number in apart}
     sure = [shift for shift in again.values() if tracker.moved(shift)]
     believed = {number: shift for number, shift in again.items() if any(tracker.alike(shift, one) for one in sure)}
