@@ -1,5 +1,6 @@
 """The rows of the paper's tables, and which of them the weights in a folder can fill."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -85,5 +86,8 @@ def as_shipped(method: Method) -> Method:
 
 
 def chosen(out: Path, lights: str | None, normals: str | None, second: str | None, intensities: str | None) -> Method:
-    """Return the method that flags describe; see `sdps.methods.combine`."""
-    return combine(lights, normals, second, intensities, finder(out))
+    """Return the method that flags describe, with its row in the paper's table; see `sdps.methods.combine`."""
+    method = combine(lights, normals, second, intensities, finder(out))
+    parts = tuple(part.removeprefix(weights.SHIPPED) for part in (method.lights, method.normals, method.second))
+    papers = {row[:3]: row[3] for row in NORMAL_ROWS}
+    return method if method.intensities else replace(method, paper=papers.get(parts, ""))
