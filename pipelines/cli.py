@@ -35,6 +35,7 @@ COMMANDS = {
     "noise": ("noise", "add_arguments", "main", "measure the renderer's noise against converged images"),
     "bench-train": ("bench_train", "add_arguments", "main", "measure training against a plain float32 loop"),
     "bench-classical": ("bench_classical", "add_arguments", "main", "time the classical methods on a large object"),
+    "bench-checks": ("bench_checks", "add_arguments", "main", "count false alarms and hits of the photograph checks"),
     "bench-infer": ("bench_infer", "add_arguments", "main", "time sdps infer on photographs of a large object"),
     "bench": ("bench", "add_arguments", "main", "measure the renderer against Mitsuba's path integrator"),
 }
