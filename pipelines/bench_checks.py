@@ -1,6 +1,6 @@
 """`sdps bench-checks`: how often the checks of photographs cry wolf, and how often they notice, on rendered scenes.
 
-Rendered scenes stand still under white lights, so that any word of movement or of a changing colour is a false alarm. The
+Rendered scenes stand still under white lights, so any word of movement or of a changing colour is a false alarm. The
 same scenes with half of the pictures moved, one picture moved, or a channel of some dimmed tell what is noticed.
 """
 

@@ -13,15 +13,14 @@ from PIL import Image, ImageDraw
 
 from render.manifest import SceneSpec
 from render.shards import Shard, read_shard
+from sdps.photos.curves import display
 
 _PAPER = (255, 255, 255)
 
 
 def tone_map(image: np.ndarray, exposure: float = 1.0) -> np.ndarray:  # (H, W, 3) uint8
     """Turn linear radiance into display values: exposure, clip, sRGB's curve."""
-    linear = np.clip(np.asarray(image, np.float32) * exposure, 0, 1)
-    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return (255 * curve + 0.5).astype(np.uint8)
+    return display(np.asarray(image, np.float32) * exposure)
 
 
 def auto_exposure(images: np.ndarray, mask: np.ndarray) -> float:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 TRUTH = "truth"
 _LIGHTS, _SIZE, _SPP = "near-uniform:48", 256, 64
-_UNCLIPPED = 99.5
+_UNCLIPPED = 99.9
 """Per cent of the object's values that the exposure leaves below full scale, as a careful photographer does."""
 
 

@@ -34,6 +34,7 @@ from sdps.estimate import Estimate
 from sdps.methods import Runner, RunnerConfig, parse
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load, write_lights
+from sdps.photos.curves import display
 from sdps.surface.integration import Depth, integrate
 from sdps.surface.mesh import mesh, write_mesh
 from sdps.surface.relight import Residuals, fit_albedo, relit, residuals
@@ -188,7 +189,7 @@ class Inference:
             write_mesh(surface, folder / f"mesh.{suffix}")
         (folder / "relit").mkdir()
         for name, view in self.relit().items():
-            write_png(folder / "relit" / f"{name}.png", _srgb(view))
+            write_png(folder / "relit" / f"{name}.png", display(view))
         write_json(folder / "result.json", self.summary())
 
 
@@ -264,9 +265,4 @@ def _save_array(path: Path, array: np.ndarray) -> None:
 
 def _display(albedo: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
     """Return colours for a screen, the brightest percent at white."""
-    return _srgb(np.clip(albedo / max(float(np.percentile(albedo[mask], 99)), 1e-9), 0.0, 1.0))
-
-
-def _srgb(linear: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
-    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
-    return (255 * np.clip(curve, 0.0, 1.0) + 0.5).astype(np.uint8)
+    return display(albedo / max(float(np.percentile(albedo[mask], 99)), 1e-9))

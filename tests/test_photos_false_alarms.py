@@ -1,12 +1,16 @@
 """Static scenes of glossy objects raise no alarm, and the same scenes spoilt do."""
 
+import json
 from pathlib import Path
 
 import classical_scenes as scenes
 import numpy as np
 import photo_folders as folders
 import pytest
+from sdps_scenes import write_data
 
+from pipelines import bench_checks
+from pipelines.cli import main
 from pipelines.self_test import photograph_bunny
 from sdps import photos
 from sdps.photos.checks import Finding
@@ -77,3 +81,15 @@ def test_a_rendered_bunny(tmp_path: Path, material: str) -> None:
     found = set(alarms(tmp_path / "bumped", images, mask)["moved"].images)
     after = {f"{number}.png" for number in range(25, 49)}
     assert len(found & after) > 12 and len(found - after) <= 2
+
+
+def test_the_bench_counts_alarms_and_hits(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_data(tmp_path / "data", ("train",), lights=16, size=64)
+    assert main(["bench-checks", str(tmp_path / "data"), "--out", str(tmp_path / "out")]) == 0
+    rows = json.loads((tmp_path / "out" / "bench_checks.json").read_text())["rows"]
+    by_case = {row["case"]: row for row in rows}
+    assert set(by_case) == set(bench_checks.CASES)
+    assert not by_case["still"]["said"] and not by_case["white"]["said"]
+    assert by_case["half"]["pictures"] == 8 and by_case["blue"]["pictures"] == 2
+    assert "nothing wrong, said to have moved" in capsys.readouterr().out
+    assert main(["bench-checks", str(tmp_path / "data"), "--every", "0"]) == 2

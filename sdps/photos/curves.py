@@ -42,6 +42,13 @@ def curve(values: np.ndarray, gamma: str | float) -> np.ndarray:
     return values**gamma
 
 
+def display(linear: np.ndarray) -> np.ndarray:  # uint8
+    """Return linear values as a screen wants them: clipped to [0, 1], sRGB's curve, 8 bits."""
+    linear = np.clip(np.asarray(linear, np.float32), 0, 1)
+    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return (255 * coded + 0.5).astype(np.uint8)
+
+
 @cache
 def _table(bits: int, gamma: str | float) -> np.ndarray:
     return curve(np.arange(_FULL[bits] + 1) / _FULL[bits], gamma).astype(np.float32)
