@@ -109,7 +109,8 @@ def _named(images: np.ndarray, mask: np.ndarray, words: Sequence[str]) -> set[in
         write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
         for number, image in enumerate(images):
             write_png(folder / f"{number:03d}.png", quantise(image, 16))
-        found = [finding for finding in check(load(folder)) if any(word in finding.text for word in words)]
+        alarms = [finding for finding in check(load(folder)) if finding.level != "note"]
+    found = [finding for finding in alarms if any(word in finding.text for word in words)]
     return {int(name[:3]) for finding in found for name in finding.images} if found else None
 
 

@@ -49,7 +49,7 @@ def write(
         title="MERL-Test scenes",
         text=text,
         order=10,
-        tables=(*tables, _per_scene(results, names)),
+        tables=tuple(tables),
         command=f"sdps eval-merltest --preset {preset.name} --out {out}",
     )
     writer = SectionWriter(section)
@@ -59,6 +59,9 @@ def write(
             runner.method.name: {item.name: evaluation.result(item, runner, keep_normals=True)} for runner in runners
         }
         writer.strip(f"{result.scene.shape}, {result.scene.material}", tiles(item, found, names))
+    single = Section(name="merltest-scenes", title="MERL-Test, scene by scene", text="", order=15,
+                     tables=(_per_scene(results, names),))  # fmt: skip
+    SectionWriter(single).write(out)
     return writer.write(out)
 
 
