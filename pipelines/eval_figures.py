@@ -109,7 +109,7 @@ def write(name: str, drawn: Drawn, bench: Workbench) -> None:
     command = f"sdps eval-figures --preset {bench.preset.name} --out {bench.out} --figures {name}"
     section = Section(
         name=f"figure-{name}", title=drawn.title, text=drawn.text, order=_ORDER + list(FIGURES).index(name),
-        tables=drawn.tables, command=command,
+        tables=drawn.tables, command=command, pictures_first=True,
     )  # fmt: skip
     writer = SectionWriter(section)
     for file, caption, chart in drawn.charts:
