@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from render.manifest import SceneSpec, read_manifest
 from render.progress import progress_bar
 from render.seeds import generator
 from render.shards import read_shard
+
+if TYPE_CHECKING:
+    from sdps.photos import Finding
 
 MOST = 40
 """Pictures of a scene at most."""
@@ -77,15 +80,13 @@ def judge(folder: Path, scene: SceneSpec) -> list[dict]:
     images = photographs(shard, gains)[chosen]
     images /= np.percentile(images[:, shard.mask], 99.5)
     images = np.pad(images, ((0, 0), (_PAD, _PAD), (_PAD, _PAD), (0, 0)))
-    mask, rows = np.pad(shard.mask, _PAD), []
+    mask, rows, alarms = np.pad(shard.mask, _PAD), [], {}
     for case, spoilt in CASES.items():
         picked = _picked(spoilt.which, len(images))
-        altered = images.copy()
-        if spoilt.channel is not None:
-            altered[picked, ..., spoilt.channel] *= _DIMMED
-        elif len(picked):
-            altered[picked] = np.roll(altered[picked], _STEP, (1, 2))
-        named = _named(altered, mask, spoilt.words)
+        done = spoilt.which, spoilt.channel
+        if done not in alarms:  # two cases leave the pictures as they are
+            alarms[done] = _alarms(_altered(images, spoilt, picked), mask)
+        named = _named(alarms[done], spoilt.words)
         right = sorted(named & set(picked.tolist())) if named is not None else []
         wrong = sorted(named - set(picked.tolist())) if named is not None else []
         rows.append({"scene": scene.id, "case": case, "said": named is not None, "pictures": len(picked),
@@ -100,8 +101,18 @@ def _picked(which: str, count: int) -> np.ndarray:
     return np.arange(count)[places[which]]
 
 
-def _named(images: np.ndarray, mask: np.ndarray, words: Sequence[str]) -> set[int] | None:
-    """Write photographs, check them, and return the pictures named with one of the words; None without the words."""
+def _altered(images: np.ndarray, spoilt: Spoilt, picked: np.ndarray) -> np.ndarray:
+    """Return the pictures with what a case does to some of them."""
+    altered = images.copy()
+    if spoilt.channel is not None:
+        altered[picked, ..., spoilt.channel] *= _DIMMED
+    elif len(picked):
+        altered[picked] = np.roll(altered[picked], _STEP, (1, 2))
+    return altered
+
+
+def _alarms(images: np.ndarray, mask: np.ndarray) -> "list[Finding]":
+    """Write photographs and check them; notes are no alarms."""
     from sdps.photos import check, load
 
     with tempfile.TemporaryDirectory() as temporary:
@@ -109,7 +120,11 @@ def _named(images: np.ndarray, mask: np.ndarray, words: Sequence[str]) -> set[in
         write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
         for number, image in enumerate(images):
             write_png(folder / f"{number:03d}.png", quantise(image, 16))
-        alarms = [finding for finding in check(load(folder)) if finding.level != "note"]
+        return [finding for finding in check(load(folder)) if finding.level != "note"]
+
+
+def _named(alarms: "Sequence[Finding]", words: Sequence[str]) -> set[int] | None:
+    """Return the pictures named with one of the words; None without the words."""
     found = [finding for finding in alarms if any(word in finding.text for word in words)]
     return {int(name[:3]) for finding in found for name in finding.images} if found else None
 

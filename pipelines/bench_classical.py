@@ -6,7 +6,6 @@ least squares in the same run.
 """
 
 import argparse
-import multiprocessing
 import sys
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -14,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.memory import peak_bytes
+from pipelines.memory import apart, peak_gib
 from pipelines.regenerate import split_list
 from pipelines.tables import render_text
 from render import lights as light_sets
@@ -80,24 +79,13 @@ def measure(name: str, config: BenchClassicalConfig) -> dict:
 
     The two sizes are None where the system does not tell them.
     """
-    context = multiprocessing.get_context("spawn")  # a forked child would count its parent's memory as its own
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(name, config, sender))
-    process.start()
-    sender.close()
-    try:
-        return receiver.recv()
-    except EOFError:
-        process.join()
-        return {"error": f"the process ended with code {process.exitcode}"}
-    finally:
-        process.join()
+    return apart(_work, name, config)
 
 
 def _work(name: str, config: BenchClassicalConfig, results: Connection) -> None:
     """Make the images, run the method, and send what it took."""
     images, mask, normals, lights, gains = scene(config)
-    before = _peak()
+    before = peak_gib()
     try:
         estimate = registry.run(name, images, mask, lights, gains)
     except InputError as error:
@@ -106,19 +94,13 @@ def _work(name: str, config: BenchClassicalConfig, results: Connection) -> None:
     results.send(
         {
             "seconds": estimate.diagnostics["seconds"],
-            "peak_gib": _peak(),
+            "peak_gib": peak_gib(),
             "input_gib": before,
             "pixels": int(mask.sum()),
             "normal_mae": normal_mae(estimate.normals, normals, mask),
             "error": "",
         }
     )
-
-
-def _peak() -> float | None:
-    """Return the most memory this process has held, in GiB; None where the system does not tell."""
-    peak = peak_bytes()
-    return None if peak is None else peak / 2**30
 
 
 def scene(config: BenchClassicalConfig) -> tuple[np.ndarray, ...]:

@@ -6,7 +6,6 @@ does not grow with them.
 """
 
 import argparse
-import multiprocessing
 import shutil
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.bench_classical import BenchClassicalConfig, scene
-from pipelines.memory import peak_bytes
+from pipelines.memory import apart, peak_gib
 from pipelines.regenerate import split_list
 from pipelines.tables import render_text
 from render.errors import InputError
@@ -91,18 +90,7 @@ def repeated(folder: Path, source: Path, count: int) -> Path:
 
 def measure(folder: Path, method: str, models: Path | None, precision: str) -> dict:
     """Infer a folder in a fresh process: seconds per step and in all, peak_gib, pixels, error."""
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(folder, method, models, precision, sender))
-    process.start()
-    sender.close()
-    try:
-        return receiver.recv()
-    except EOFError:
-        process.join()
-        return {"error": f"the process ended with code {process.exitcode}"}
-    finally:
-        process.join()
+    return apart(_work, folder, method, models, precision)
 
 
 def _work(folder: Path, method: str, models: Path | None, precision: str, results: Connection) -> None:
@@ -125,13 +113,12 @@ def _work(folder: Path, method: str, models: Path | None, precision: str, result
     except InputError as error:
         results.send({"error": str(error)})
         return
-    peak = peak_bytes()
     steps = dict(zip(STEPS, np.diff(marks).round(2).tolist(), strict=True))
     results.send(
         {
             **steps,
             "seconds": marks[-1] - marks[0],
-            "peak_gib": None if peak is None else peak / 2**30,
+            "peak_gib": peak_gib(),
             "pixels": int(photos.mask.sum()),
             "error": "",
         }

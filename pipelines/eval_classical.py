@@ -26,8 +26,7 @@ from render.materials import surfaces
 from render.progress import progress_bar
 from sdps import weights
 from sdps.classical import registry
-from sdps.methods import NONE, Method, Runner, RunnerConfig
-from sdps.models.registry import TRUE_LIGHTS
+from sdps.methods import Runner, RunnerConfig, parse
 
 LIGHT_SETS = ("near-uniform:96", "biased:96")
 TABLES = {
@@ -102,8 +101,8 @@ def classical_runner(name: str) -> Runner:
     Raises:
         InputError: an unknown name, with the nearest.
     """
-    lights = TRUE_LIGHTS if registry.method(name).calibrated else NONE
-    return Runner(Method(name=name, normals=name, lights=lights), weights.require, RunnerConfig())
+    registry.method(name)
+    return Runner(parse(name, weights.require), weights.require, RunnerConfig())
 
 
 def evaluate(

@@ -34,7 +34,7 @@ def main(args: argparse.Namespace) -> int:
     """Evaluate, print the tables, and write <out>/diligent/results.json and the report's section."""
     config = DiligentConfig(bits=args.bits, bear=args.bear)
     models = choose.runs_folder(args.models)
-    chosen = choose.selected(split_list(args.methods), models, [])
+    chosen = choose.selected(split_list(args.methods), models)
     items = suite.pick(diligent_objects(args.data, config), split_list(args.objects))
     chosen = chosen or choose.every_method(models)
     using = RunnerConfig(read_out=args.read_out)

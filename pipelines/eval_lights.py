@@ -79,7 +79,7 @@ def main(args: argparse.Namespace) -> int:
     _check(args)
     bench = BENCHMARKS[args.dataset]
     models = choose.runs_folder(args.models)
-    chosen = choose.selected(split_list(args.methods), models, [])
+    chosen = choose.selected(split_list(args.methods), models)
     _refuse_given([method for method in chosen if method.lights == TRUE_LIGHTS])
     items = suite.pick(bench.load(args), split_list(args.objects))
     chosen = chosen or default_methods(models)
@@ -146,5 +146,5 @@ def definition(bench: Benchmark, items: Sequence[TestObject], args: argparse.Nam
         f"{bench.title}: images of {images}; {bench.about(args)}; cropped to the mask's box with 15 pixels of margin, "
         f"times the mask{size}. Directions: mean angular error in degrees over images. Intensities: truth divided per "
         "channel by the first image's, one least-squares scale, mean relative error. No true normals exist; "
-        f"{CONSTANT} is a predictor that sees nothing. A dash: not in the folder or not printed."
+        f"the {CONSTANT} predictor sees nothing. A dash: not in the folder or not printed."
     )

@@ -50,8 +50,6 @@ def main(args: argparse.Namespace) -> int:
         args.folder = photograph_bunny(args.out / "photographs")
     if args.folder is None:
         raise InputError("name a folder of photographs, or use --self-test")
-    if args.out.resolve() == args.folder.resolve():
-        raise InputError(f"--out {args.out}: holds the photographs; choose another folder")
     result = infer_folder(args)
     made = result.save(args.out)
     page = write_page(args.out / "report.html", result)
@@ -65,10 +63,11 @@ def main(args: argparse.Namespace) -> int:
 
 def infer_folder(args: argparse.Namespace) -> "Inference":
     """Read the photographs, say what was found about them, and run the method."""
-    from sdps.api import infer, load
+    from sdps.api import check_out, infer, load
     from sdps.methods import RunnerConfig
     from sdps.photos import check
 
+    check_out(args.out, args.folder)
     photos = load(
         args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
         gamma=args.gamma, names=args.images,
@@ -125,7 +124,7 @@ def _section(result: "Inference") -> SectionWriter:
     tiles.append(("depth, near is bright", _depth_picture(result)))
     if len(result.light_directions):
         tiles.append(
-            ("lights, seen from the camera", pictures.light_intensity_plot(result.light_directions, result._gains()))
+            ("lights, seen from the camera", pictures.light_intensity_plot(result.light_directions, result.gains))
         )
     writer.strip("Photograph, mask, normals, depth, lights", tiles)
     writer.strip("The surface from the left, the front and the right", [("", strip(result.depth, 360))], wide=True)
@@ -169,7 +168,7 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
         rows.append(("photographs against Lambert's law, relative RMS", f"{result.residuals.overall:.3f}"))
     tables = [checks, Table(title="Figures", header=("what", "value"), rows=tuple(rows))]
     if len(result.light_directions):
-        gains = result._gains()
+        gains = result.gains
         gains = gains if gains.ndim == 1 else gains.mean(1)
         body = tuple(
             (name, *(f"{value:.3f}" for value in direction), f"{gain / gains.mean():.3f}")

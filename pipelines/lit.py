@@ -1,7 +1,7 @@
 """Rendered test scenes as photographs under lights of unknown strength: what every evaluation on them starts from."""
 
 import hashlib
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,10 @@ from render.seeds import generator
 from render.shards import Shard, file_hash, read_shard
 
 
-@cache
-def _hash(path: Path, _size: int, _time: int) -> str:
-    """Hash a file once as long as it does not change."""
-    return file_hash(path)
+@lru_cache(maxsize=1)
+def _read(path: Path, scene: SceneSpec, _size: int, _time: int) -> tuple[Shard, str]:
+    """Read a shard, and hash its file, once for all draws of intensities, as long as it does not change."""
+    return read_shard(path, scene), file_hash(path)
 
 
 def intensities(scene: SceneSpec, config: TestConfig, repeat: int) -> np.ndarray:  # (L,) float32
@@ -43,10 +43,10 @@ def lit_object(scene: SceneSpec, folder: Path, config: TestConfig, repeat: int =
         InputError: the shard is missing or damaged.
     """
     path = folder / scene.file
-    shard = read_shard(path, scene)
+    file = path.stat() if path.is_file() else None  # reading it tells what is wrong
+    shard, digest = _read(path, scene, *((file.st_size, file.st_mtime_ns) if file else (0, 0)))
     gains = intensities(scene, config, repeat)
-    file = path.stat()
-    parts = (_hash(path, file.st_size, file.st_mtime_ns), gains.tobytes().hex())
+    parts = (digest, gains.tobytes().hex())
     return TestObject(
         name=scene.id if repeat == 0 else f"{scene.id}, draw {repeat}",
         digest=hashlib.sha256(repr(parts).encode()).hexdigest()[:24],

@@ -44,7 +44,7 @@ def lighting_table(results: Sequence[SceneScores], methods: Sequence[Method], *,
             cell(results, shape, method.name, metric, figure)
             for shape in shapes
             for metric, figure in zip(
-                LIGHTING_COLUMNS, _beside(published.LIGHTING, method.paper, shape, 2), strict=True
+                LIGHTING_COLUMNS, published.figures(published.LIGHTING, method.paper, shape, 2), strict=True
             )
         ]
         for method in methods
@@ -60,7 +60,9 @@ def normal_table(results: Sequence[SceneScores], methods: Sequence[Method], *, a
     body = [
         [method.paper or "-", method.name]
         + [
-            cell(results, shape, method.name, "normal_mae", *_beside(published.NORMALS, method.paper, shape, 1))
+            cell(
+                results, shape, method.name, "normal_mae", *published.figures(published.NORMALS, method.paper, shape, 1)
+            )
             for shape in shapes
         ]
         for method in methods
@@ -83,21 +85,13 @@ def cell(results: Sequence[SceneScores], shape: str, name: str, metric: str, pap
     return text + (f" [{len(scored) - len(values)} of {len(scored)} failed]" if len(values) < len(scored) else "")
 
 
-def _beside(table: dict[str, tuple], row: str, shape: str, count: int) -> tuple[float | None, ...]:
-    """Return the paper's `count` figures of a row and shape, None where it has none."""
-    if row not in table or shape not in published.SHAPES:
-        return (None,) * count
-    figures = table[row][1 + published.SHAPES.index(shape)]
-    return figures if isinstance(figures, tuple) else (figures,)
-
-
 def _missing(table: dict[str, tuple], methods: Sequence[Method], shapes: Sequence[str], count: int) -> list[list[str]]:
     """Return a row for each of the paper's that no method fills."""
     filled = {method.paper for method in methods}
     rows = []
     for row in table:
         if row not in filled:
-            figures = [figure for shape in shapes for figure in _beside(table, row, shape, count)]
+            figures = [figure for shape in shapes for figure in published.figures(table, row, shape, count)]
             cells = [MISSING + ("" if figure is None else f" ({number(figure)})") for figure in figures]
             rows.append([row, table[row][0], *cells])
     return rows

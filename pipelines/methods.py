@@ -88,6 +88,10 @@ def as_shipped(method: Method) -> Method:
 def chosen(out: Path, lights: str | None, normals: str | None, second: str | None, intensities: str | None) -> Method:
     """Return the method that flags describe, with its row in the paper's table; see `sdps.methods.combine`."""
     method = combine(lights, normals, second, intensities, finder(out))
+    return replace(method, paper=paper_row(method))
+
+
+def paper_row(method: Method) -> str:
+    """Return the row of the paper's table of normals that a combination is, or an empty string."""
     parts = tuple(part.removeprefix(weights.SHIPPED) for part in (method.lights, method.normals, method.second))
-    papers = {row[:3]: row[3] for row in NORMAL_ROWS}
-    return method if method.intensities else replace(method, paper=papers.get(parts, ""))
+    return "" if method.intensities else next((row[3] for row in NORMAL_ROWS if row[:3] == parts), "")

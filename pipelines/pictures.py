@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from PIL import Image, ImageDraw
 
+from pipelines.figures.charts import light_disc
 from render.manifest import SceneSpec
 from render.shards import Shard, read_shard
 from sdps.photos.curves import display
@@ -126,13 +127,7 @@ def light_intensity_plot(directions: np.ndarray, intensities: np.ndarray) -> Fig
     grey = intensities if intensities.ndim == 1 else intensities.mean(1)
     figure = Figure(figsize=(3.0, 2.6), dpi=100, layout="tight")
     axes = figure.add_subplot()
-    axes.add_patch(Circle((0, 0), 1, fill=False, color="0.6", lw=0.8))
-    drawn = axes.scatter(
-        directions[:, 0], directions[:, 1], s=16, c=grey / grey.max(), cmap="viridis", vmin=0.0, vmax=1.0
-    )
-    axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
-    axes.axis("off")
-    figure.colorbar(drawn, ax=axes, shrink=0.7, label="intensity / strongest")
+    figure.colorbar(light_disc(axes, directions, grey), ax=axes, shrink=0.7, label="intensity / strongest")
     return figure
 
 

@@ -22,3 +22,11 @@ NORMALS = {  # MAE in degrees on sphere, on bunny
     "B9": ("UPS-FCN retrain", 7.44, 12.34),
 }
 SHAPES = ("sphere", "bunny")
+
+
+def figures(table: dict[str, tuple], row: str, shape: str, count: int = 1) -> tuple[float | None, ...]:
+    """Return the paper's `count` figures of a row and shape, None where it has none."""
+    if row not in table or shape not in SHAPES:
+        return (None,) * count
+    found = table[row][1 + SHAPES.index(shape)]
+    return found if isinstance(found, tuple) else (found,)

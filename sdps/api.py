@@ -98,20 +98,26 @@ class Inference:
         """Lambertian albedo under the lights found, relative; None where no lights were found."""
         if not len(self.light_directions):
             return None
-        return fit_albedo(self.photos, self.photos.mask, self.normals, self.light_directions, self._gains())
+        return fit_albedo(self.photos, self.photos.mask, self.normals, self.light_directions, self.gains)
 
     @cached_property
     def residuals(self) -> Residuals | None:
         """How far the photographs are from Lambert's law on what was found; None where no lights were found."""
         if self.albedo is None:
             return None
-        return residuals(self.photos, self.photos.mask, self.normals, self.light_directions, self._gains(), self.albedo)
+        return residuals(self.photos, self.photos.mask, self.normals, self.light_directions, self.gains, self.albedo)
 
-    def _gains(self) -> np.ndarray:
+    @property
+    def gains(self) -> np.ndarray:
+        """Intensities (L,) or (L, 3), equal ones where none were found."""
         return self.intensities if len(self.intensities) else np.ones(len(self.photos), np.float32)
 
     def relit(self) -> dict[str, np.ndarray]:
         """Return the object under lights of our choice, by name, (H, W, 3) float32 linear in [0, 1]."""
+        return self._relit
+
+    @cached_property
+    def _relit(self) -> dict[str, np.ndarray]:
         albedo = self.albedo if self.albedo is not None else np.ones((*self.photos.shape, 3), np.float32)
         inside = albedo[self.photos.mask]
         albedo = albedo * (0.9 / max(float(np.percentile(inside, 99)), 1e-9))
@@ -157,8 +163,7 @@ class Inference:
             InputError: the folder of the photographs, or a disk that refuses the files.
         """
         out = Path(out)
-        if out.resolve() == self.photos.folder.resolve():
-            raise InputError(f"--out {out}: holds the photographs; choose another folder")
+        check_out(out, self.photos.folder)
         try:
             out.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(prefix=".infer-", dir=out) as temporary:
@@ -181,7 +186,7 @@ class Inference:
         write_png(folder / "normal.png", quantise((normals.astype(np.float64) + 1.0) / 2.0, 16))
         write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
         if len(self.light_directions):
-            write_lights(folder / "lights.json", self.photos.files, self.light_directions, self._gains())
+            write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains)
         _save_array(folder / "depth.npy", self.depth.z)
         colour = None if self.albedo is None else _display(self.albedo, mask)
         surface = mesh(self.depth, colour=colour, normals=normals)
@@ -191,6 +196,16 @@ class Inference:
         for name, view in self.relit().items():
             write_png(folder / "relit" / f"{name}.png", display(view))
         write_json(folder / "result.json", self.summary())
+
+
+def check_out(out: Path, photographs: Path) -> None:
+    """Refuse to write among the photographs.
+
+    Raises:
+        InputError: the two folders are one.
+    """
+    if out.resolve() == photographs.resolve():
+        raise InputError(f"--out {out}: holds the photographs; choose another folder")
 
 
 def infer(

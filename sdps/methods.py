@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from render.errors import InputError
+from render.shards import file_hash
 from sdps import weights
 from sdps.baselines import constant_estimate
 from sdps.classical import registry as classical
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from sdps.checkpoint import TrainedModel
 
 NONE = ""
+_digest = cache(file_hash)
 CONSTANT = "constant"
 """A predictor that sees nothing: what knowing nothing scores."""
 CLASSICAL = (*classical.METHODS, CONSTANT)
@@ -118,7 +120,7 @@ class Runner:
             parts.append(classical.source_digest(method.normals))
         if self.estimator is not None:
             named = {place: getattr(method, place) for place in ("lights", "normals", "second")}
-            parts += [(place, _file_digest(self.files[name])) for place, name in named.items() if name in self.files]
+            parts += [(place, _digest(self.files[name])) for place, name in named.items() if name in self.files]
             parts += [method.read_out or config.read_out, config.precision, config.rotations, _inference_digest()]
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
@@ -305,12 +307,6 @@ def _check_classical(normals: str, lights: str, second: str | None, intensities:
         raise InputError(f"{normals} is told the lights; give --lights, `true` or a lighting model")
     if not calibrated and (lights or second or intensities):
         raise InputError(f"{normals} finds the lights itself; leave out --lights, --second and --intensities")
-
-
-@cache
-def _file_digest(path: Path) -> str:
-    with path.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 @cache

@@ -24,6 +24,12 @@ def shipped() -> list[str]:
     return sorted(path.stem for path in shipped_folder().glob(f"*{_SUFFIX}"))
 
 
+def trained(out: Path | None) -> list[str]:
+    """Return the names of the runs whose last weights lie in a folder; none where it is None."""
+    files = sorted((out / MODELS_FOLDER).glob(f"*/*{_SUFFIX}")) if out is not None else []
+    return [path.stem for path in files if not path.stem.endswith("-best")]
+
+
 def trained_file(out: Path, name: str) -> Path:
     """Return where the weights of a run lie, or would lie, in the folder of the runs."""
     own = out / MODELS_FOLDER / name / f"{name}{_SUFFIX}"
@@ -59,6 +65,5 @@ def require(name: str, out: Path | None = None) -> Path:
         return path
     plain = name.removeprefix(SHIPPED)
     if plain not in MODELS and not name.endswith(_SUFFIX):
-        runs = {path.parent.name for path in (out / MODELS_FOLDER).glob(f"*/*{_SUFFIX}")} if out else set()
-        raise unknown("model or method", name, {*runs, *shipped(), *MODELS, *COMBINATIONS, *METHODS})
+        raise unknown("model or method", name, {*trained(out), *shipped(), *MODELS, *COMBINATIONS, *METHODS})
     raise InputError(f"{path}: no such weights; train them with `sdps train --models {plain}`")

@@ -15,12 +15,6 @@ SHOWN = ("least-squares, true lights", "pf14")
 _MOST_SHOWN = 4
 
 
-def trained(out: Path | None) -> list[str]:
-    """Return the names of the runs whose last weights lie in a folder."""
-    files = sorted((out / weights.MODELS_FOLDER).glob("*/*.safetensors")) if out is not None else []
-    return [path.stem for path in files if not path.stem.endswith("-best")]
-
-
 def lighting_rows(out: Path | None) -> list[Method]:
     """Return a method per lighting model, trained and shipped, that tells lights alone."""
     find = methods.finder(out)
@@ -28,7 +22,7 @@ def lighting_rows(out: Path | None) -> list[Method]:
     def tells_lights(name: str) -> bool:
         return MODELS[model_of(name, find)].role == "lighting"
 
-    names = [name for name in trained(out) if tells_lights(name)]
+    names = [name for name in weights.trained(out) if tells_lights(name)]
     names = sorted(names, key=lambda name: (list(MODELS).index(name) if name in MODELS else len(MODELS), name))
     kept = [name for name in (weights.SHIPPED + name for name in weights.shipped()) if tells_lights(name)]
     return [parse(name, find) for name in [*names, *kept]]
@@ -47,10 +41,8 @@ def every_method(out: Path | None) -> list[Method]:
     return list({method.name: method for method in found}.values())
 
 
-def selected(expressions: list[str], out: Path | None, default: list[Method]) -> list[Method]:
-    """Return the methods of `--methods`, or the default."""
-    if not expressions:
-        return default
+def selected(expressions: list[str], out: Path | None) -> list[Method]:
+    """Return the methods of `--methods`, each once."""
     return list({method.name: method for method in (parse(text, methods.finder(out)) for text in expressions)}.values())
 
 
@@ -75,6 +67,6 @@ def runs_folder(folder: Path | None) -> Path | None:
     if folder is None:
         return None
     base = folder.resolve().parent if folder.resolve().name == weights.MODELS_FOLDER else folder
-    if not trained(base):
+    if not weights.trained(base):
         raise InputError(f"{folder}: no trained weights under {weights.MODELS_FOLDER}/; give the --out of `sdps train`")
     return base

@@ -126,9 +126,7 @@ def _worst(corners: list[Mean]) -> Mean:
 
 def _published(runner: Runner, shape: str) -> float | None:
     """Return the paper's figure for true lights (row B0)."""
-    if paper_row(runner.method) != "B0" or shape not in published.SHAPES:
-        return None
-    return published.NORMALS["B0"][1 + published.SHAPES.index(shape)]
+    return published.figures(published.NORMALS, "B0", shape)[0] if paper_row(runner.method) == "B0" else None
 
 
 def _table(

@@ -107,13 +107,11 @@ def _average(draws: Sequence[Mean]) -> tuple[float, float, float, int]:
 
 def _published(method: Method, shape: str, metric: str) -> float | None:
     """Return the paper's figure for all images, where it has the method and shape."""
-    if shape not in published.SHAPES:
-        return None
-    place, row = 1 + published.SHAPES.index(shape), paper_row(method)
+    row = paper_row(method)
     if metric == "normal_mae":
-        return published.NORMALS[row][place] if row in published.NORMALS else None
+        return published.figures(published.NORMALS, row, shape)[0]
     if row in ("B1", "B2"):  # both with LCNet's lights, row A0
-        return published.LIGHTING["A0"][place][0 if metric == "direction_mae" else 1]
+        return published.figures(published.LIGHTING, "A0", shape, 2)[0 if metric == "direction_mae" else 1]
     return None
 
 

@@ -1,18 +1,17 @@
 """What the figures share: the methods, the scenes, the results kept on disk, and the form of what a figure gives."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from pipelines import scenes
+from pipelines import methods, scenes
 from pipelines.evaluation import Evaluation, Result, TestObject
 from pipelines.lit import lit_object
-from pipelines.methods import NORMAL_ROWS
 from pipelines.presets import Preset, TestConfig
 from pipelines.render_data import render_planned
 from pipelines.sections import Table
@@ -21,10 +20,6 @@ from render.errors import InputError
 from render.manifest import SceneSpec
 from sdps.methods import Method, Runner
 from sdps.models.registry import TRUE_LIGHTS
-from sdps.weights import SHIPPED
-
-if TYPE_CHECKING:
-    from sdps.image_source import ImageSource
 
 METRICS = {  # of the figures: title and unit
     "direction_mae": ("Light directions", "mean angular error (degrees)"),
@@ -97,7 +92,7 @@ class Workbench:
         """Yield each scene under random intensities (the first draw), its images made once however often asked for."""
         for scene in wanted:
             item = lit_object(scene, folder, config)
-            yield replace(item, load=_once(item.load))
+            yield replace(item, load=cache(item.load))
 
     def results(self, item: TestObject, runners: Sequence[Runner]) -> list[Result]:
         """Return what methods make of an object, from the cache or by running them."""
@@ -113,18 +108,11 @@ class Workbench:
         return [r for r in self.runners if r.method.lights not in told and r.method.intensities not in told]
 
 
-def _once(load: "Callable[[], ImageSource]") -> "Callable[[], ImageSource]":
-    return cache(load)
-
-
 def paper_row(method: Method) -> str:
     """Return the row of the paper's table that a method is, `PF14` for that method, or an empty string."""
     if (method.lights, method.normals, method.intensities) == ("", "pf14", ""):
         return "PF14"
-    if method.intensities:
-        return ""
-    parts = tuple(part.removeprefix(SHIPPED) for part in (method.lights, method.normals, method.second))
-    return next((row[3] for row in NORMAL_ROWS if row[:3] == parts), "")
+    return methods.paper_row(method)
 
 
 def finds(method: Method, metric: str) -> bool:
