@@ -28,7 +28,7 @@ ASSETS_READY := $(VENV)/.assets-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report demo test test-slow lint bench bench-train bench-classical bench-infer clean
+	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow lint bench bench-train bench-classical bench-infer clean
 .DEFAULT_GOAL := help
 
 help:
@@ -39,6 +39,7 @@ help:
 	@echo "make eval-classical | bench-classical | eval-photos DATA=folder   the methods without learning"
 	@echo "make eval-figures PRESET=...   the paper's figures; make report OUT=folder   one page of everything evaluated"
 	@echo "make eval-diligent DATA=folder [BITS=16 BEAR=76] | eval-lights DATA=folder DATASET=gourd-apple|light-stage   [RUNS=trained]"
+	@echo "make ship | shipped-results [DATA=DiLiGenT's folder]   trained weights into the package; their tables"
 	@echo "make infer PHOTOS=folder [METHOD=pf14 RUNS=trained]   normals, lights, meshes and a page from photographs"
 	@echo "make data-plan | data-status | data-validate | data-preview | data-card   PRESET=... OUT=folder"
 	@echo "make regenerate   SHAPES=bunny MATERIALS=chrome,lambertian:0.5 LIGHTS=merltest OUT=folder [MITSUBA=1]"
@@ -98,6 +99,19 @@ eval-figures: $(ASSETS_READY)
 infer: OUT = out/infer
 infer: $(READY)
 	$(SDPS) infer '$(PHOTOS)' --out $(OUT) $(if $(METHOD),--method '$(METHOD)') $(if $(RUNS),--models $(RUNS))
+
+# Weights of finished runs into assets/weights; then their tables, there and in the README. DATA: DiLiGenT's folder.
+ship: PRESET = ship
+ship: $(READY)
+	$(SDPS) ship --preset $(PRESET) --out $(OUT) $(if $(MODELS),--models '$(MODELS)')
+
+shipped-results: OUT = out/shipped
+shipped-results: PRESET = ship
+shipped-results: METHODS = lcnet,sdps,sdps-plus,psfcn,least-squares
+shipped-results: $(ASSETS_READY)
+	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
+	$(if $(DATA),$(SDPS) eval-diligent '$(DATA)' --out $(OUT) --methods '$(METHODS)')
+	$(SDPS) shipped-results --out $(OUT) --readme README.md
 
 report: $(READY)
 	$(SDPS) report $(OUT)

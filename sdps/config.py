@@ -11,6 +11,7 @@ from typing import Literal
 from render.errors import InputError
 from sdps.augment import Augmentation
 from sdps.lighting import LightClasses, ReadOut
+from sdps.models.lcnet import EARLY_SIZE, INPUT_SIZE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,8 +137,11 @@ class LightingTraining(TrainingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.size != 128:
-            raise InputError(f"size must be 128 for LCNet, whose last layers need it, got {self.size}")
+        if self.size not in (EARLY_SIZE, INPUT_SIZE):
+            raise InputError(
+                f"size must be {INPUT_SIZE} for LCNet, whose last layers need it, or {EARLY_SIZE} for a run that "
+                f"others start from, got {self.size}"
+            )
         self.classes()
 
     def intensity_range(self) -> tuple[float, float]:

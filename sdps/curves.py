@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from render.errors import InputError, unknown
 from render.files import atomic_path, read_text
+from sdps.extrapolation import PowerLaw
 
 Rows = list[dict[str, float]]
 
@@ -107,7 +108,7 @@ def compare_curves(runs: Mapping[str, str | Path], picture: str | Path, value: s
         for number, against in enumerate(("step", "hours") if timed else ("step",)):
             axes = figure.add_subplot(1, 1 + timed, number + 1)
             for place, (name, rows) in enumerate(kept.items()):
-                steps, values = _series(rows, value)
+                steps, values = series(rows, value)
                 if against == "hours" and len(_clock(rows)[0]) < 2:
                     continue
                 places = _hours(rows, steps) if against == "hours" else steps
@@ -125,6 +126,36 @@ def compare_curves(runs: Mapping[str, str | Path], picture: str | Path, value: s
         _save(figure, picture)
 
 
+def extrapolated_curves(
+    runs: Mapping[str, str | Path], laws: Mapping[str, PowerLaw], picture: str | Path, value: str, until: float
+) -> None:
+    """Draw one metric of several runs, and the laws fitted to them dotted, on logarithmic axes.
+
+    Args:
+        runs: The `metrics.jsonl` of each run by the name its curve gets.
+        laws: Of some or all runs.
+        picture: PNG to write, 1,000 pixels wide.
+        value: Name of the metric.
+        until: Step up to which laws are drawn, if that is beyond the last one taken.
+    """
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(_WIDTH, 4.8), dpi=_DPI, layout="constrained")
+        axes = figure.add_subplot()
+        for place, (name, file) in enumerate(runs.items()):
+            steps, values = series(read_metrics(file), value)
+            if not len(steps):
+                continue
+            axes.loglog(steps, values, marker="o", ms=3, lw=1.3, color=f"C{place % 10}", label=name)
+            if name in laws:
+                far = np.geomspace(steps[0], max(until, steps[-1]), 100)
+                axes.loglog(far, laws[name].at(far), ls=":", lw=1.3, color=f"C{place % 10}")
+        axes.set(xlabel="optimiser step", ylabel=f"{_spoken(value)}, {_unit(value)}")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
+        axes.legend()
+        _save(figure, picture)
+
+
 def _panels(rows: Rows) -> list[_Panel]:
     """Return the plots that a run's metrics give, each with names of one unit."""
     names = list(dict.fromkeys(key for row in rows for key in row))
@@ -138,13 +169,13 @@ def _panels(rows: Rows) -> list[_Panel]:
         _Panel("learning rate", "learning rate", [name for name in names if name == "learning_rate"]),
         _Panel("speed", "images/s", [name for name in names if name == "images_per_second"]),
     ]
-    return [panel for panel in candidates if any(_series(rows, name)[0].size for name in panel.names)]
+    return [panel for panel in candidates if any(series(rows, name)[0].size for name in panel.names)]
 
 
 def _draw(axes: Axes, rows: Rows, panel: _Panel) -> None:
     """Plot a panel's curves; training losses raw behind their running mean, validation with its points marked."""
     for place, name in enumerate(panel.names):
-        steps, values = _series(rows, name)
+        steps, values = series(rows, name)
         label = _spoken(name.removeprefix("val_"))
         if panel.title == "training loss":
             axes.plot(steps, values, lw=0.6, alpha=0.35, color=f"C{place}")
@@ -203,8 +234,8 @@ def _hours(rows: Rows, places: np.ndarray, *, inverse: bool = False) -> np.ndarr
     return inside + slope * (np.minimum(places, 0.0) + np.maximum(places - known[-1], 0.0))
 
 
-def _series(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the steps at which a metric was recorded as a finite number, and its values."""
+def series(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps at which a metric was recorded as a finite number, and its values, each (N,)."""
     pairs = [(row["step"], row[name]) for row in rows if name in row and math.isfinite(row[name])]
     return np.array([step for step, _ in pairs], np.float64), np.array([value for _, value in pairs], np.float64)
 

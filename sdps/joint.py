@@ -6,12 +6,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from render.errors import InputError
 from sdps.checkpoint import TrainedModel
 from sdps.config import JointTraining, LightingTraining
 from sdps.dataset import Batch, SampleOptions
 from sdps.losses import faithful_normal_loss, masked_normal_loss
 from sdps.models.base import LightingNetwork, Lights, NormalNetwork
-from sdps.models.lcnet import resize_input
+from sdps.models.lcnet import INPUT_SIZE, resize_input
 from sdps.models.lighting_variants import LCNetSecond
 from sdps.stages import LightingStage, Part, Stage, crop, described, freeze, light_errors, normal_error
 
@@ -24,6 +25,9 @@ class SecondStage(LightingStage):
         lighting, normals: The first pass.
         model: Name in the registry.
         name: Name of the run.
+
+    Raises:
+        InputError: a size other than that of the first pass.
     """
 
     def __init__(
@@ -35,6 +39,8 @@ class SecondStage(LightingStage):
         model: str = "lcnet-second",
         name: str | None = None,
     ) -> None:
+        if config.size != INPUT_SIZE:
+            raise InputError(f"size must be {INPUT_SIZE} for {model}, as its first pass has it, got {config.size}")
         super().__init__(config, model=model, name=name)
         self.lighting, self.normals = freeze(lighting), freeze(normals)
 

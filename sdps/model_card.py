@@ -54,6 +54,7 @@ class _Sources(NamedTuple):
 
     run: str  # name of the run, which is that of its folder
     file: str  # name of the weights file
+    stored: str  # its size and type of number
     model: TrainedModel
     rows: Rows  # metrics of the run, empty where there are none
     base: str  # model the run trains, `sdps-joint` included
@@ -65,6 +66,7 @@ def write_model_card(
     data: str | Path | None = None,
     *,
     terms: Sequence[tuple[str, str, str]] = (),
+    shipped: str | Path | None = None,
 ) -> None:
     """Write the card of trained weights; metrics and configuration of the run are looked for beside them.
 
@@ -73,21 +75,29 @@ def write_model_card(
         weights: The safetensors file, in its run's folder.
         data: The data folder trained on, for its composition.
         terms: Rows of materials, their source and their terms of use; by default, what the data folder's card says.
+        shipped: A copy of the weights, rounded, that the card is to travel with.
 
     Raises:
         InputError: weights that cannot be loaded, a damaged manifest, or an unwritable disk.
     """
-    write_text(path, render_card(weights, data, terms))
+    write_text(path, render_card(weights, data, terms, shipped))
 
 
-def render_card(weights: str | Path, data: str | Path | None = None, terms: Sequence[tuple[str, str, str]] = ()) -> str:
+def render_card(
+    weights: str | Path,
+    data: str | Path | None = None,
+    terms: Sequence[tuple[str, str, str]] = (),
+    shipped: str | Path | None = None,
+) -> str:
     """Compose the card; see `write_model_card`."""
     weights = Path(weights)
     model = load_weights(weights)
     metrics = weights.parent / _METRICS
     rows = read_metrics(metrics) if metrics.is_file() and metrics.stat().st_size else []
     run = weights.absolute().parent.name
-    source = _Sources(run, weights.name, model, rows, _base(weights.parent / _CONFIG) or model.name)
+    file = weights if shipped is None else Path(shipped)
+    stored = f"{file.stat().st_size / 1e6:.1f} MB as {'float32' if shipped is None else 'float16'}"
+    source = _Sources(run, file.name, stored, model, rows, _base(weights.parent / _CONFIG) or model.name)
     folder = Path(data) if data is not None and (Path(data) / MANIFEST).is_file() else None
     sections = [
         _front_matter(source),
@@ -145,13 +155,9 @@ def _about(source: _Sources) -> str:
         ("reconstruction", f"the paper leaves open, and this project decided: {entry.reconstruction}"
          if entry.reconstruction else "no; layers as published or derived from them"),
         ("options of the network", _value(model.options) if model.options else "defaults"),
-        ("weights", f"`{source.file}` (safetensors, {_precision(model)}); loading runs no code"),
+        ("weights", f"`{source.file}` (safetensors, {source.stored}); loading runs no code"),
     ]  # fmt: skip
     return f"{entry.summary}.\n\n" + _table(("what", "value"), rows)
-
-
-def _precision(model: TrainedModel) -> str:
-    return f"{parameter_count(model.network) * 4 / 1e6:.1f} MB as float32"
 
 
 def _input(model: TrainedModel) -> str:
@@ -176,6 +182,8 @@ def _input(model: TrainedModel) -> str:
         lines.append("It is told the light directions, and images are divided by the light intensities.")
     if getattr(network, "per_pixel", False):
         lines.append("Images are divided by each pixel's norm over the lights.")
+    if getattr(network, "refines", False):
+        lines.append("It also sees the normals of least squares under these lights, and adds to them.")
     return "## What it expects\n\n" + "".join(f"- {line}\n" for line in lines)
 
 

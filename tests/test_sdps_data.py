@@ -154,7 +154,11 @@ def test_cache_gives_the_same_samples_and_notices_a_new_shard(tmp_path: Path) ->
     cached = SceneDataset(tmp_path, "train", options(size=16), cache=True)
     for _ in range(2):  # decoded, then mapped
         assert all(torch.equal(*pair) for pair in zip(cached.sample(key), direct, strict=True))
-    assert len(list((tmp_path / "cache").iterdir())) == 2
+    entry = {path.name.split(".")[-2]: path for path in (tmp_path / "cache").iterdir()}
+    assert entry.keys() == {"images", "truth"}
+    seen = (read_shard(next(tmp_path.rglob("*.exr"))).images != 0.0).any(axis=(0, 3))
+    assert 0 < seen.sum() < seen.size  # there is something black to leave out
+    assert np.load(entry["images"]).shape == (4, seen.sum(), 3)
     write_data(tmp_path, ("train",), lights=4, size=16, seed=5)
     renewed = SceneDataset(tmp_path, "train", options(size=16), cache=True).sample(key)
     assert not torch.equal(renewed.directions, direct.directions)

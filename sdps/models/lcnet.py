@@ -15,6 +15,8 @@ from sdps.models.base import LightingNetwork, Lights
 from sdps.models.blocks import conv, initialise
 
 INPUT_SIZE = 128
+EARLY_SIZE = 64
+"""A quarter of the work: for the first part of training. The last convolutions then see 4x4 features, 2x2, 1x1, 1x1."""
 
 
 class LightingLogits(NamedTuple):
@@ -58,8 +60,8 @@ class LightingTrunk(LightingNetwork):
         )
 
     def encode(self, images: Tensor, mask: Tensor, context: Tensor | None = None) -> Tensor:
-        """Return the local features (B, Q, F, 8, 8) of images (B, Q, 3, 128, 128)."""
-        assert images.shape[-2:] == (INPUT_SIZE, INPUT_SIZE), images.shape
+        """Return the local features (B, Q, F, 8, 8) of images (B, Q, 3, 128, 128); half of both sides is possible."""
+        assert images.shape[-2:] in {(side, side) for side in (EARLY_SIZE, INPUT_SIZE)}, images.shape
         return super().encode(images, mask, context)
 
     def fuse(self, local: Tensor, shared: Tensor) -> Tensor:

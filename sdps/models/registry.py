@@ -97,8 +97,8 @@ MODELS: dict[str, ModelEntry] = {
         summary="NENet on images divided by each pixel's norm over the lights",
     ),
     "nenet-plus": ModelEntry(
-        role="normals", build=NENet, options={"per_pixel": True}, parameters=2_210_048, lights="lcnet-soft",
-        summary="nenet-norm trained on lcnet-soft's lights",
+        role="normals", build=NENet, options={"per_pixel": True, "refines": True}, parameters=2_212_352,
+        lights="lcnet-soft", summary="NENet that refines the normals of least squares, on lcnet-soft's lights",
     ),
     "psfcn": ModelEntry(
         role="normals", build=NENet, parameters=2_210_048, paper="B0", lights=TRUE_LIGHTS, recipe=_PSFCN,
