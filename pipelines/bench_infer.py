@@ -10,6 +10,7 @@ import shutil
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -95,8 +96,7 @@ def measure(folder: Path, method: str, models: Path | None, precision: str) -> d
 
 def _work(folder: Path, method: str, models: Path | None, precision: str, results: Connection) -> None:
     """Do what `sdps infer` does, and send what it took."""
-    from sdps.api import infer, load
-    from sdps.methods import RunnerConfig
+    from sdps.api import INFER_CONFIG, infer, load
     from sdps.photos import check
 
     marks = [time.perf_counter()]
@@ -105,7 +105,9 @@ def _work(folder: Path, method: str, models: Path | None, precision: str, result
         marks.append(time.perf_counter())
         findings = tuple(check(photos))
         marks.append(time.perf_counter())
-        result = infer(photos, method, models=models, config=RunnerConfig(precision=precision), findings=findings)
+        result = infer(
+            photos, method, models=models, config=replace(INFER_CONFIG, precision=precision), findings=findings
+        )
         marks.append(time.perf_counter())
         with tempfile.TemporaryDirectory() as out:
             result.save(out)

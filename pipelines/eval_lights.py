@@ -15,8 +15,9 @@ from pipelines.benchmarks.object_tables import object_table
 from pipelines.evaluation import TestObject
 from pipelines.regenerate import split_list
 from pipelines.sections import Section, Table
+from render.config import to_plain
 from render.errors import InputError
-from sdps.methods import CONSTANT, Method, RunnerConfig
+from sdps.methods import CONSTANT, Method
 from sdps.models.registry import TRUE_LIGHTS
 
 
@@ -83,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
     _refuse_given([method for method in chosen if method.lights == TRUE_LIGHTS])
     items = suite.pick(bench.load(args), split_list(args.objects))
     chosen = chosen or default_methods(models)
-    using = RunnerConfig(read_out=args.read_out)
+    using = suite.runner_config(args)
     shown = suite.pictured(chosen)
     found, runners = suite.run(items, chosen, models, args.out / bench.name / "cache", using, shown)
     tables = build_tables(bench, items, found, chosen)
@@ -96,10 +97,8 @@ def main(args: argparse.Namespace) -> int:
         tables=tuple(tables),
         command=f"sdps eval-lights {args.data} --dataset {args.dataset} --out {args.out}",
     )
-    protocol = {
-        name: getattr(args, name) for name in ("measured_lights", "least_z", "gamma", "longest_side", "read_out")
-    }
-    suite.write(args.out, section, items, found, runners, shown, protocol)
+    protocol = {name: getattr(args, name) for name in ("measured_lights", "least_z", "gamma", "longest_side")}
+    suite.write(args.out, section, items, found, runners, shown, {**protocol, **to_plain(using)})
     sys.stdout.write(f"{suite.text_of(tables, found)}\n{text}\n{args.out / bench.name / 'results.json'}\n")
     return 0
 

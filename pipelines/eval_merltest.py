@@ -78,7 +78,8 @@ def main(args: argparse.Namespace) -> int:
 
 def runner_config(config: TestConfig) -> RunnerConfig:
     """Return how a preset uses networks at test."""
-    return RunnerConfig(read_out=config.read_out, precision=config.precision, rotations=config.rotations)
+    same = ("read_out", "precision", "rotations", "light_views", "normal_views")
+    return RunnerConfig(**{name: getattr(config, name) for name in same})
 
 
 def rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[list[Method], list[Method]]:

@@ -38,6 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--discontinuities", action="store_true", help="let the depth jump where slopes disagree")
     parser.add_argument("--read-out", default="expectation", choices=("centre", "expectation", "peak"))
     parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"))
+    parser.add_argument("--light-views", type=int, default=8, metavar="N",
+                        help="views that a network's lights are averaged over: 1, 2, 4 or 8 (default: 8)")  # fmt: skip
+    parser.add_argument("--normal-views", type=int, default=1, metavar="N",
+                        help="the same for normals, each at full cost (default: 1)")  # fmt: skip
     parser.add_argument("--self-test", action="store_true",
                         help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
 
@@ -76,7 +80,9 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     height, width = photos.shape
     sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is taken for orthographic\n")
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
-    config = RunnerConfig(read_out=args.read_out, precision=args.precision)
+    config = RunnerConfig(
+        read_out=args.read_out, precision=args.precision, light_views=args.light_views, normal_views=args.normal_views
+    )
     return infer(
         photos, args.method, models=args.models, config=config, discontinuities=args.discontinuities, findings=findings
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sdps import recipes, weights
-from sdps.methods import NONE, Method, combine, label
+from sdps.methods import NONE, Method, combine, label, views_of
 from sdps.models.registry import MODELS, TRUE_LIGHTS
 
 if TYPE_CHECKING:
@@ -51,10 +51,18 @@ def lighting_methods(out: Path, preset: "Preset") -> list[Method]:
     if "lcnet" in trained:
         others = (how for how in ("centre", "expectation", "peak") if how != preset.test.read_out)
         methods += [Method(name=f"lcnet, {how}", lights="lcnet", read_out=how) for how in others]
-    kept = [name for name in names if name in weights.shipped()]
-    return methods + [
-        Method(name=f"{name} (shipped)", lights=weights.SHIPPED + name, paper=MODELS[name].paper) for name in kept
+        methods.append(_in_all_views(methods[0]))
+    kept = [
+        Method(name=f"{name} (shipped)", lights=weights.SHIPPED + name, paper=MODELS[name].paper)
+        for name in names
+        if name in weights.shipped()
     ]
+    return [*methods, *kept, *map(_in_all_views, kept)]
+
+
+def _in_all_views(method: Method) -> Method:
+    """Return the same lights averaged over all eight views, beside the paper's one."""
+    return replace(method, name=f"{method.name}, 8 views", light_views=8, paper="")
 
 
 def _role(name: str, preset: "Preset") -> str:
@@ -67,7 +75,8 @@ def normal_methods(out: Path) -> list[Method]:
     trained, kept = [], []
     available = set(weights.shipped())
     for lights, normals, second, paper in NORMAL_ROWS:
-        method = Method(name=label(lights, normals, second), lights=lights, normals=normals, second=second, paper=paper)
+        name, views = label(lights, normals, second), views_of(lights, normals, second)
+        method = Method(name=name, lights=lights, normals=normals, second=second, paper=paper, light_views=views)
         if all(weights.trained_file(out, name).is_file() for name in method.models()):
             trained.append(method)
         if method.models() and method.models() <= available:
@@ -82,7 +91,7 @@ def as_shipped(method: Method) -> Method:
         return weights.SHIPPED + name if name in method.models() else name
 
     parts = place(method.lights), place(method.normals), place(method.second)
-    return Method(name=label(*parts), lights=parts[0], normals=parts[1], second=parts[2], paper=method.paper)
+    return replace(method, name=label(*parts), lights=parts[0], normals=parts[1], second=parts[2])
 
 
 def chosen(out: Path, lights: str | None, normals: str | None, second: str | None, intensities: str | None) -> Method:

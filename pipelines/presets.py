@@ -17,6 +17,7 @@ from render.plan import DataConfig
 from sdps import recipes
 from sdps.lighting import ReadOut
 from sdps.models.registry import MODELS
+from sdps.symmetry import check_views
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +38,8 @@ class TestConfig:
         pictures: Scenes shown in the report, per shape.
         read_out: How LCNet's classes become lights: `centre` (the paper's) or `expectation`.
         rotations: Rotations about the view axis that pixel networks average over.
+        light_views: Turned and mirrored views that lights are averaged over, 1, 2, 4 or 8.
+        normal_views: The same for normals.
         precision: Arithmetic of the networks, `float32` or `bfloat16`.
     """
 
@@ -53,6 +56,8 @@ class TestConfig:
     pictures: int = 5
     read_out: ReadOut = "centre"
     rotations: int = 10
+    light_views: int = 1
+    normal_views: int = 1
     precision: Literal["float32", "bfloat16"] = "bfloat16"
 
     def __post_init__(self) -> None:
@@ -67,6 +72,7 @@ class TestConfig:
             raise InputError("shapes and materials must name at least one each")
         if self.seed < 0 or self.bounces < 0:
             raise InputError("seed and bounces must not be negative")
+        check_views(self.light_views, self.normal_views)
         light_sets.load(self.lights)
 
 

@@ -45,6 +45,8 @@ AUTO = "auto"
 _LEARNED = ("sdps-plus", "sdps")
 _CALIBRATED = ("psfcn", "robust-least-squares")
 _FALLBACK = "pf14"
+INFER_CONFIG = RunnerConfig(precision="float32", light_views=8)
+"""LCNet sees 128x128 whatever the photographs' size, so that seven more views cost little."""
 RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
          "grazing": (-0.85, 0.45, 0.25)}  # fmt: skip
 
@@ -224,7 +226,7 @@ def infer(
         method: A combination (`sdps`), lights and normals (`lcnet+psfcn`), a normal model or a classical method;
             `auto` for the best there is: a shipped network, or a classical method where there is none.
         models: Folder of trained runs to take weights from before the shipped ones.
-        config: Read-out, precision and rotations of networks.
+        config: How networks are used; by default in float32, lights averaged over eight views.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
 
@@ -237,7 +239,7 @@ def infer(
         raise InputError(f"{photos.folder}: {grave.text}")
     find = partial(weights.require, out=None if models is None else Path(models))
     chosen = _automatic(photos, find) if method == AUTO else method
-    runner = Runner(_told(chosen, photos, find), find, config or RunnerConfig(precision="float32"))
+    runner = Runner(_told(chosen, photos, find), find, config or INFER_CONFIG)
     began = time.perf_counter()
     estimate = runner.estimate(photos, photos.mask, photos.light_directions, photos.intensities)
     seconds = time.perf_counter() - began

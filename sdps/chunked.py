@@ -8,7 +8,6 @@ Legend: L images, P pixels of the object, (h, w) the sides of what the network s
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from functools import reduce
 from typing import Any
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sdps.image_source import View
-from sdps.models.base import LightingNetwork, Lights, NormalNetwork, Statistics, divide
+from sdps.models.base import LightingNetwork, Lights, NormalNetwork, divide
 from sdps.observation_maps import predict_normals
 
 Autocast = Callable[[], AbstractContextManager]
@@ -58,17 +57,24 @@ def normal_map(network: NormalNetwork, view: View, lights: Lights | None, autoca
         lights: Of all images, (1, L, ...); None for networks that are not told the lights.
         autocast: Makes the context in which the network runs.
     """
-    statistics = None
-    if network.needs_statistics:
-        parts = (network.statistics(images, some_lights(lights, part)) for part, images in view)
-        statistics = reduce(Statistics.joined, parts)
+    mean_square = _mean_square(network, view, lights) if network.per_pixel else None
     mask, feature = view.mask, None
     for part, images in view:
-        seen = network.observe(images, mask, some_lights(lights, part), statistics)
+        seen = network.observe(images, mask, some_lights(lights, part), mean_square)
         with autocast():
             feature = _maximum(feature, network.encode(seen))
     with autocast():
-        return network.regress(feature, seen.initial).float()
+        return network.regress(feature).float()
+
+
+def _mean_square(network: NormalNetwork, view: View, lights: Lights | None) -> Tensor:
+    """Return the mean over all images and channels of the squares of what the network sees, (1, 1, 1, h, w)."""
+    total = 0.0
+    for part, images in view:
+        if network.needs_lights:
+            images = divide(images, some_lights(lights, part).intensities)
+        total = total + network.mean_square(images) * images.shape[1]
+    return total / len(view)
 
 
 def pixel_normal_map(network: nn.Module, view: View, lights: Lights, autocast: Autocast, *, rotations: int) -> Tensor:

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from render.errors import InputError
 from sdps.augment import measure_exposure
@@ -21,6 +22,7 @@ from sdps.lighting import ReadOut
 from sdps.models.base import Lights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
 from sdps.models.lighting_variants import LCNetSecond
+from sdps.symmetry import SYMMETRIES, KeptView, TurnedView, check_views, mean_lights, turned_context
 
 _ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels"), "second": ("second",)}
 
@@ -50,6 +52,8 @@ class Estimator:
         antialias: Average when the lighting networks' input is shrunk to 128x128 (the authors' code only interpolates).
         chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images.
         rotations: Rotations about the view axis that pixel networks average over.
+        light_views: Lights are the mean over so many turned and mirrored views of the object, 1, 2, 4 or 8.
+        normal_views: The same for normals; every view costs as much again.
 
     Raises:
         InputError: a model of another role than its place, or an option out of range.
@@ -65,6 +69,8 @@ class Estimator:
     antialias: bool = True
     chunk_pixels: int = 2**19
     rotations: int = 10
+    light_views: int = 1
+    normal_views: int = 1
 
     def __post_init__(self) -> None:
         for place, roles in _ROLES.items():
@@ -78,6 +84,7 @@ class Estimator:
         for name, least in (("margin", 0), ("chunk_pixels", 1), ("rotations", 1)):
             if getattr(self, name) < least:
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        check_views(self.light_views, self.normal_views)
 
     @property
     def needs_lights(self) -> bool:
@@ -189,17 +196,28 @@ class Estimator:
     def _lighting_pass(
         self, place: str, scene: ObjectImages, read_out: ReadOut, diagnostics: dict[str, Any], context: Any = None
     ) -> Lights:
-        """Return the lights (1, L, ...) that the lighting network in `place` finds."""
+        """Return the lights (1, L, ...) that the lighting network in `place` finds, the mean over the views."""
         network = getattr(self, place).network
         view = self._view(scene, place, None, self._shrink, INPUT_SIZE**2, diagnostics)
-        return network.lights(lighting_prediction(network, view, self._autocast, context), read_out)
+        if self.light_views > 1:
+            view = KeptView(view)
+        found = []
+        for symmetry in SYMMETRIES[: self.light_views]:
+            turned, extra = TurnedView(view, symmetry), turned_context(symmetry, context)
+            prediction = lighting_prediction(network, turned, self._autocast, extra)
+            found.append((symmetry, network.lights(prediction, read_out)))
+        return mean_lights(found)
 
     def _normals(self, view: View, lights: Lights | None) -> Tensor:
-        """Return normals (1, 3, h, w) of a view."""
+        """Return normals (1, 3, h, w) of a view, the mean over the views it is turned into."""
         network = self.normals.network
         if self.normals.role == "pixels":
             return pixel_normal_map(network, view, lights, self._autocast, rotations=self.rotations)
-        return normal_map(network, view, lights, self._autocast)
+        found = []
+        for symmetry in SYMMETRIES[: self.normal_views]:
+            turned = normal_map(network, TurnedView(view, symmetry), symmetry.lights(lights), self._autocast)
+            found.append(symmetry.vectors_back(symmetry.images_back(turned), dim=1))
+        return functional.normalize(torch.stack(found).mean(0), dim=1) if len(found) > 1 else found[0]
 
     def _view(
         self,

@@ -43,6 +43,7 @@ class Method:
         second: A second lighting pass, or empty.
         intensities: `true` where only the intensities are given, else empty.
         read_out: How light classes become lights; None for the runner's.
+        light_views: Turned views that lights are averaged over; None for the runner's.
         paper: Row of the paper's table.
     """
 
@@ -52,6 +53,7 @@ class Method:
     second: str = NONE
     intensities: str = NONE
     read_out: ReadOut | None = None
+    light_views: int | None = None
     paper: str = ""
 
     def models(self) -> set[str]:
@@ -67,11 +69,15 @@ class RunnerConfig:
         read_out: How light classes become lights.
         precision: Arithmetic of the networks.
         rotations: Rotations about the view axis that pixel networks average over.
+        light_views: Turned and mirrored views that lights are averaged over, 1, 2, 4 or 8.
+        normal_views: The same for normals.
     """
 
     read_out: ReadOut = "expectation"
     precision: Literal["float32", "bfloat16"] = "bfloat16"
     rotations: int = 10
+    light_views: int = 1
+    normal_views: int = 1
 
 
 @cache
@@ -100,6 +106,7 @@ class Runner:
             return _loaded(self.files[name]) if name in self.files else None
 
         lighting, normals, second = (model(name) for name in (method.lights, method.normals, method.second))
+        self.light_views = config.light_views if method.light_views is None else method.light_views
         self.estimator = None
         if lighting is not None or normals is not None:
             self.estimator = Estimator(
@@ -110,6 +117,8 @@ class Runner:
                 precision=config.precision,
                 read_out=method.read_out or config.read_out,
                 rotations=config.rotations,
+                light_views=self.light_views,
+                normal_views=config.normal_views,
             )
 
     def identity(self) -> str:
@@ -121,7 +130,8 @@ class Runner:
         if self.estimator is not None:
             named = {place: getattr(method, place) for place in ("lights", "normals", "second")}
             parts += [(place, _digest(self.files[name])) for place, name in named.items() if name in self.files]
-            parts += [method.read_out or config.read_out, config.precision, config.rotations, _inference_digest()]
+            parts += [method.read_out or config.read_out, config.precision, config.rotations]
+            parts += [self.light_views, config.normal_views, _inference_digest()]
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
     def estimate(
@@ -201,6 +211,12 @@ def label(lights: str, normals: str, second: str = NONE) -> str:
     return " + ".join(part for part in (lights, second, normals) if part) + suffix
 
 
+def views_of(lights: str, normals: str, second: str = NONE) -> int | None:
+    """Return over how many views a combination averages its lights, None for the runner's choice."""
+    parts = tuple(part.removeprefix(weights.SHIPPED) for part in (lights, normals, second) if part)
+    return next((pair.light_views for pair in COMBINATIONS.values() if pair.members() == parts), None)
+
+
 def combine(
     lights: str | None, normals: str | None, second: str | None, intensities: str | None, find: Callable[[str], Path]
 ) -> Method:
@@ -233,7 +249,9 @@ def combine(
     name = label(_stem(lights), _stem(normals), _stem(second or NONE))
     if intensities:
         name += ", true intensities"
-    method = Method(name=name, lights=lights, normals=normals, second=second or NONE, intensities=intensities or NONE)
+    views = views_of(_stem(lights), _stem(normals), _stem(second or NONE))
+    method = Method(name=name, lights=lights, normals=normals, second=second or NONE, intensities=intensities or NONE,
+                    light_views=views)  # fmt: skip
     for needed in sorted(method.models()):
         find(needed)
     return method
@@ -313,7 +331,7 @@ def _check_classical(normals: str, lights: str, second: str | None, intensities:
 def _inference_digest() -> str:
     """Return a digest of the code that uses trained networks, so that results of other code are told apart."""
     root, digest = Path(__file__).parent, hashlib.sha256()
-    names = ("inference", "chunked", "image_source", "augment", "lighting", "observation_maps")
+    names = ("inference", "chunked", "image_source", "augment", "lighting", "observation_maps", "symmetry")
     for path in [*(root / f"{name}.py" for name in names), *sorted((root / "models").glob("*.py"))]:
         digest.update(re.sub(rb"\s+", b" ", path.read_bytes()))
     return digest.hexdigest()

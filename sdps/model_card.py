@@ -182,8 +182,6 @@ def _input(model: TrainedModel) -> str:
         lines.append("It is told the light directions, and images are divided by the light intensities.")
     if getattr(network, "per_pixel", False):
         lines.append("Images are divided by each pixel's norm over the lights.")
-    if getattr(network, "refines", False):
-        lines.append("It also sees the normals of least squares under these lights, and adds to them.")
     return "## What it expects\n\n" + "".join(f"- {line}\n" for line in lines)
 
 

@@ -105,6 +105,9 @@ def test_flags_that_a_classical_method_would_not_look_at(runs: Path) -> None:
     for flags in (("lcnet", None, None), (None, None, "true")):
         with pytest.raises(InputError, match="leave out --lights, --second and --intensities"):
             combine(flags[0], "pf14", flags[1], flags[2], find)
+    assert combine(None, "sdps-plus", None, None, lambda name: Path(name)).light_views == 8
+    assert combine(None, "shipped:sdps-plus", None, None, lambda name: Path(name)).light_views == 8
+    assert combine(None, "sdps", None, None, lambda name: Path(name)).light_views is None
     given = combine("true", "sdps-plus", None, None, lambda name: Path(name))
     assert given.second == ""  # of lights that are given nothing is left to correct
 
@@ -144,8 +147,9 @@ def test_results_are_kept_until_something_changes(tmp_path: Path, runs: Path, mo
             Evaluation(tmp_path).result(changed, runner)
     networks = [Runner(parse(text, methods.finder(runs)), methods.finder(runs), config)
                 for text, config in (("sdps", RunnerConfig()), ("sdps", RunnerConfig(read_out="centre")),
+                                     ("sdps", RunnerConfig(light_views=8)), ("sdps", RunnerConfig(normal_views=2)),
                                      ("true+nenet", RunnerConfig()), ("lcnet+psfcn", RunnerConfig()))]  # fmt: skip
-    assert len({item.identity() for item in networks}) == 4
+    assert len({item.identity() for item in networks}) == 6
 
 
 def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

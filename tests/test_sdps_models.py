@@ -1,9 +1,7 @@
 """The networks: sizes from the paper's tables, invariances, and what their losses mean."""
 
-import numpy as np
 import pytest
 import torch
-from torch.nn import functional
 
 from render.errors import InputError
 from sdps.losses import faithful_normal_loss, masked_normal_loss
@@ -182,33 +180,6 @@ def test_per_pixel_networks_see_shading_without_albedo() -> None:
     norm = thirty_two.square().sum((1, 2), keepdim=True).sqrt()
     seen = network.observe(thirty_two, torch.ones(1, 1, 4, 4), Lights(torch.rand(1, 32, 3), torch.ones(1, 32)))
     torch.testing.assert_close(seen.images, thirty_two / norm, rtol=1e-3, atol=1e-5)
-
-
-def shaded(normals: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """Return Lambertian images (1, Q, 3, H, W) of normals (1, 3, H, W), of three albedos, without shadows."""
-    return (
-        torch.einsum("bchw,bqc->bqhw", normals, directions)[:, :, None] * torch.tensor([0.2, 0.5, 0.8])[:, None, None]
-    )
-
-
-def test_a_refining_network_starts_at_the_normals_of_least_squares() -> None:
-    normals = functional.normalize(torch.randn(1, 3, 8, 8) * 0.2 + torch.tensor([0.0, 0.0, 1.0])[:, None, None], dim=1)
-    directions = functional.normalize(torch.randn(1, 9, 3) * 0.3 + torch.tensor([0.0, 0.0, 1.0]), dim=-1)
-    intensities, mask = torch.rand(1, 9) + 0.5, torch.ones(1, 1, 8, 8)
-    mask[..., :2] = 0.0
-    images = shaded(normals, directions) * intensities[..., None, None, None]
-    network = NENet(refines=True, per_pixel=True)
-    seen = network.observe(images, mask, Lights(directions, intensities))
-    inside = mask[:, 0].bool()
-    cosine = (seen.initial * normals).sum(1)[inside]
-    assert cosine.min() > np.cos(np.deg2rad(1.0))  # the ridge leaves a fraction of a degree
-    assert (seen.initial.movedim(1, -1)[~inside] == 0.0).all()
-    assert torch.equal(network(seen).movedim(1, -1)[inside], functional.normalize(seen.initial).movedim(1, -1)[inside])
-    # Lights in a plane leave a direction open, black pixels all of them: there is an answer all the same.
-    flat = directions * torch.tensor([1.0, 0.0, 1.0])
-    for some, lights in ((images, flat), (images * 0.0, directions)):
-        found = network(network.observe(some, mask, Lights(lights, intensities)))
-        assert torch.isfinite(found).all()
 
 
 def test_a_network_sees_only_what_it_declares() -> None:

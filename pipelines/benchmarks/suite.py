@@ -168,6 +168,9 @@ def add_arguments(parser: Any, out: str) -> None:
     parser.add_argument("--objects", action="append", help="commas or repeat (default: all in the folder)")
     parser.add_argument("--read-out", default="expectation", choices=("centre", "expectation", "peak"),
                         help="how light classes become lights (the paper: centre; default: %(default)s)")  # fmt: skip
+    parser.add_argument("--light-views", type=int, default=1, metavar="N",
+                        help="turned views that lights are averaged over: 1, 2, 4 or 8 (default: 1)")  # fmt: skip
+    parser.add_argument("--normal-views", type=int, default=1, metavar="N", help="the same for normals (default: 1)")
     parser.add_argument("--out", type=Path, default=Path(out), help="output folder (default: %(default)s)")
 
 
@@ -188,7 +191,14 @@ def describe(runners: Sequence[Runner], config: RunnerConfig) -> str:
     """Say how networks were used, where there are any."""
     if not any(runner.estimator for runner in runners):
         return ""
-    return f" Networks: light classes read out by {config.read_out}, {config.precision}."
+    views = f"lights averaged over {config.light_views} views, normals over {config.normal_views}"
+    views = "" if config.light_views == config.normal_views == 1 else f", {views}"
+    return f" Networks: light classes read out by {config.read_out}{views}, {config.precision}."
+
+
+def runner_config(args: Any) -> RunnerConfig:
+    """Return how the flags want networks to be used."""
+    return RunnerConfig(read_out=args.read_out, light_views=args.light_views, normal_views=args.normal_views)
 
 
 def pictured(chosen: Sequence[Method]) -> list[str]:

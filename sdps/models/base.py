@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from sdps.lighting import LightClasses, ReadOut
 from sdps.models.blocks import max_over_images
@@ -85,77 +84,30 @@ class LightingNetwork(nn.Module, ABC):
         return self.predict(local, max_over_images(local, keepdim=True))
 
 
-class Statistics(NamedTuple):
-    """Sums over the images of a scene, for what a network has to know of every pixel before it sees the first image.
-
-    Float32 whatever the precision of the networks: squares of bfloat16 would carry errors of a per cent.
-    """
-
-    count: int  # images
-    squares: Tensor  # (B, 1, H, W), of the mean over the channels of the squares
-    moment: Tensor | None = None  # (B, 3, H, W), of the grey value times the light direction
-    gram: Tensor | None = None  # (B, 3, 3), of the outer products of the light directions
-
-    @staticmethod
-    def of(images: Tensor, directions: Tensor | None = None) -> "Statistics":
-        """Return the sums over images (B, Q, 3, H, W) under light directions (B, Q, 3)."""
-        with torch.autocast(images.device.type, enabled=False):
-            images = images.float()
-            squares = images.square().mean(dim=2).sum(dim=1, keepdim=True)
-            if directions is None:
-                return Statistics(images.shape[1], squares)
-            lights = directions.float()
-            moment = torch.einsum("bqhw,bqc->bchw", images.mean(dim=2), lights)
-            return Statistics(images.shape[1], squares, moment, lights.mT @ lights)
-
-    def joined(self, other: "Statistics") -> "Statistics":
-        """Return the sums over the images of both."""
-        return Statistics(*(None if one is None else one + two for one, two in zip(self, other, strict=True)))
-
-    def mean_square(self) -> Tensor:
-        """Return the mean over images and channels of the squares, (B, 1, H, W)."""
-        # The tiny floor keeps the square root's gradient finite at pixels that are black under every light.
-        return (self.squares / self.count).clamp(min=1e-14)
-
-    def normals(self) -> Tensor:
-        """Return the unit normals (B, 3, H, W) of calibrated least squares (Woodham 1980), (0, 0, 1) of black pixels.
-
-        A thousandth of the identity is added to the mean outer product, for lights that do not span space.
-        """
-        with torch.autocast(self.squares.device.type, enabled=False):
-            ridge = 1e-3 * torch.eye(3, device=self.squares.device)
-            scaled = torch.linalg.solve(self.gram / self.count + ridge, self.moment.flatten(2) / self.count)
-            towards = torch.tensor([0.0, 0.0, _TINY], device=scaled.device)[:, None]
-            return functional.normalize(scaled + towards, dim=1, eps=_TINY).unflatten(2, self.squares.shape[-2:])
-
-
 class Observations(NamedTuple):
     """What a normal network sees of a scene; made by `NormalNetwork.observe`."""
 
     images: Tensor  # (B, Q, 3, H, W), divided by the light intensities if the network is told the lights
     directions: Tensor | None = None  # (B, Q, 3)
     mask: Tensor | None = None  # (B, 1, H, W)
-    initial: Tensor | None = None  # (B, 3, H, W), unit normals to start from, zero outside the mask
 
 
 class NormalNetwork(nn.Module, ABC):
     """Estimates normals from any number of images, in any order, by the maximum over their features.
 
     `encode` followed by `regress` lets a caller keep a running maximum, so that memory does not grow with the number
-    of images. A network with `per_pixel` or `refines` also needs sums over all images beforehand.
+    of images. A network with `per_pixel` also needs each pixel's norm over all images beforehand.
 
     Attributes:
         needs_lights: The network is told directions, and its images are divided by the intensities.
         needs_mask: The mask is an input channel.
         per_pixel: Images are divided by each pixel's norm over all lights and channels (PS-FCN (Norm.), Chen et al.,
             TPAMI 2020), which takes albedo away and leaves shading.
-        refines: The network sees the normals of calibrated least squares, and learns what they lack.
     """
 
     needs_lights: bool = True
     needs_mask: bool = False
     per_pixel: bool = False
-    refines: bool = False
     size_multiple: int = 4
 
     def observe(
@@ -163,7 +115,7 @@ class NormalNetwork(nn.Module, ABC):
         images: Tensor,  # (B, Q, 3, H, W)
         mask: Tensor,  # (B, 1, H, W)
         lights: Lights | None,
-        statistics: Statistics | None = None,
+        mean_square: Tensor | None = None,  # (B, 1, 1, H, W)
     ) -> Observations:
         """Prepare images for `encode`.
 
@@ -171,44 +123,34 @@ class NormalNetwork(nn.Module, ABC):
             images: Exposed images, under lights of the intensities in `lights`.
             mask: 0 or 1.
             lights: May be None for networks that are not told the lights.
-            statistics: Those of all images of the scene, from `statistics`, where `images` are only some.
+            mean_square: `mean_square(...)` over all images of the scene where `images` are only some; see `per_pixel`.
         """
-        if self.needs_statistics and statistics is None:
-            statistics = self.statistics(images, lights)
         if self.needs_lights:
             images = divide(images, lights.intensities)
         if self.per_pixel:
+            squares = mean_square if mean_square is not None else self.mean_square(images)
             # The published norm of 32 images of 3 channels, whatever the number of images here.
-            images = images / ((32 * 3 * statistics.mean_square()[:, None]).sqrt() + _SCALE_FLOOR)
-        return Observations(
-            images,
-            lights.directions if self.needs_lights else None,
-            mask if self.needs_mask else None,
-            statistics.normals() * mask if self.refines else None,
-        )
+            images = images / ((32 * 3 * squares).sqrt() + _SCALE_FLOOR)
+        return Observations(images, lights.directions if self.needs_lights else None, mask if self.needs_mask else None)
 
-    @property
-    def needs_statistics(self) -> bool:
-        """Whether `observe` needs sums over all images."""
-        return self.per_pixel or self.refines
-
-    def statistics(self, images: Tensor, lights: Lights | None) -> Statistics:
-        """Return the sums over images (B, Q, 3, H, W), under `lights` if the network is told them."""
-        if not self.needs_lights:
-            return Statistics.of(images)
-        return Statistics.of(divide(images, lights.intensities), lights.directions)
+    @staticmethod
+    def mean_square(images: Tensor) -> Tensor:
+        """Return the mean over images and channels of the squares, (B, 1, 1, H, W), of (B, Q, 3, H, W)."""
+        # Before any autocast region: squares of bfloat16 would carry errors of a per cent.
+        # The tiny floor keeps the square root's gradient finite at pixels that are black under every light.
+        return images.float().square().mean(dim=(1, 2), keepdim=True).clamp(min=1e-14)
 
     @abstractmethod
     def encode(self, seen: Observations) -> Tensor:
         """Return the maximum over the features of the given images."""
 
     @abstractmethod
-    def regress(self, feature: Tensor, initial: Tensor | None = None) -> Tensor:
-        """Return unit normals (B, 3, H, W), float32, of the aggregated feature, and of those to start from."""
+    def regress(self, feature: Tensor) -> Tensor:
+        """Return unit normals (B, 3, H, W), float32, of the aggregated feature."""
 
     def forward(self, seen: Observations) -> Tensor:
         """Return unit normals (B, 3, H, W)."""
-        return self.regress(self.encode(seen), seen.initial)
+        return self.regress(self.encode(seen))
 
 
 def divide(images: Tensor, intensities: Tensor) -> Tensor:

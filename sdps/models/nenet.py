@@ -57,8 +57,6 @@ class MaxFusionNet(NormalNetwork):
             parts.append(lights.expand(-1, -1, -1, height, width))
         if seen.mask is not None:
             parts.append(seen.mask[:, None].expand(-1, count, -1, -1, -1))
-        if seen.initial is not None:
-            parts += [seen.initial[:, None].expand(-1, count, -1, -1, -1), attached_shading(seen)]
         inputs = torch.cat(parts, dim=2) if len(parts) > 1 else seen.images
         return self.extractor(inputs.flatten(0, 1)).unflatten(0, (scenes, count))
 
@@ -66,19 +64,12 @@ class MaxFusionNet(NormalNetwork):
         """Return the maximum (B, F, H/2, W/2) over the features of the given images."""
         return max_over_images(self.local(seen))
 
-    def regress(self, feature: Tensor, initial: Tensor | None = None) -> Tensor:
+    def regress(self, feature: Tensor) -> Tensor:
         """Return unit normals (B, 3, H, W), float32, of the aggregated feature (B, F, H/2, W/2)."""
         feature = self.regressor(feature).float()
         # Never under autocast: a normal rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
         with torch.autocast(feature.device.type, enabled=False):
-            change = self.normal(feature)
-            return functional.normalize(change if initial is None else initial + change, dim=1)
-
-
-def attached_shading(seen: Observations) -> Tensor:
-    """Return the cosine between normal and light, zero in attached shadow, (B, Q, 1, H, W)."""
-    cosine = torch.einsum("bchw,bqc->bqhw", seen.initial, seen.directions.to(seen.initial.dtype))
-    return cosine.clamp(min=0.0)[:, :, None]
+            return functional.normalize(self.normal(feature), dim=1)
 
 
 class NENet(MaxFusionNet):
@@ -88,13 +79,9 @@ class NENet(MaxFusionNet):
 
     Args:
         per_pixel: Divide by each pixel's norm over the lights first, as PS-FCN (Norm.) does.
-        refines: See, besides, the normals of calibrated least squares and their shading under each light, and add to
-            them. The network starts at their error instead of at that of a random one.
     """
 
-    def __init__(self, *, per_pixel: bool = False, refines: bool = False) -> None:
-        super().__init__(10 if refines else 6)
-        self.per_pixel, self.refines = per_pixel, refines
+    def __init__(self, *, per_pixel: bool = False) -> None:
+        super().__init__(6)
+        self.per_pixel = per_pixel
         initialise(self)
-        if refines:
-            nn.init.zeros_(self.normal.weight)

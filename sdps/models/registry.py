@@ -97,8 +97,8 @@ MODELS: dict[str, ModelEntry] = {
         summary="NENet on images divided by each pixel's norm over the lights",
     ),
     "nenet-plus": ModelEntry(
-        role="normals", build=NENet, options={"per_pixel": True, "refines": True}, parameters=2_212_352,
-        lights="lcnet-soft", summary="NENet that refines the normals of least squares, on lcnet-soft's lights",
+        role="normals", build=NENet, parameters=2_210_048, lights="lcnet-soft",
+        summary="NENet trained on lcnet-soft's lights",
     ),
     "psfcn": ModelEntry(
         role="normals", build=NENet, parameters=2_210_048, paper="B0", lights=TRUE_LIGHTS, recipe=_PSFCN,
@@ -149,6 +149,7 @@ class Combination:
         second: Second lighting pass, or empty.
         summary: One line.
         paper: Row of the paper's table, if any.
+        light_views: Turned views that lights are averaged over; None for what the caller wants.
     """
 
     lighting: str
@@ -156,6 +157,7 @@ class Combination:
     second: str = ""
     summary: str = ""
     paper: str = ""
+    light_views: int | None = None
 
     def members(self) -> tuple[str, ...]:
         """Return the names of the models."""
@@ -171,7 +173,7 @@ COMBINATIONS = {
     "sdps-reg": Combination("lcnet-reg", "nenet-reg", summary="SDPS-Net with regressed lights", paper="B3"),
     "sdps-plus": Combination(
         "lcnet-soft", "nenet-plus", "lcnet-second",
-        "soft-argmax lights, per-pixel normalisation, a second lighting pass",
+        "soft-argmax lights, averaged over eight views, and a second lighting pass", light_views=8,
     ),
 }  # fmt: skip
 
