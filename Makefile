@@ -107,10 +107,9 @@ ship: $(READY)
 
 shipped-results: OUT = out/shipped
 shipped-results: PRESET = ship
-shipped-results: METHODS = lcnet,sdps,sdps-plus,psfcn,least-squares
 shipped-results: $(ASSETS_READY)
 	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
-	$(if $(DATA),$(SDPS) eval-diligent '$(DATA)' --out $(OUT) --methods '$(METHODS)')
+	$(if $(DATA),$(SDPS) eval-diligent '$(DATA)' --out $(OUT) --methods '$(or $(METHODS),learned)')
 	$(SDPS) shipped-results --out $(OUT) --readme README.md
 
 report: $(READY)

@@ -30,6 +30,7 @@ NORMAL_ROWS = (  # lighting, normals, second, row of the paper
     (TRUE_LIGHTS, "cnnps", NONE, ""),
     ("lcnet", "cnnps", NONE, ""),
     ("lcnet-joint", "nenet-joint", NONE, ""),
+    ("lcnet-soft", "psfcn", NONE, ""),
     ("lcnet-soft", "nenet-plus", NONE, ""),
     ("lcnet-soft", "nenet-plus", "lcnet-second", ""),
     ("lcnet", "least-squares", NONE, ""),
@@ -45,7 +46,8 @@ def finder(out: Path | None) -> "partial[Path]":
 def lighting_methods(out: Path, preset: "Preset") -> list[Method]:
     """Return one method per lighting model trained in `out` or shipped, the paper's first, and LCNet's read-outs."""
     names = [name for name, item in MODELS.items() if item.role == "lighting"]
-    names += [*(name for name in preset.runs if _role(name, preset) == "lighting"), "lcnet-joint"]
+    names += [name for name in preset.runs if name not in names and _role(name, preset) == "lighting"]
+    names.append("lcnet-joint")
     trained = [name for name in names if weights.trained_file(out, name).is_file()]
     methods = [Method(name=name, lights=name, paper=MODELS[name].paper if name in MODELS else "") for name in trained]
     if "lcnet" in trained:

@@ -78,6 +78,7 @@ def save_weights(path: str | Path, model: TrainedModel, *, half: bool = False) -
     header["metadata"] = json.dumps(model.metadata)
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata=header)
+        temporary.chmod(0o644)  # safetensors leaves it to the owner alone
 
 
 def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedModel:

@@ -213,7 +213,11 @@ def test_expressions(models):
     assert (both.lights, both.normals) == ("lcnet", "least-squares")
     alone = parse("lcnet", finder(models))
     assert (alone.lights, alone.normals, alone.name) == ("lcnet", "", "lcnet")
+    learned, classic = (choose.selected([kind], models) for kind in ("learned", "classical"))
+    assert all(method.models() or "true lights" in method.name for method in learned)
+    assert not any(method.models() for method in classic)
     names = [method.name for method in choose.every_method(models)]
+    assert set(names) == {method.name for method in (*learned, *classic)}
     assert len(set(names)) == len(names) and {"lcnet", "lcnet + least-squares", "pf14", "constant predictor"} <= set(
         names
     )

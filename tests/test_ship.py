@@ -62,11 +62,12 @@ def evaluation(out: Path, used: Path) -> None:
     """Write what eval-merltest and eval-diligent write, in small."""
     rows = [["B1", "LCNet + NENet (shipped)", "3.10 (2.71)"], ["B2", "LCNet + PS-FCN", "not trained (3.19)"],
             ["-", "constant predictor", "45.05"]]  # fmt: skip
+    lights = [["A0", "LCNet", "not trained (3.47)"], ["A1", "LCNet_reg", "not trained (4.10)"]]
     table = {"header": ["row", "model", "sphere"], "rows": rows}
     merltest = {
         "config": {"spp": 64, "repeats": 5, "precision": "bfloat16", "read_out": "expectation"},
         "scenes": [{"shape": "sphere", "material": name} for name in ("chrome", "nylon")],
-        "tables": {"Table B, normal estimation (MAE)": table}, "weights": {"lcnet": str(used)},
+        "tables": {"Table A": {**table, "rows": lights}, "Table B, normal estimation (MAE)": table}, "weights": {"lcnet": str(used)},
     }  # fmt: skip
     real = [["sdps (shipped)", "ours", "2.90", "-", "2.90", "-"], ["SDPS-Net", "SDPS-Net, CVPR 2019", "2.77", "8.06",
             "2.77", "9.51"], ["WT13", "SDPS-Net, CVPR 2019", "4.39", "36.55", "4.39", "23.93"]]  # fmt: skip
@@ -88,7 +89,8 @@ def test_results_go_beside_the_weights_and_into_the_readme(tmp_path: Path, kept:
     text = (kept / "RESULTS.md").read_text()
     assert "2 scenes (sphere; 2 materials), 64 samples a pixel, 5 draws of light intensities" in text
     assert "| B1 | LCNet + NENet (shipped) | 3.10 (2.71) |" in text and "constant predictor" in text
-    assert "not trained" not in text
+    assert "not trained" not in text and "LCNet_reg" not in text
+    assert "| A0 | LCNet | (3.47) |" in text
     assert "| method | source | ball |" in text and "| SDPS-Net | SDPS-Net, CVPR 2019 | 2.77 |" in text
     assert "WT13" not in text and "8 bits, ball" in text
     assert "`lcnet.safetensors` " in text

@@ -12,6 +12,7 @@ from sdps.models.registry import COMBINATIONS, MODELS
 SHOWN = ("least-squares, true lights", "pf14")
 """Classical methods whose pictures are shown, if they are run."""
 
+LEARNED, CLASSICAL = "learned", "classical"
 _MOST_SHOWN = 4
 
 
@@ -36,14 +37,21 @@ def classical_rows(*, calibrated: bool) -> list[Method]:
 
 def every_method(out: Path | None) -> list[Method]:
     """Return every method there is: lighting models, all rows of normals, all classical methods."""
-    learned = methods.normal_methods(weights.shipped_folder() if out is None else out)  # nothing is trained there
-    found = [*lighting_rows(out), *learned, *classical_rows(calibrated=True)]
-    return list({method.name: method for method in found}.values())
+    return selected([LEARNED, CLASSICAL], out)
 
 
 def selected(expressions: list[str], out: Path | None) -> list[Method]:
-    """Return the methods of `--methods`, each once."""
-    return list({method.name: method for method in (parse(text, methods.finder(out)) for text in expressions)}.values())
+    """Return the methods of `--methods`, each once; `learned` and `classical` stand for all of a kind."""
+    found: list[Method] = []
+    for text in expressions:
+        if text == LEARNED:
+            normals = methods.normal_methods(weights.shipped_folder() if out is None else out)  # nothing trained there
+            found += [*lighting_rows(out), *normals]
+        elif text == CLASSICAL:
+            found += classical_rows(calibrated=True)
+        else:
+            found.append(parse(text, methods.finder(out)))
+    return list({method.name: method for method in found}.values())
 
 
 def shown(chosen: list[Method]) -> list[str]:

@@ -162,7 +162,7 @@ def add_arguments(parser: Any, out: str) -> None:
     """Declare the flags every benchmark has."""
     parser.add_argument("data", type=Path, help="folder of the benchmark, see docs/benchmarks.md")
     parser.add_argument("--methods", action="append", metavar="METHOD,LIGHTS+NORMALS,...",
-                        help="commas or repeat, e.g. pf14,sdps,lcnet+psfcn (default: all there are)")  # fmt: skip
+                        help="commas or repeat, e.g. lcnet+psfcn,learned,classical (default: all)")  # fmt: skip
     parser.add_argument("--models", type=Path, metavar="DIR",
                         help="--out of `sdps train`, whose models are evaluated (default: shipped ones)")  # fmt: skip
     parser.add_argument("--objects", action="append", help="commas or repeat (default: all in the folder)")
