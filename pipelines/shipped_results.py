@@ -87,7 +87,7 @@ def _read(path: Path, remedy: str) -> dict[str, Any]:
 
 
 def _measured(table: Table) -> Table:
-    """Leave out the paper's rows that no shipped model belongs to, but for its own networks, which are compared with."""
+    """Leave out the paper's rows that no shipped model belongs to, but for its own networks."""
     rows = []
     for row in table["rows"]:
         if not all(cell.startswith(NOT_TRAINED) for cell in row[2:]):

@@ -23,7 +23,8 @@ from sdps.models.blocks import parameter_count
 from sdps.models.registry import TRUE_LIGHTS
 
 UNKNOWN = "not recorded"
-_METRICS, _DATASET_CARD, _CONFIG = "metrics.jsonl", "DATASET_CARD.md", "config.yaml"
+_METRICS, _DATASET_CARD = "metrics.jsonl", "DATASET_CARD.md"
+_PRESET, _TRAINING = "config.yaml", "training.yaml"  # what `sdps train` leaves beside the weights
 _GIVES = {
     "lighting": "direction and relative intensity of the light of every image",
     "second": "direction and relative intensity of the light of every image, from the images and a first estimate of "
@@ -58,6 +59,7 @@ class _Sources(NamedTuple):
     model: TrainedModel
     rows: Rows  # metrics of the run, empty where there are none
     base: str  # model the run trains, `sdps-joint` included
+    preset: dict[str, Any]  # resolved, empty where it is not recorded
 
 
 def write_model_card(
@@ -97,7 +99,7 @@ def render_card(
     run = weights.absolute().parent.name
     file = weights if shipped is None else Path(shipped)
     stored = f"{file.stat().st_size / 1e6:.1f} MB as {'float32' if shipped is None else 'float16'}"
-    source = _Sources(run, file.name, stored, model, rows, _base(weights.parent / _CONFIG) or model.name)
+    source = _Sources(run, file.name, stored, model, rows, _base(weights.parent) or model.name, _preset(weights.parent))
     folder = Path(data) if data is not None and (Path(data) / MANIFEST).is_file() else None
     sections = [
         _front_matter(source),
@@ -114,13 +116,23 @@ def render_card(
     return "\n".join(sections)
 
 
-def _base(config: Path) -> str:
-    """Return the model that the run's configuration names, if there is one beside the weights."""
+def _base(folder: Path) -> str:
+    """Return the model of the run, if that is recorded beside the weights."""
+    return str(_plain(folder / _TRAINING).get("model", ""))
+
+
+def _preset(folder: Path) -> dict[str, Any]:
+    """Return the resolved preset beside the weights; empty if there is none."""
+    values = _plain(folder / _PRESET)
+    return values if "data" in values else {}
+
+
+def _plain(file: Path) -> dict[str, Any]:
     try:
-        values = yaml.safe_load(read_text(config))
+        values = yaml.safe_load(read_text(file))
     except (InputError, yaml.YAMLError):
-        return ""
-    return str(values.get("model", "")) if isinstance(values, dict) else ""
+        return {}
+    return values if isinstance(values, dict) else {}
 
 
 def _front_matter(source: _Sources) -> str:
@@ -281,6 +293,8 @@ def _licences(folder: Path | None, terms: Sequence[tuple[str, str, str]]) -> str
 
 def _repeat(source: _Sources) -> str:
     """Give a preset that resolves to this run's settings, and the command that trains it."""
+    if source.preset:
+        return _repeat_all(source)
     config = source.model.metadata["config"]
     preset = {"name": "repeat", "description": f"Trains {source.run} again.", "train": [source.run],
               "runs": {source.run: {"base": source.base, **config}}}  # fmt: skip
@@ -290,6 +304,19 @@ def _repeat(source: _Sources) -> str:
     return (
         f"## How to repeat it\n\nSave this as `repeat.yaml` and run `sdps train --preset repeat.yaml --data DATA --out "
         f"OUT`, with the data folder above as DATA.{first}\n\n```yaml\n{text}```\n"
+    )
+
+
+def _repeat_all(source: _Sources) -> str:
+    """Give the preset that was trained with, for data, this run, and those whose weights it needs."""
+    kept = {name: value for name, value in source.preset.items() if name != "test"}
+    preset = {**kept, "name": "repeat", "description": f"Trains {source.run} again.", "train": [source.run]}
+    text = yaml.safe_dump(preset, sort_keys=False, width=120)
+    return (
+        "## How to repeat it\n\nSave this as `repeat.yaml`; it is the preset "
+        f"`{source.preset.get('name', UNKNOWN)}` with all settings as they were. `sdps render-data --preset "
+        "repeat.yaml --out OUT` makes the data again, `sdps train --preset repeat.yaml --out OUT` trains this run, "
+        f"after those whose weights it needs.\n\n```yaml\n{text}```\n"
     )
 
 

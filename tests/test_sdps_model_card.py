@@ -10,6 +10,7 @@ import yaml
 from sdps_scenes import write_data
 
 from pipelines import presets
+from pipelines.train import in_order
 from render.config import to_plain, to_yaml
 from render.errors import InputError
 from render.manifest import MANIFEST
@@ -42,7 +43,7 @@ def write_run(out: Path, data: Path | None, *, model: str = "nenet", name: str =
     rows = [{"step": 4, "loss": 1.0, "images_per_second": 80.0, "waiting_share": 0.02, "seconds": 2700.0},
             {"step": 4, "val_normal_mae": 11.5}, {"step": 8, "val_normal_mae": 12.3456}]  # fmt: skip
     (path.parent / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    (path.parent / "config.yaml").write_text(to_yaml({"model": model, "training": config}))
+    (path.parent / "training.yaml").write_text(to_yaml({"model": model, "training": config}))
     return path
 
 
@@ -77,6 +78,18 @@ def test_its_preset_repeats_the_run(tmp_path: Path, data: Path) -> None:
     assert (run.model, run.config) == ("nenet", CONFIG)
 
 
+def test_the_whole_preset_is_told_where_it_is_known(tmp_path: Path, data: Path) -> None:
+    weights = write_run(tmp_path, data)
+    preset = presets.load("smoke", ["runs.first={base: psfcn}", "runs.own={base: nenet, start: first}"])
+    presets.save_resolved(preset, weights.parent)
+    block = re.search(r"```yaml\n(.*?)```", render_card(weights, data), re.DOTALL).group(1)
+    (tmp_path / "repeat.yaml").write_text(block)
+    again = presets.load(str(tmp_path / "repeat.yaml"))
+    assert again.train == ("own",) and again.data == preset.data
+    assert in_order(again, ["own"]) == in_order(preset, ["own"])
+    assert sorted(in_order(again, ["own"])) == ["first", "lcnet", "own"]
+
+
 def test_its_snippet_loads_the_weights(tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     weights = write_run(tmp_path, data)
     lighting = write_run(tmp_path, data, model="lcnet", name="lcnet", config=LightingTraining())
@@ -92,7 +105,7 @@ def test_its_snippet_loads_the_weights(tmp_path: Path, data: Path, monkeypatch: 
 def test_what_is_not_known_is_not_recorded(tmp_path: Path) -> None:
     weights = write_run(tmp_path, None)
     (weights.parent / "metrics.jsonl").unlink()
-    (weights.parent / "config.yaml").unlink()
+    (weights.parent / "training.yaml").unlink()
     model = load_weights(weights)
     bare = {"config": model.metadata["config"]}
     save_weights(weights, TrainedModel(model.name, model.network, {}, bare))

@@ -46,6 +46,9 @@ def test_shipped_weights_are_halves_with_card_and_curve(tmp_path: Path, kept: Pa
     assert all(torch.equal(after[name], value.half().float()) for name, value in before.items())
     card = (kept / "lcnet.md").read_text()
     assert "8.8 MB as float16" in card and "4,409,692" in card
+    written = (kept / "lcnet.safetensors").stat().st_mtime_ns
+    ship(["lcnet"], tmp_path / "run", kept)
+    assert (kept / "lcnet.safetensors").stat().st_mtime_ns == written  # nothing new, nothing written
     assert (
         weights.shipped() == ["lcnet"] and weights.locate("lcnet", tmp_path / "nothing") == kept / "lcnet.safetensors"
     )
@@ -67,7 +70,8 @@ def evaluation(out: Path, used: Path) -> None:
     merltest = {
         "config": {"spp": 64, "repeats": 5, "precision": "bfloat16", "read_out": "expectation"},
         "scenes": [{"shape": "sphere", "material": name} for name in ("chrome", "nylon")],
-        "tables": {"Table A": {**table, "rows": lights}, "Table B, normal estimation (MAE)": table}, "weights": {"lcnet": str(used)},
+        "tables": {"Table A": {**table, "rows": lights}, "Table B, normal estimation (MAE)": table},
+        "weights": {"lcnet": str(used)},
     }  # fmt: skip
     real = [["sdps (shipped)", "ours", "2.90", "-", "2.90", "-"], ["SDPS-Net", "SDPS-Net, CVPR 2019", "2.77", "8.06",
             "2.77", "9.51"], ["WT13", "SDPS-Net, CVPR 2019", "4.39", "36.55", "4.39", "23.93"]]  # fmt: skip
