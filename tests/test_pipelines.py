@@ -13,6 +13,7 @@ from pipelines.regenerate import split_list
 from render.errors import InputError
 from render.manifest import read_manifest
 from render.shards import file_hash, read_shard
+from sdps import weights
 
 TINY = [word for item in ("size=32", "spp=2", "bounces=0") for word in ("--set", f"test.{item}")]
 
@@ -103,7 +104,8 @@ def test_help_lists_every_command(capsys):
         assert command in text
 
 
-def test_train_and_evaluate_without_data_or_weights_say_what_to_run(capsys, tmp_path):
+def test_train_and_evaluate_without_data_or_weights_say_what_to_run(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(weights, "shipped", list)  # as if none travelled with the package
     assert "sdps render-data" in fails(capsys, "train", "--preset", "smoke", "--out", str(tmp_path / "none"))
     assert "sdps train" in fails(capsys, "eval-merltest", "--preset", "smoke", "--out", str(tmp_path / "none"))
     assert not (tmp_path / "none" / "merltest").exists()

@@ -54,7 +54,7 @@ def test_what_a_run_needs() -> None:
     [
         ({}, {}, "nenett", "did you mean 'nenet'"),
         ({"normals": {"crp": 64}}, {}, "nenet", "did you mean 'normals.crop'"),
-        ({"lighting": {"size": 64}}, {}, "lcnet", "must be 128 for LCNet"),
+        ({"lighting": {"size": 96}}, {}, "lcnet", "must be 128 for LCNet"),
         ({}, {"nenet": {"crop": 30}}, "nenet", "crop must be"),
         ({}, {"mine": {"base": "lcnt"}}, "mine", "unknown model 'lcnt'"),
         ({}, {"upsfcn": {"lights": "lcnet"}}, "upsfcn", "is told no lights"),
