@@ -16,7 +16,7 @@ from pipelines.evaluation import TestObject
 from pipelines.regenerate import split_list
 from pipelines.sections import Section, Table
 from render.config import to_plain
-from sdps.methods import Method
+from sdps.methods import Method, runner_config
 
 _PRINTED = "Published rows: bear with 96 images; 'this object' and 'mean of' are over the objects present."
 
@@ -37,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
     chosen = choose.selected(split_list(args.methods), models)
     items = suite.pick(diligent_objects(args.data, config), split_list(args.objects))
     chosen = chosen or choose.every_method(models)
-    using = suite.runner_config(args)
+    using = runner_config(args)
     shown = suite.pictured(chosen)
     found, runners = suite.run(items, chosen, models, args.out / "diligent" / "cache", using, shown)
     tables = build_tables(items, found, chosen)

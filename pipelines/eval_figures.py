@@ -11,7 +11,6 @@ from typing import Any
 from PIL import Image
 
 from pipelines import presets
-from pipelines.eval_merltest import runner_config
 from pipelines.evaluation import Evaluation
 from pipelines.figures import bins, images, lights, materials, pf14
 from pipelines.figures.workbench import Drawn, LeftOut, Workbench
@@ -23,7 +22,7 @@ from render.config import to_plain
 from render.errors import InputError, unknown
 from render.files import atomic_path, read_text, write_json
 from sdps import weights
-from sdps.methods import NONE, Method, Runner, parse
+from sdps.methods import NONE, Method, Runner, parse, runner_config
 from sdps.models.registry import COMBINATIONS
 
 _log = logging.getLogger(__name__)

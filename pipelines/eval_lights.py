@@ -17,7 +17,7 @@ from pipelines.regenerate import split_list
 from pipelines.sections import Section, Table
 from render.config import to_plain
 from render.errors import InputError
-from sdps.methods import CONSTANT, Method
+from sdps.methods import CONSTANT, Method, runner_config
 from sdps.models.registry import TRUE_LIGHTS
 
 
@@ -84,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
     _refuse_given([method for method in chosen if method.lights == TRUE_LIGHTS])
     items = suite.pick(bench.load(args), split_list(args.objects))
     chosen = chosen or default_methods(models)
-    using = suite.runner_config(args)
+    using = runner_config(args)
     shown = suite.pictured(chosen)
     found, runners = suite.run(items, chosen, models, args.out / bench.name / "cache", using, shown)
     tables = build_tables(bench, items, found, chosen)

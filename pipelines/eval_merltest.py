@@ -26,7 +26,7 @@ from render.errors import InputError
 from render.files import write_json
 from render.manifest import SceneSpec
 from render.progress import progress_bar
-from sdps.methods import CONSTANT, Method, Runner, RunnerConfig
+from sdps.methods import CONSTANT, Method, Runner, runner_config
 
 DEFINITION = (
     "Means over scenes (one per material). Normals: mean angular error in degrees over mask pixels. Directions: mean "
@@ -74,12 +74,6 @@ def main(args: argparse.Namespace) -> int:
     sys.stdout.write("\n".join(listed))
     sys.stdout.write(f"\n{DEFINITION}\n{page}\n")
     return 0
-
-
-def runner_config(config: TestConfig) -> RunnerConfig:
-    """Return how a preset uses networks at test."""
-    same = ("read_out", "precision", "rotations", "light_views", "normal_views")
-    return RunnerConfig(**{name: getattr(config, name) for name in same})
 
 
 def rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[list[Method], list[Method]]:

@@ -68,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
 def infer_folder(args: argparse.Namespace) -> "Inference":
     """Read the photographs, say what was found about them, and run the method."""
     from sdps.api import check_out, infer, load
-    from sdps.methods import RunnerConfig
+    from sdps.methods import runner_config
     from sdps.photos import check
 
     check_out(args.out, args.folder)
@@ -80,12 +80,10 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     height, width = photos.shape
     sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is taken for orthographic\n")
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
-    config = RunnerConfig(
-        read_out=args.read_out, precision=args.precision, light_views=args.light_views, normal_views=args.normal_views
-    )
     return infer(
-        photos, args.method, models=args.models, config=config, discontinuities=args.discontinuities, findings=findings
-    )
+        photos, args.method, models=args.models, config=runner_config(args), discontinuities=args.discontinuities,
+        findings=findings,
+    )  # fmt: skip
 
 
 def describe(findings: "Sequence[Finding]") -> str:

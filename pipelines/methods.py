@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sdps import recipes, weights
-from sdps.methods import NONE, Method, combine, label, views_of
+from sdps.methods import NONE, Method, combine, combined
 from sdps.models.registry import MODELS, TRUE_LIGHTS
 
 if TYPE_CHECKING:
@@ -77,8 +77,7 @@ def normal_methods(out: Path) -> list[Method]:
     trained, kept = [], []
     available = set(weights.shipped())
     for lights, normals, second, paper in NORMAL_ROWS:
-        name, views = label(lights, normals, second), views_of(lights, normals, second)
-        method = Method(name=name, lights=lights, normals=normals, second=second, paper=paper, light_views=views)
+        method = combined(lights, normals, second, paper=paper)
         if all(weights.trained_file(out, name).is_file() for name in method.models()):
             trained.append(method)
         if method.models() and method.models() <= available:
@@ -92,8 +91,7 @@ def as_shipped(method: Method) -> Method:
     def place(name: str) -> str:
         return weights.SHIPPED + name if name in method.models() else name
 
-    parts = place(method.lights), place(method.normals), place(method.second)
-    return replace(method, name=label(*parts), lights=parts[0], normals=parts[1], second=parts[2])
+    return combined(place(method.lights), place(method.normals), place(method.second), paper=method.paper)
 
 
 def chosen(out: Path, lights: str | None, normals: str | None, second: str | None, intensities: str | None) -> Method:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from render.errors import InputError
-from render.files import read_text, write_text
+from render.files import markdown_table, read_text, write_text
 from render.shards import file_hash
 from sdps import weights
 
@@ -110,9 +110,7 @@ def _compared(table: Table) -> Table:
 
 
 def _markdown(title: str, table: Table) -> str:
-    header, rows = list(table["header"]), table["rows"]
-    lines = [header, ["---"] * len(header), *rows]
-    return f"**{title}**\n\n" + "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+    return f"**{title}**\n\n{markdown_table(table['header'], table['rows'])}".rstrip()
 
 
 def _weights(files: Mapping[str, str]) -> str:

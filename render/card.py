@@ -12,7 +12,7 @@ from render.composition import Composition
 from render.config import read_yaml, to_yaml
 from render.croissant import Description
 from render.errors import InputError
-from render.files import atomic_path, read_text
+from render.files import atomic_path, markdown_table, read_text
 from render.manifest import MANIFEST, SceneSpec
 from render.progress import progress_bar
 from render.shards import file_hash
@@ -101,12 +101,6 @@ def _front_matter(text: Description, counts: Composition) -> str:
     return f"---\n{yaml.safe_dump(values, sort_keys=False)}---\n"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    lines += ["| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
-
-
 def _spelled(values: Mapping) -> str:
     """Spell counts: the value alone when there is one, else each with its number of scenes."""
     if len(values) == 1:
@@ -127,8 +121,8 @@ def _composition(scenes: Sequence[SceneSpec], there: Sequence[SceneSpec], counts
     ]
     categories = ", ".join(f"{name} {count:,}" for name, count in counts.categories.items())
     return (
-        "## Composition\n\n" + _table(("what", "number"), facts) + "\n"
-        + _table(("shape family", "scenes", "shapes", "views"), rows)
+        "## Composition\n\n" + markdown_table(("what", "number"), facts) + "\n"
+        + markdown_table(("shape family", "scenes", "shapes", "views"), rows)
         + f"\nScenes per material category: {categories}.\n"
     )  # fmt: skip
 
@@ -176,7 +170,11 @@ def _files(folder: Path) -> str:
     ]  # fmt: skip
     always = ("`shards/<id>.exr`", "`croissant.json`")
     present = [row for row in files if row[0] in always or (folder / row[0].strip("`")).is_file()]
-    return "## Files\n\n" + _table(("file", "content"), present) + "\nShards are ordinary multi-part OpenEXR (ZIP).\n"
+    return (
+        "## Files\n\n"
+        + markdown_table(("file", "content"), present)
+        + "\nShards are ordinary multi-part OpenEXR (ZIP).\n"
+    )
 
 
 def _splits(scenes: Sequence[SceneSpec], counts: Composition) -> str:
@@ -186,7 +184,7 @@ def _splits(scenes: Sequence[SceneSpec], counts: Composition) -> str:
     shared = sum(len(splits) > 1 for splits in owners.values())
     apart = "No shape is in two splits." if not shared else f"{shared:,} shapes are in more than one split."
     rows = [(name, f"{count:,}") for name, count in counts.splits.items()]
-    return "## Splits\n\n" + _table(("split", "scenes"), rows) + f"\n{apart}\n"
+    return "## Splits\n\n" + markdown_table(("split", "scenes"), rows) + f"\n{apart}\n"
 
 
 def _provenance(folder: Path, rendered: Mapping[str, str]) -> str:
@@ -206,7 +204,7 @@ def _provenance(folder: Path, rendered: Mapping[str, str]) -> str:
     if config:
         shown = {key: config[key] for key in ("name", "description", "data") if key in config} or config
         block = f"\nConfiguration (the part of `{CONFIG}` the data follow from):\n\n```yaml\n{to_yaml(shown)}```\n"
-    return "## Provenance\n\n" + _table(("what", "value"), rows) + block
+    return "## Provenance\n\n" + markdown_table(("what", "value"), rows) + block
 
 
 def _licences(text: Description, counts: Composition) -> str:
@@ -222,7 +220,8 @@ def _licences(text: Description, counts: Composition) -> str:
     meshes = provenance.mesh_terms(counts).items()
     return (
         f"## Licences\n\n{stated} What it was made from has terms of its own:\n\n"
-        + _table(("materials", "source", "terms"), materials) + "\n" + _table(("shapes", "terms"), list(meshes))
+        + markdown_table(("materials", "source", "terms"), materials) + "\n"
+        + markdown_table(("shapes", "terms"), list(meshes))
     )  # fmt: skip
 
 
@@ -247,5 +246,5 @@ def _validation(folder: Path) -> str:
         rows = [(check["name"], check["level"], check["findings"], check["about"]) for check in found]
     except (InputError, ValueError, KeyError, TypeError):
         return "## Validation\n\nNot validated: run `sdps data validate`, then write the card again.\n"
-    table = "\n" + _table(("check", "level", "findings", "what should hold"), rows) if rows else ""
+    table = "\n" + markdown_table(("check", "level", "findings", "what should hold"), rows) if rows else ""
     return f"## Validation\n\n{line}\n{table}"

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from render.errors import InputError
+from render.seeds import generator
 
 _FEWEST = 5
 _STEEPEST = 3.0
@@ -59,7 +60,7 @@ def predicted_range(steps: np.ndarray, values: np.ndarray, at: float, *, fits: i
         seed: Of the draws.
     """
     fit_power_law(steps, values)  # refuses what cannot be fitted
-    rng = np.random.default_rng(seed)
+    rng = generator(seed, "power law")
     found = []
     for _ in range(fits):
         chosen = np.sort(rng.integers(len(steps), size=len(steps)))

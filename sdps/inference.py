@@ -216,7 +216,7 @@ class Estimator:
         found = []
         for symmetry in SYMMETRIES[: self.normal_views]:
             turned = normal_map(network, TurnedView(view, symmetry), symmetry.lights(lights), self._autocast)
-            found.append(symmetry.vectors_back(symmetry.images_back(turned), dim=1))
+            found.append(symmetry.back.vectors(symmetry.back.images(turned), dim=1))
         return functional.normalize(torch.stack(found).mean(0), dim=1) if len(found) > 1 else found[0]
 
     def _view(

@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -78,6 +78,12 @@ class RunnerConfig:
     rotations: int = 10
     light_views: int = 1
     normal_views: int = 1
+
+
+def runner_config(settings: Any) -> RunnerConfig:
+    """Return how networks are used, from what parsed flags or a preset's section say of it by the same names."""
+    names = (field.name for field in fields(RunnerConfig))
+    return RunnerConfig(**{name: getattr(settings, name) for name in names if hasattr(settings, name)})
 
 
 @cache
@@ -217,6 +223,14 @@ def views_of(lights: str, normals: str, second: str = NONE) -> int | None:
     return next((pair.light_views for pair in COMBINATIONS.values() if pair.members() == parts), None)
 
 
+def combined(lights: str, normals: str, second: str = NONE, *, paper: str = "", intensities: str = NONE) -> Method:
+    """Return the method of parts that go together, with its label and, where they are a combination, its views."""
+    parts = tuple(_stem(part) for part in (lights, normals, second))
+    name = label(*parts) + (", true intensities" if intensities else "")
+    return Method(name=name, lights=lights, normals=normals, second=second, intensities=intensities,
+                  light_views=views_of(*parts), paper=paper)  # fmt: skip
+
+
 def combine(
     lights: str | None, normals: str | None, second: str | None, intensities: str | None, find: Callable[[str], Path]
 ) -> Method:
@@ -246,12 +260,7 @@ def combine(
         _check_classical(normals, lights, second, intensities)
     if second and lights in (NONE, TRUE_LIGHTS):
         raise InputError("--second corrects estimated lights; name a lighting model with --lights")
-    name = label(_stem(lights), _stem(normals), _stem(second or NONE))
-    if intensities:
-        name += ", true intensities"
-    views = views_of(_stem(lights), _stem(normals), _stem(second or NONE))
-    method = Method(name=name, lights=lights, normals=normals, second=second or NONE, intensities=intensities or NONE,
-                    light_views=views)  # fmt: skip
+    method = combined(lights, normals, second or NONE, intensities=intensities or NONE)
     for needed in sorted(method.models()):
         find(needed)
     return method

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from render.errors import InputError
-from render.files import read_text, write_text
+from render.files import markdown_table, read_text, write_text
 from render.manifest import MANIFEST, SceneSpec, read_manifest
 from render.shards import file_hash
 from sdps.checkpoint import TrainedModel, load_weights
@@ -169,7 +169,7 @@ def _about(source: _Sources) -> str:
         ("options of the network", _value(model.options) if model.options else "defaults"),
         ("weights", f"`{source.file}` (safetensors, {source.stored}); loading runs no code"),
     ]  # fmt: skip
-    return f"{entry.summary}.\n\n" + _table(("what", "value"), rows)
+    return f"{entry.summary}.\n\n" + markdown_table(("what", "value"), rows)
 
 
 def _input(model: TrainedModel) -> str:
@@ -213,8 +213,8 @@ def _training(source: _Sources) -> str:
             facts.append((f"frozen {use} model it was trained with", _value(metadata[use])))
     settings = [(f"`{name}`", _value(value)) for name, value in _flat(metadata["config"])]
     return (
-        f"## How it was trained\n\n{_table(('what', 'value'), facts)}\nAll settings, resolved:\n\n"
-        f"{_table(('setting', 'value'), settings)}"
+        f"## How it was trained\n\n{markdown_table(('what', 'value'), facts)}\nAll settings, resolved:\n\n"
+        f"{markdown_table(('setting', 'value'), settings)}"
     )
 
 
@@ -233,7 +233,7 @@ def _data(model: TrainedModel, folder: Path | None) -> str:
         rows += _composition(read_manifest(folder))
         if (folder / _DATASET_CARD).is_file():
             note = f"\nThe data folder's own `{_DATASET_CARD}` tells how the scenes were made.\n"
-    return f"## Data\n\n{_table(('what', 'value'), rows)}{note}"
+    return f"## Data\n\n{markdown_table(('what', 'value'), rows)}{note}"
 
 
 def _composition(scenes: Sequence[SceneSpec]) -> list[tuple[str, str]]:
@@ -259,7 +259,7 @@ def _validation(source: _Sources) -> str:
     scenes, images = (config.get(name, UNKNOWN) for name in ("validation_scenes", "images"))
     return (
         f"## Validation\n\nMeans over at most {scenes} scenes of split `val`, which training does not see, {images} "
-        f"images of each, augmented like those of training.\n\n{_table(header, rows)}"
+        f"images of each, augmented like those of training.\n\n{markdown_table(header, rows)}"
     )
 
 
@@ -275,7 +275,7 @@ def _defined(name: str) -> tuple[str, str]:
 def _licences(folder: Path | None, terms: Sequence[tuple[str, str, str]]) -> str:
     text = "The licence of these weights is not stated. What they were trained on has terms of its own.\n\n"
     if terms:
-        return "## Licences\n\n" + text + _table(("materials", "source", "terms"), terms)
+        return "## Licences\n\n" + text + markdown_table(("materials", "source", "terms"), terms)
     card = ""
     if folder is not None and (folder / _DATASET_CARD).is_file():
         found = re.search(
@@ -395,9 +395,3 @@ def _counts(counts: Mapping[Any, int]) -> str:
     if len(ordered) == 1:
         return f"{ordered[0][0]} ({ordered[0][1]:,})"
     return f"{sum(counts.values()):,}: " + ", ".join(f"{value} {count:,}" for value, count in ordered)
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    cells = ([str(cell).replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows)
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in cells)]) + "\n"

@@ -27,12 +27,9 @@ class Symmetry(NamedTuple):
 
     def images(self, images: Tensor) -> Tensor:
         """Turn images (..., h, w)."""
-        return torch.rot90(images.flip(-1) if self.mirror else images, self.turns, (-2, -1))
-
-    def images_back(self, images: Tensor) -> Tensor:
-        """Undo `images`."""
-        images = torch.rot90(images, -self.turns, (-2, -1))
-        return images.flip(-1) if self.mirror else images
+        images = images.flip(-1) if self.mirror else images
+        # Not by zero turns: that copies, out of the memory layout that networks are fast in.
+        return torch.rot90(images, self.turns, (-2, -1)) if self.turns else images
 
     def vectors(self, vectors: Tensor, dim: int = -1) -> Tensor:
         """Turn vectors whose x, y and z lie along dimension `dim`."""
@@ -42,12 +39,10 @@ class Symmetry(NamedTuple):
             x, y = -y, x
         return torch.stack([x, y, z], dim)
 
-    def vectors_back(self, vectors: Tensor, dim: int = -1) -> Tensor:
-        """Undo `vectors`."""
-        x, y, z = vectors.unbind(dim)
-        for _ in range(self.turns % 4):
-            x, y = y, -x
-        return torch.stack([-x if self.mirror else x, y, z], dim)
+    @property
+    def back(self) -> "Symmetry":
+        """What undoes it; a mirrored turn undoes itself."""
+        return self if self.mirror else Symmetry(-self.turns % 4)
 
     def lights(self, lights: Lights | None) -> Lights | None:
         """Turn the directions of lights."""
@@ -118,7 +113,7 @@ def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
     """Return the mean of lights found in turned views, each turned back: directions of unit length."""
     if len(found) == 1:
         return found[0][1]
-    directions = torch.stack([symmetry.vectors_back(lights.directions.float()) for symmetry, lights in found]).mean(0)
+    directions = torch.stack([symmetry.back.vectors(lights.directions.float()) for symmetry, lights in found]).mean(0)
     intensities = torch.stack([lights.intensities.float() for _, lights in found]).mean(0)
     sure = [lights.confidence for _, lights in found]
     confidence = None if sure[0] is None else torch.stack([one.float() for one in sure]).mean(0)

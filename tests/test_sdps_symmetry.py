@@ -32,8 +32,8 @@ def test_every_symmetry_is_that_of_training_and_has_a_way_back(symmetry: Symmetr
     np.testing.assert_array_equal(symmetry.images(stack).movedim(1, -1), turned[0])
     np.testing.assert_array_equal(symmetry.vectors(symmetry.images(map_), dim=0).movedim(0, -1), turned[1])
     np.testing.assert_array_equal(symmetry.vectors(lights), turned[3])
-    assert torch.equal(symmetry.images_back(symmetry.images(stack)), stack)
-    assert torch.equal(symmetry.vectors_back(symmetry.vectors(lights)), lights)
+    assert torch.equal(symmetry.back.images(symmetry.images(stack)), stack)
+    assert torch.equal(symmetry.back.vectors(symmetry.vectors(lights)), lights)
 
 
 def test_the_first_views_are_groups_and_all_are_different() -> None:
@@ -86,8 +86,8 @@ def differences(network: Estimator) -> tuple[float, float]:
     found = network.estimate_lights(turned_images, turned_mask).light_directions
     normals = network.estimate(images, mask, given.numpy(), np.ones(3)).normals
     turned = network.estimate(turned_images, turned_mask, quarter.vectors(given).numpy(), np.ones(3)).normals
-    back = quarter.vectors_back(torch.from_numpy(np.rot90(turned, -1).copy())).numpy()
-    lit = angle_degrees(quarter.vectors_back(torch.from_numpy(found)).numpy(), lights).max()
+    back = quarter.back.vectors(torch.from_numpy(np.rot90(turned, -1).copy())).numpy()
+    lit = angle_degrees(quarter.back.vectors(torch.from_numpy(found)).numpy(), lights).max()
     return float(lit), float(np.median(angle_degrees(back[mask], normals[mask])))
 
 

@@ -196,11 +196,6 @@ def describe(runners: Sequence[Runner], config: RunnerConfig) -> str:
     return f" Networks: light classes read out by {config.read_out}{views}, {config.precision}."
 
 
-def runner_config(args: Any) -> RunnerConfig:
-    """Return how the flags want networks to be used."""
-    return RunnerConfig(read_out=args.read_out, light_views=args.light_views, normal_views=args.normal_views)
-
-
 def pictured(chosen: Sequence[Method]) -> list[str]:
     """Return the names of the methods to show, and of the first lighting model."""
     names = choose.shown(list(chosen))
