@@ -4,15 +4,11 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipelines import presets
 from render.errors import InputError
 from render.files import read_bytes, write_text
 from sdps import recipes, weights
-
-if TYPE_CHECKING:
-    from sdps.checkpoint import TrainedModel
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,22 +56,8 @@ def ship(names: Sequence[str], out: Path, folder: Path) -> list[tuple[str, int]]
     written = []
     for name, file in files.items():
         kept = folder / f"{name}.safetensors"
-        model = load_weights(file)
-        if not _holds(kept, model):
-            save_weights(kept, model, half=True)
+        save_weights(kept, load_weights(file), half=True)
         write_model_card(kept.with_suffix(".md"), file, out / "data", shipped=kept)
         write_text(kept.with_suffix(".jsonl"), read_bytes(file.parent / METRICS).decode())
         written.append((name, kept.stat().st_size))
     return written
-
-
-def _holds(kept: Path, model: "TrainedModel") -> bool:
-    """Tell whether a shipped file holds this model already; written again it could differ in the header's order."""
-    from sdps.checkpoint import load_weights
-
-    if not kept.is_file():
-        return False
-    old, new = load_weights(kept), model.network.state_dict()
-    same = (old.name, old.options, old.metadata) == (model.name, model.options, model.metadata)
-    values = old.network.state_dict()
-    return same and all(name in values and value.half().float().equal(values[name]) for name, value in new.items())

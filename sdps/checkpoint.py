@@ -6,6 +6,7 @@ Neither file can execute code when loaded, and neither is ever half-written.
 import hashlib
 import json
 import pickle
+import struct
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import nn
 
 from render.config import build
@@ -23,6 +24,9 @@ from sdps.augment import Augmentation
 from sdps.models import registry
 
 FORMAT = "sdps-weights-1"
+
+_LENGTH = struct.Struct("<Q")
+"""The first bytes of a safetensors file: the length of its header, which is JSON."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +67,7 @@ def code_version() -> str:
 
 
 def save_weights(path: str | Path, model: TrainedModel, *, half: bool = False) -> None:
-    """Write the network's weights and metadata atomically.
+    """Write the network's weights and metadata atomically; the same model gives the same bytes.
 
     Args:
         path: Destination, by convention `.safetensors`.
@@ -77,8 +81,17 @@ def save_weights(path: str | Path, model: TrainedModel, *, half: bool = False) -
     header = {"format": FORMAT, "model": model.name, "options": json.dumps(model.options)}
     header["metadata"] = json.dumps(model.metadata)
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata=header)
-        temporary.chmod(0o644)  # safetensors leaves it to the owner alone
+        temporary.write_bytes(_with_sorted_header(save(tensors, metadata=header)))
+
+
+def _with_sorted_header(data: bytes) -> bytes:
+    """Return a safetensors file with the keys of its header in order; the library leaves them to chance."""
+    start = _LENGTH.size + _LENGTH.unpack_from(data)[0]
+    header = json.loads(data[_LENGTH.size : start])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % _LENGTH.size)  # tensors stay aligned
+    return _LENGTH.pack(len(text)) + text + data[start:]
 
 
 def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedModel:

@@ -268,6 +268,18 @@ def test_half_precision_weights_load_as_float32(tmp_path: Path) -> None:
         torch.testing.assert_close(tensor, model.network.state_dict()[name], atol=1e-3, rtol=1e-3)
 
 
+def test_the_same_model_gives_the_same_bytes(tmp_path: Path) -> None:
+    # The library leaves the order of the header to chance: eight tries in fresh hash maps would differ.
+    model = TrainedModel("nenet", create("nenet"), {}, {"config": {"augmentation": {}}, "code": "Zürich"})
+    files = [tmp_path / f"{number}.safetensors" for number in range(8)]
+    for file in files:
+        save_weights(file, model)
+    assert len({file.read_bytes() for file in files}) == 1
+    assert load_weights(files[0]).metadata["code"] == "Zürich"
+    (tmp_path / "plain").touch()
+    assert files[0].stat().st_mode == (tmp_path / "plain").stat().st_mode  # the library itself: the owner alone
+
+
 def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path: Path) -> None:
     weights = uninterrupted[1].weights["nenet"]
     cut, text = tmp_path / "cut.safetensors", tmp_path / "text.safetensors"
