@@ -240,7 +240,9 @@ def infer(
         raise InputError(f"{photos.folder}: {grave.text}")
     find = partial(weights.require, out=None if models is None else Path(models))
     chosen = _automatic(photos, find) if method == AUTO else method
-    runner = Runner(_told(chosen, photos, find), find, config or INFER_CONFIG)
+    # Eight views of large photographs take hours, so that `config` decides here, not the combination.
+    told = dataclasses.replace(_told(chosen, photos, find), light_views=None, normal_views=None)
+    runner = Runner(told, find, config or INFER_CONFIG)
     began = time.perf_counter()
     estimate = runner.estimate(photos, photos.mask, photos.light_directions, photos.intensities)
     seconds = time.perf_counter() - began

@@ -30,6 +30,7 @@ _digest = cache(file_hash)
 CONSTANT = "constant"
 """A predictor that sees nothing: what knowing nothing scores."""
 CLASSICAL = (*classical.METHODS, CONSTANT)
+_VIEWS = ("light_views", "normal_views")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +45,7 @@ class Method:
         intensities: `true` where only the intensities are given, else empty.
         read_out: How light classes become lights; None for the runner's.
         light_views: Turned views that lights are averaged over; None for the runner's.
+        normal_views: The same for normals.
         paper: Row of the paper's table.
     """
 
@@ -54,6 +56,7 @@ class Method:
     intensities: str = NONE
     read_out: ReadOut | None = None
     light_views: int | None = None
+    normal_views: int | None = None
     paper: str = ""
 
     def models(self) -> set[str]:
@@ -112,7 +115,8 @@ class Runner:
             return _loaded(self.files[name]) if name in self.files else None
 
         lighting, normals, second = (model(name) for name in (method.lights, method.normals, method.second))
-        self.light_views = config.light_views if method.light_views is None else method.light_views
+        own = {name: getattr(method, name) for name in _VIEWS}
+        self.views = {name: getattr(config, name) if count is None else count for name, count in own.items()}
         self.estimator = None
         if lighting is not None or normals is not None:
             self.estimator = Estimator(
@@ -123,8 +127,7 @@ class Runner:
                 precision=config.precision,
                 read_out=method.read_out or config.read_out,
                 rotations=config.rotations,
-                light_views=self.light_views,
-                normal_views=config.normal_views,
+                **self.views,
             )
 
     def identity(self) -> str:
@@ -137,7 +140,7 @@ class Runner:
             named = {place: getattr(method, place) for place in ("lights", "normals", "second")}
             parts += [(place, _digest(self.files[name])) for place, name in named.items() if name in self.files]
             parts += [method.read_out or config.read_out, config.precision, config.rotations]
-            parts += [self.light_views, config.normal_views, _inference_digest()]
+            parts += [*self.views.values(), _inference_digest()]
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
     def estimate(
@@ -217,10 +220,11 @@ def label(lights: str, normals: str, second: str = NONE) -> str:
     return " + ".join(part for part in (lights, second, normals) if part) + suffix
 
 
-def views_of(lights: str, normals: str, second: str = NONE) -> int | None:
-    """Return over how many views a combination averages its lights, None for the runner's choice."""
+def views_of(lights: str, normals: str, second: str = NONE) -> dict[str, int | None]:
+    """Return over how many views a combination averages lights and normals, None for the runner's choice."""
     parts = tuple(part.removeprefix(weights.SHIPPED) for part in (lights, normals, second) if part)
-    return next((pair.light_views for pair in COMBINATIONS.values() if pair.members() == parts), None)
+    pair = next((pair for pair in COMBINATIONS.values() if pair.members() == parts), None)
+    return {name: getattr(pair, name, None) for name in _VIEWS}
 
 
 def combined(lights: str, normals: str, second: str = NONE, *, paper: str = "", intensities: str = NONE) -> Method:
@@ -228,7 +232,7 @@ def combined(lights: str, normals: str, second: str = NONE, *, paper: str = "", 
     parts = tuple(_stem(part) for part in (lights, normals, second))
     name = label(*parts) + (", true intensities" if intensities else "")
     return Method(name=name, lights=lights, normals=normals, second=second, intensities=intensities,
-                  light_views=views_of(*parts), paper=paper)  # fmt: skip
+                  paper=paper, **views_of(*parts))  # fmt: skip
 
 
 def combine(

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import classical_scenes as scenes
@@ -18,7 +19,8 @@ from sdps_scenes import hemisphere_lights
 from pipelines import bench_infer
 from pipelines.cli import main
 from render.config import to_plain
-from sdps import weights
+from render.errors import InputError
+from sdps import api, methods, weights
 from sdps.api import infer, load
 from sdps.augment import Augmentation
 from sdps.checkpoint import TrainedModel, save_weights
@@ -137,6 +139,23 @@ def test_networks_with_and_without_known_lights(hills: tuple, tmp_path: Path, ca
     config = RunnerConfig(light_views=1)
     only = infer(load(folder), "lcnet+least-squares", models=models, config=config)
     assert only.method == "lcnet + least-squares" and only.normals[mask].any()
+
+
+def test_a_combination_does_not_decide_over_how_many_views(
+    hills: tuple, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def runner(method: methods.Method, find: Callable, config: RunnerConfig) -> None:
+        asked.append(method)
+        raise InputError("enough")
+
+    assert methods.parse("sdps-plus", Path).normal_views == 8
+    monkeypatch.setattr(api, "Runner", runner)
+    monkeypatch.setattr(api.weights, "require", lambda name, out: Path(name))
+    with pytest.raises(InputError, match="enough"):
+        infer(load(hills[0]), "sdps-plus")
+    assert (asked[0].light_views, asked[0].normal_views) == (None, None)
 
 
 def test_folders_and_methods_that_do_not_fit_are_one_line(hills: tuple, tmp_path: Path, capsys) -> None:

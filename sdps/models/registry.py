@@ -150,6 +150,7 @@ class Combination:
         summary: One line.
         paper: Row of the paper's table, if any.
         light_views: Turned views that lights are averaged over; None for what the caller wants.
+        normal_views: The same for normals.
     """
 
     lighting: str
@@ -158,6 +159,7 @@ class Combination:
     summary: str = ""
     paper: str = ""
     light_views: int | None = None
+    normal_views: int | None = None
 
     def members(self) -> tuple[str, ...]:
         """Return the names of the models."""
@@ -173,7 +175,8 @@ COMBINATIONS = {
     "sdps-reg": Combination("lcnet-reg", "nenet-reg", summary="SDPS-Net with regressed lights", paper="B3"),
     "sdps-plus": Combination(
         "lcnet-soft", "nenet-plus", "lcnet-second",
-        "soft-argmax lights, averaged over eight views, and a second lighting pass", light_views=8,
+        "soft-argmax lights and a second lighting pass, lights and normals averaged over eight views",
+        light_views=8, normal_views=8,
     ),
 }  # fmt: skip
 
