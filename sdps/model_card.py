@@ -331,7 +331,7 @@ def _load(source: _Sources) -> str:
         "pixels": (f'lighting="lcnet.safetensors", normals="{source.file}"', ", lights, intensities"),
     }  # fmt: skip
     arguments, known = files[role]
-    note = "  # leave lights and intensities out to have them estimated" if known else ""
+    note = "  # leave lights, intensities out to have them estimated" if known else ""
     if role in ("normals", "pixels") and not getattr(source.model.network, "needs_lights", role == "pixels"):
         arguments, known, note = f'normals="{source.file}"', "", ""
     return f"""## How to load it
