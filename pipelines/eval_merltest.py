@@ -27,6 +27,8 @@ from render.files import write_json
 from render.manifest import SceneSpec
 from render.progress import progress_bar
 from sdps.methods import CONSTANT, Method, Runner, runner_config
+from sdps.models.registry import TRUE_LIGHTS
+from sdps.weights import SHIPPED
 
 DEFINITION = (
     "Means over scenes (one per material). Normals: mean angular error in degrees over mask pixels. Directions: mean "
@@ -96,10 +98,16 @@ def rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[list[Meth
 
 
 def shown(normals: Sequence[Method]) -> list[str]:
-    """Return the names of the methods whose normal maps the page shows: the paper's pair, or the first, and a rival."""
-    pairs = [method for method in normals if method.paper == "B1"]
-    first = pairs[-1] if pairs else normals[0]  # the shipped pair comes last
-    return list(dict.fromkeys([first.name, "least-squares, true lights"]))
+    """Return the names of the methods whose normal maps the page shows.
+
+    The paper's pair if it was trained here, the last of the shipped ways that find the lights, and least squares; where
+    there is neither, the first method.
+    """
+    finders = [method for method in normals if method.lights != TRUE_LIGHTS and method.normals in method.models()]
+    shipped = [method for method in finders if all(name.startswith(SHIPPED) for name in method.models())]
+    pairs = [method for method in finders if method.paper == "B1" and method not in shipped]
+    chosen = [*pairs[:1], *shipped[-1:]] or normals[:1]
+    return list(dict.fromkeys([*(method.name for method in chosen), "least-squares, true lights"]))
 
 
 def evaluate(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sdps_scenes import hemisphere_lights
 
-from pipelines import evaluation, methods
+from pipelines import eval_merltest, evaluation, methods
 from pipelines.evaluation import Evaluation, TestObject
 from render.config import to_plain
 from render.errors import InputError
@@ -160,3 +160,18 @@ def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCap
     assert result.scores == {} and "black inside the mask" in result.reason
     assert Evaluation(tmp_path).result(dark, runner).reason == result.reason
     assert evaluation._FORMAT in (tmp_path / "scores.jsonl").read_text()
+
+
+def test_the_page_shows_the_pair_trained_here_and_the_best_shipped_way(runs: Path, kept: Path, tmp_path: Path) -> None:
+    least_squares = "least-squares, true lights"
+    assert eval_merltest.shown(methods.normal_methods(runs)) == ["lcnet + nenet", least_squares]
+    for name in ("psfcn", "nenet"):
+        write_weights(kept.with_name(f"{name}.safetensors"), name)
+    # Rows further down the table build on better networks; least squares on LCNet's lights comes last.
+    assert eval_merltest.shown(methods.normal_methods(tmp_path)) == ["lcnet + psfcn (shipped)", least_squares]
+    both = eval_merltest.shown(methods.normal_methods(runs))
+    assert both == ["lcnet + nenet", "lcnet + psfcn (shipped)", least_squares]
+    write_weights(kept.with_name("lcnet-soft.safetensors"), "lcnet-soft")
+    assert eval_merltest.shown(methods.normal_methods(runs))[1] == "lcnet-soft + psfcn (shipped)"
+    given = [Method(name="psfcn, true lights", lights="true", normals="psfcn")]
+    assert eval_merltest.shown(given) == ["psfcn, true lights", least_squares]
