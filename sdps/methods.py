@@ -209,30 +209,29 @@ class Runner:
 
 def label(lights: str, normals: str, second: str = NONE) -> str:
     """Name a combination."""
-    parts = [part.removeprefix(weights.SHIPPED) for part in (lights, normals, second)]
     suffix = " (shipped)" if any(part.startswith(weights.SHIPPED) for part in (lights, normals, second)) else ""
-    lights, normals, second = parts
-    for name, pair in COMBINATIONS.items():
-        if second and pair.members() == (lights, normals, second):
-            return f"{name} ({' + '.join(pair.members())}){suffix}"
+    lights, normals, second = (part.removeprefix(weights.SHIPPED) for part in (lights, normals, second))
+    if second and (name := _combination(lights, normals, second)):
+        return f"{name} ({' + '.join(COMBINATIONS[name].members())}){suffix}"
     if lights == TRUE_LIGHTS:
         return f"{normals}, true lights{suffix}"
     return " + ".join(part for part in (lights, second, normals) if part) + suffix
 
 
-def views_of(lights: str, normals: str, second: str = NONE) -> dict[str, int | None]:
-    """Return over how many views a combination averages lights and normals, None for the runner's choice."""
+def _combination(lights: str, normals: str, second: str) -> str:
+    """Return the name of what parts make together, shipped or not; empty if it has none."""
     parts = tuple(part.removeprefix(weights.SHIPPED) for part in (lights, normals, second) if part)
-    pair = next((pair for pair in COMBINATIONS.values() if pair.members() == parts), None)
-    return {name: getattr(pair, name, None) for name in _VIEWS}
+    return next((name for name, pair in COMBINATIONS.items() if pair.members() == parts), "")
 
 
 def combined(lights: str, normals: str, second: str = NONE, *, paper: str = "", intensities: str = NONE) -> Method:
     """Return the method of parts that go together, with its label and, where they are a combination, its views."""
     parts = tuple(_stem(part) for part in (lights, normals, second))
     name = label(*parts) + (", true intensities" if intensities else "")
+    pair = COMBINATIONS.get(_combination(*parts))
+    views = {field: getattr(pair, field, None) for field in _VIEWS}  # None: the runner's choice
     return Method(name=name, lights=lights, normals=normals, second=second, intensities=intensities,
-                  paper=paper, **views_of(*parts))  # fmt: skip
+                  paper=paper, **views)  # fmt: skip
 
 
 def combine(
