@@ -100,8 +100,8 @@ def rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[list[Meth
 def shown(normals: Sequence[Method]) -> list[str]:
     """Return the names of the methods whose normal maps the page shows.
 
-    The paper's pair if it was trained here, the last of the shipped ways that find the lights, and least squares; where
-    there is neither, the first method.
+    The paper's pair if it was trained here, the last of the shipped ways that find the lights (the rows have the best
+    last), and least squares; where there is neither, the first method.
     """
     finders = [method for method in normals if method.lights != TRUE_LIGHTS and method.normals in method.models()]
     shipped = [method for method in finders if all(name.startswith(SHIPPED) for name in method.models())]

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sdps import recipes, weights
-from sdps.methods import NONE, Method, combine, combined
-from sdps.models.registry import MODELS, TRUE_LIGHTS
+from sdps.methods import NONE, Method, as_combination, combine, combined
+from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
 if TYPE_CHECKING:
     from pipelines.presets import Preset
@@ -76,8 +76,7 @@ def normal_methods(out: Path) -> list[Method]:
     """Return the tables' rows whose models are all trained in `out`, and those that are shipped."""
     trained, kept = [], []
     available = set(weights.shipped())
-    for lights, normals, second, paper in NORMAL_ROWS:
-        method = combined(lights, normals, second, paper=paper)
+    for method in _every_row():
         if all(weights.trained_file(out, name).is_file() for name in method.models()):
             trained.append(method)
         if method.models() and method.models() <= available:
@@ -85,13 +84,20 @@ def normal_methods(out: Path) -> list[Method]:
     return trained + kept
 
 
+def _every_row() -> list[Method]:
+    """Return the tables' rows, and after them the combinations that average over views."""
+    rows = [combined(lights, normals, second, paper=paper) for lights, normals, second, paper in NORMAL_ROWS]
+    for name, pair in COMBINATIONS.items():
+        named = as_combination(name, combined(pair.lighting, pair.normals, pair.second))
+        rows += [named] if named.light_views or named.normal_views else []
+    return rows
+
+
 def as_shipped(method: Method) -> Method:
-    """Return the same combination of the weights that travel with the package."""
-
-    def place(name: str) -> str:
-        return weights.SHIPPED + name if name in method.models() else name
-
-    return combined(place(method.lights), place(method.normals), place(method.second), paper=method.paper)
+    """Return the same way with the weights that travel with the package."""
+    parts = {part: getattr(method, part) for part in ("lights", "normals", "second")}
+    placed = {part: weights.SHIPPED + name for part, name in parts.items() if name in method.models()}
+    return replace(method, name=f"{method.name} (shipped)", **placed)
 
 
 def chosen(out: Path, lights: str | None, normals: str | None, second: str | None, intensities: str | None) -> Method:

@@ -42,7 +42,7 @@ from sdps.surface.relight import Residuals, fit_albedo, relit, residuals
 __all__ = ["Inference", "infer", "load"]
 
 AUTO = "auto"
-_LEARNED = ("sdps-plus", "lcnet-soft+nenet-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
+_LEARNED = ("sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
 """Tried in this order; the parts may be trained or shipped one by one."""
 _CALIBRATED = ("psfcn", "robust-least-squares")
 _FALLBACK = "pf14"

@@ -31,6 +31,8 @@ CONSTANT = "constant"
 """A predictor that sees nothing: what knowing nothing scores."""
 CLASSICAL = (*classical.METHODS, CONSTANT)
 _VIEWS = ("light_views", "normal_views")
+_SHIPPED = " (shipped)"
+"""Ends the label of a method with shipped weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,29 +211,26 @@ class Runner:
 
 def label(lights: str, normals: str, second: str = NONE) -> str:
     """Name a combination."""
-    suffix = " (shipped)" if any(part.startswith(weights.SHIPPED) for part in (lights, normals, second)) else ""
+    suffix = _SHIPPED if any(part.startswith(weights.SHIPPED) for part in (lights, normals, second)) else ""
     lights, normals, second = (part.removeprefix(weights.SHIPPED) for part in (lights, normals, second))
-    if second and (name := _combination(lights, normals, second)):
-        return f"{name} ({' + '.join(COMBINATIONS[name].members())}){suffix}"
     if lights == TRUE_LIGHTS:
         return f"{normals}, true lights{suffix}"
     return " + ".join(part for part in (lights, second, normals) if part) + suffix
 
 
-def _combination(lights: str, normals: str, second: str) -> str:
-    """Return the name of what parts make together, shipped or not; empty if it has none."""
-    parts = tuple(part.removeprefix(weights.SHIPPED) for part in (lights, normals, second) if part)
-    return next((name for name, pair in COMBINATIONS.items() if pair.members() == parts), "")
-
-
 def combined(lights: str, normals: str, second: str = NONE, *, paper: str = "", intensities: str = NONE) -> Method:
-    """Return the method of parts that go together, with its label and, where they are a combination, its views."""
-    parts = tuple(_stem(part) for part in (lights, normals, second))
-    name = label(*parts) + (", true intensities" if intensities else "")
-    pair = COMBINATIONS.get(_combination(*parts))
-    views = {field: getattr(pair, field, None) for field in _VIEWS}  # None: the runner's choice
-    return Method(name=name, lights=lights, normals=normals, second=second, intensities=intensities,
-                  paper=paper, **views)  # fmt: skip
+    """Return the method of parts that go together, with its label."""
+    name = label(*map(_stem, (lights, normals, second))) + (", true intensities" if intensities else "")
+    return Method(name=name, lights=lights, normals=normals, second=second, intensities=intensities, paper=paper)
+
+
+def as_combination(name: str, method: Method) -> Method:
+    """Return a method made of a combination's parts with the combination's name and views, where it has views."""
+    views = {field: count for field in _VIEWS if (count := getattr(COMBINATIONS[name], field)) is not None}
+    if not views:
+        return method
+    parts, suffix = method.name.removesuffix(_SHIPPED), _SHIPPED if method.name.endswith(_SHIPPED) else ""
+    return replace(method, name=f"{name} ({parts}){suffix}", **views)
 
 
 def combine(
@@ -250,8 +249,9 @@ def combine(
         InputError: a name without weights, or choices that do not go together.
     """
     prefix = weights.SHIPPED if normals and normals.startswith(weights.SHIPPED) else ""
-    if normals and normals.removeprefix(prefix) in COMBINATIONS:
-        pair = COMBINATIONS[normals.removeprefix(prefix)]
+    named = normals.removeprefix(prefix) if normals else NONE
+    if named in COMBINATIONS:
+        pair = COMBINATIONS[named]
         if pair.second and lights != TRUE_LIGHTS:  # of lights that are given nothing is left to correct
             second = second or prefix + pair.second
         lights = lights or prefix + pair.lighting
@@ -264,6 +264,7 @@ def combine(
     if second and lights in (NONE, TRUE_LIGHTS):
         raise InputError("--second corrects estimated lights; name a lighting model with --lights")
     method = combined(lights, normals, second or NONE, intensities=intensities or NONE)
+    method = as_combination(named, method) if named in COMBINATIONS else method
     for needed in sorted(method.models()):
         find(needed)
     return method

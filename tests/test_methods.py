@@ -108,8 +108,15 @@ def test_flags_that_a_classical_method_would_not_look_at(runs: Path) -> None:
     for name, count in (("sdps-plus", 8), ("shipped:sdps-plus", 8), ("sdps", None)):
         method = combine(None, name, None, None, lambda name: Path(name))
         assert (method.light_views, method.normal_views) == (count, count)
-    given = combine("true", "sdps-plus", None, None, lambda name: Path(name))
+    assert combine("lcnet-soft", "nenet-plus", None, None, lambda name: Path(name)).light_views is None
+    given = combine("true", "sdps-second", None, None, lambda name: Path(name))
     assert given.second == ""  # of lights that are given nothing is left to correct
+
+
+def test_a_combination_has_one_label_however_it_is_asked_for() -> None:
+    asked = combine(None, "shipped:sdps-plus", None, None, lambda name: Path(name))
+    (row,) = [methods.as_shipped(row) for row in methods._every_row() if row.light_views]
+    assert row == asked and asked.name == "sdps-plus (lcnet-soft + nenet-plus) (shipped)"
 
 
 def test_a_lazy_source_gives_a_classical_method_what_an_array_does() -> None:

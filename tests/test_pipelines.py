@@ -274,7 +274,7 @@ def evaluate_combinations(capsys, flags, out):
     scores = json.loads((out / "eval" / "results.json").read_text())["scenes"][0]["scores"]
     assert "direction_mae" not in scores["least-squares, true lights"]  # what was given is not scored
     assert "did you mean 'psfcn'" in fails(capsys, "eval-merltest", *flags, "--lights", "lcnet", "--normals", "psfnc")
-    line = fails(capsys, "eval-merltest", *flags, "--normals", "sdps-plus")
+    line = fails(capsys, "eval-merltest", *flags, "--normals", "sdps-second")
     assert "no such weights; train them with `sdps train --models" in line
 
 

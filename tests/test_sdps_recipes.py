@@ -68,7 +68,7 @@ def test_mistakes_name_the_field(sections: dict, runs: dict, name: str, message:
 
 
 def test_names_expand_to_runs() -> None:
-    assert recipes.expand(["sdps-plus", "nenet"], {}) == ["lcnet-soft", "nenet-plus", "lcnet-second", "nenet"]
+    assert recipes.expand(["sdps-second", "nenet"], {}) == ["lcnet-soft", "nenet-plus", "lcnet-second", "nenet"]
     assert set(recipes.expand(["all"], {"mine": {}})) == {*MODELS, "sdps-joint", "mine"}
     with pytest.raises(InputError, match="did you mean 'sdps-plus'"):
         recipes.expand(["sdps-pluss"], {})

@@ -61,9 +61,9 @@ def shown(chosen: list[Method]) -> list[str]:
         return [method.name for method in giving]
     pair = COMBINATIONS["sdps"].members()
     main = [m.name for m in giving if tuple(n.removeprefix(weights.SHIPPED) for n in (m.lights, m.normals)) == pair]
-    second = [method.name for method in giving if method.second]
+    plus = [method.name for method in giving if method.normal_views]
     classic = [method.name for method in giving if method.name in SHOWN]
-    return [*main[-1:], *second[-1:], *classic] or [giving[0].name]
+    return [*main[-1:], *plus[-1:], *classic] or [giving[0].name]
 
 
 def runs_folder(folder: Path | None) -> Path | None:
