@@ -108,7 +108,7 @@ ship: $(READY)
 shipped-results: OUT = out/shipped
 shipped-results: PRESET = ship
 shipped-results: $(ASSETS_READY)
-	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
+	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) --set 'test.shipped=[all]' $(SETTINGS)
 	$(if $(DATA),$(SDPS) eval-diligent '$(DATA)' --out $(OUT) --methods '$(or $(METHODS),learned)')
 	$(SDPS) shipped-results --out $(OUT) --readme README.md
 

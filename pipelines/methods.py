@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sdps import recipes, weights
-from sdps.methods import NONE, Method, as_combination, combine, combined
+from sdps.methods import NONE, Method, as_combination, combine, combined, parse
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
 if TYPE_CHECKING:
     from pipelines.presets import Preset
 
+ALL = ("all",)
 NORMAL_ROWS = (  # lighting, normals, second, row of the paper
     (TRUE_LIGHTS, "psfcn", NONE, "B0"),
     ("lcnet", "nenet", NONE, "B1"),
@@ -54,10 +55,11 @@ def lighting_methods(out: Path, preset: "Preset") -> list[Method]:
         others = (how for how in ("centre", "expectation", "peak") if how != preset.test.read_out)
         methods += [Method(name=f"lcnet, {how}", lights="lcnet", read_out=how) for how in others]
         methods.append(_in_all_views(methods[0]))
+    told = {method.lights for method in normal_methods(out, preset.test.shipped)}
     kept = [
         Method(name=f"{name} (shipped)", lights=weights.SHIPPED + name, paper=MODELS[name].paper)
         for name in names
-        if name in weights.shipped()
+        if name in weights.shipped() and (preset.test.shipped == ALL or weights.SHIPPED + name in told)
     ]
     return [*methods, *kept, *map(_in_all_views, kept)]
 
@@ -72,8 +74,12 @@ def _role(name: str, preset: "Preset") -> str:
     return "joint" if model == recipes.JOINT else MODELS[model].role
 
 
-def normal_methods(out: Path) -> list[Method]:
-    """Return the tables' rows whose models are all trained in `out`, and those that are shipped."""
+def normal_methods(out: Path, shipped: tuple[str, ...] = ALL) -> list[Method]:
+    """Return the tables' rows whose models are all trained in `out`, and those that are shipped, or some of these.
+
+    Raises:
+        InputError: `shipped` names what is not.
+    """
     trained, kept = [], []
     available = set(weights.shipped())
     for method in _every_row():
@@ -81,7 +87,13 @@ def normal_methods(out: Path) -> list[Method]:
             trained.append(method)
         if method.models() and method.models() <= available:
             kept.append(as_shipped(method))
-    return trained + kept
+    return trained + (kept if shipped == ALL else [_shipped_way(text) for text in shipped])
+
+
+def _shipped_way(text: str) -> Method:
+    parts = [part if part == TRUE_LIGHTS else weights.SHIPPED + part for part in text.split("+")]
+    method = parse("+".join(parts), finder(None))
+    return replace(method, paper=paper_row(method))
 
 
 def _every_row() -> list[Method]:

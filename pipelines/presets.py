@@ -41,6 +41,7 @@ class TestConfig:
         light_views: Turned and mirrored views that lights are averaged over, 1, 2, 4 or 8.
         normal_views: The same for normals.
         precision: Arithmetic of the networks, `float32` or `bfloat16`.
+        shipped: Shipped ways beside what is trained, such as `sdps` or `lcnet-soft+psfcn`; `all` for every one.
     """
 
     shapes: tuple[str, ...] = ("sphere", "bunny")
@@ -59,6 +60,7 @@ class TestConfig:
     light_views: int = 1
     normal_views: int = 1
     precision: Literal["float32", "bfloat16"] = "bfloat16"
+    shipped: tuple[str, ...] = ("all",)
 
     def __post_init__(self) -> None:
         for name in ("spp", "repeats", "pictures", "rotations"):

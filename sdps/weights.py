@@ -65,5 +65,5 @@ def require(name: str, out: Path | None = None) -> Path:
         return path
     plain = name.removeprefix(SHIPPED)
     if plain not in MODELS and not name.endswith(_SUFFIX):
-        raise unknown("model or method", name, {*trained(out), *shipped(), *MODELS, *COMBINATIONS, *METHODS})
+        raise unknown("model or method", plain, {*trained(out), *shipped(), *MODELS, *COMBINATIONS, *METHODS})
     raise InputError(f"{path}: no such weights; train them with `sdps train --models {plain}`")

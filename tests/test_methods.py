@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sdps_scenes import hemisphere_lights
 
-from pipelines import eval_merltest, evaluation, methods
+from pipelines import eval_merltest, evaluation, methods, presets
 from pipelines.evaluation import Evaluation, TestObject
 from render.config import to_plain
 from render.errors import InputError
@@ -167,6 +167,22 @@ def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCap
     assert result.scores == {} and "black inside the mask" in result.reason
     assert Evaluation(tmp_path).result(dark, runner).reason == result.reason
     assert evaluation._FORMAT in (tmp_path / "scores.jsonl").read_text()
+
+
+def test_a_preset_says_which_shipped_ways_stand_beside_what_is_trained(kept: Path, tmp_path: Path) -> None:
+    for name in ("psfcn", "nenet"):
+        write_weights(kept.with_name(f"{name}.safetensors"), name)
+    preset = presets.load("demo", ["test.shipped=[true+psfcn, sdps]"])
+    shipped = [m for m in methods.normal_methods(tmp_path, preset.test.shipped) if m.models()]
+    assert [(m.name, m.paper) for m in shipped] == [
+        ("psfcn, true lights (shipped)", "B0"),
+        ("lcnet + nenet (shipped)", "B1"),
+    ]
+    assert [m.lights for m in methods.lighting_methods(tmp_path, preset)] == ["shipped:lcnet"] * 2  # and in all views
+    only = presets.load("demo", ["test.shipped=[true+psfcn]"])
+    assert methods.lighting_methods(tmp_path, only) == []
+    with pytest.raises(InputError, match="did you mean 'sdps'"):
+        methods.normal_methods(tmp_path, ("sdpss",))
 
 
 def test_the_page_shows_the_pair_trained_here_and_the_best_shipped_way(runs: Path, kept: Path, tmp_path: Path) -> None:
