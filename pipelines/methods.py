@@ -54,19 +54,21 @@ def lighting_methods(out: Path, preset: "Preset") -> list[Method]:
     if "lcnet" in trained:
         others = (how for how in ("centre", "expectation", "peak") if how != preset.test.read_out)
         methods += [Method(name=f"lcnet, {how}", lights="lcnet", read_out=how) for how in others]
-        methods.append(_in_all_views(methods[0]))
-    told = {method.lights for method in normal_methods(out, preset.test.shipped)}
+    ways = normal_methods(out, preset.test.shipped)
+    told = {way.lights for way in ways}
     kept = [
         Method(name=f"{name} (shipped)", lights=weights.SHIPPED + name, paper=MODELS[name].paper)
         for name in names
         if name in weights.shipped() and (preset.test.shipped == ALL or weights.SHIPPED + name in told)
     ]
-    return [*methods, *kept, *map(_in_all_views, kept)]
+    averaged = {way.lights: way.light_views for way in ways if way.light_views}
+    rows = [*methods, *kept]
+    return rows + [_in_views(row, averaged[row.lights]) for row in rows if row.lights in averaged]
 
 
-def _in_all_views(method: Method) -> Method:
-    """Return the same lights averaged over all eight views, beside the paper's one."""
-    return replace(method, name=f"{method.name}, 8 views", light_views=8, paper="")
+def _in_views(method: Method, count: int) -> Method:
+    """Return the same lights averaged over turned views, beside the paper's one."""
+    return replace(method, name=f"{method.name}, {count} views", light_views=count, paper="")
 
 
 def _role(name: str, preset: "Preset") -> str:

@@ -178,11 +178,16 @@ def test_a_preset_says_which_shipped_ways_stand_beside_what_is_trained(kept: Pat
         ("psfcn, true lights (shipped)", "B0"),
         ("lcnet + nenet (shipped)", "B1"),
     ]
-    assert [m.lights for m in methods.lighting_methods(tmp_path, preset)] == ["shipped:lcnet"] * 2  # and in all views
+    assert [m.name for m in methods.lighting_methods(tmp_path, preset)] == ["lcnet (shipped)"]
     only = presets.load("demo", ["test.shipped=[true+psfcn]"])
     assert methods.lighting_methods(tmp_path, only) == []
     with pytest.raises(InputError, match="did you mean 'sdps'"):
         methods.normal_methods(tmp_path, ("sdpss",))
+    for name in ("lcnet-soft", "nenet-plus"):
+        write_weights(kept.with_name(f"{name}.safetensors"), name)
+    plus = presets.load("demo", ["test.shipped=[sdps-plus]"])
+    averaged = [(m.name, m.light_views) for m in methods.lighting_methods(tmp_path, plus)]
+    assert averaged == [("lcnet-soft (shipped)", None), ("lcnet-soft (shipped), 8 views", 8)]
 
 
 def test_the_page_shows_the_pair_trained_here_and_the_best_shipped_way(runs: Path, kept: Path, tmp_path: Path) -> None:
