@@ -150,7 +150,7 @@ def test_a_combination_does_not_decide_over_how_many_views(
         asked.append(method)
         raise InputError("enough")
 
-    assert methods.parse("sdps-plus", Path).normal_views == 8
+    assert methods.parse("sdps-plus", Path).normal_views == 4
     monkeypatch.setattr(api, "Runner", runner)
     monkeypatch.setattr(api.weights, "require", lambda name, out: Path(name))
     with pytest.raises(InputError, match="enough"):

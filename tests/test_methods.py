@@ -105,9 +105,9 @@ def test_flags_that_a_classical_method_would_not_look_at(runs: Path) -> None:
     for flags in (("lcnet", None, None), (None, None, "true")):
         with pytest.raises(InputError, match="leave out --lights, --second and --intensities"):
             combine(flags[0], "pf14", flags[1], flags[2], find)
-    for name, count in (("sdps-plus", 8), ("shipped:sdps-plus", 8), ("sdps", None)):
+    for name, counts in (("sdps-plus", (8, 4)), ("shipped:sdps-plus", (8, 4)), ("sdps", (None, None))):
         method = combine(None, name, None, None, lambda name: Path(name))
-        assert (method.light_views, method.normal_views) == (count, count)
+        assert (method.light_views, method.normal_views) == counts
     assert combine("lcnet-soft", "nenet-plus", None, None, lambda name: Path(name)).light_views is None
     given = combine("true", "sdps-second", None, None, lambda name: Path(name))
     assert given.second == ""  # of lights that are given nothing is left to correct

@@ -174,8 +174,8 @@ COMBINATIONS = {
     "sdps": Combination("lcnet", "nenet", summary="SDPS-Net", paper="B1"),
     "sdps-reg": Combination("lcnet-reg", "nenet-reg", summary="SDPS-Net with regressed lights", paper="B3"),
     "sdps-plus": Combination(
-        "lcnet-soft", "nenet-plus", summary="soft-argmax lights; lights and normals averaged over eight views",
-        light_views=8, normal_views=8,
+        "lcnet-soft", "nenet-plus", summary="soft-argmax lights; lights averaged over eight views, normals over four",
+        light_views=8, normal_views=4,
     ),
     "sdps-second": Combination(
         "lcnet-soft", "nenet-plus", "lcnet-second", "soft-argmax lights and a second lighting pass"
