@@ -159,7 +159,7 @@ def test_a_refusal_is_told():
         (["--methods", "lcnet+pf14"], "finds the lights itself"),
         (["--methods", "lcnet+"], "LIGHTS\\+NORMALS"),
         (["--methods", "true"], "which normals"),
-        (["--methods", "nenet"], "train"),
+        (["--methods", "nenet-reg"], "train"),
         (["--objects", "bal"], "did you mean 'ball'"),
         (["--models", "nowhere"], "no trained weights"),
     ],
