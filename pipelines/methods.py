@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sdps import recipes, weights
-from sdps.methods import NONE, Method, as_combination, combine, combined, parse
+from sdps.methods import CLASSICAL, NONE, Method, as_combination, combine, combined, parse
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def normal_methods(out: Path, shipped: tuple[str, ...] = ALL) -> list[Method]:
 
 
 def _shipped_way(text: str) -> Method:
-    parts = [part if part == TRUE_LIGHTS else weights.SHIPPED + part for part in text.split("+")]
+    parts = [part if part in (TRUE_LIGHTS, *CLASSICAL) else weights.SHIPPED + part for part in text.split("+")]
     method = parse("+".join(parts), finder(None))
     return replace(method, paper=paper_row(method))
 

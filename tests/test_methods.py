@@ -181,6 +181,7 @@ def test_a_preset_says_which_shipped_ways_stand_beside_what_is_trained(kept: Pat
     assert [m.name for m in methods.lighting_methods(tmp_path, preset)] == ["lcnet (shipped)"]
     only = presets.load("demo", ["test.shipped=[true+psfcn]"])
     assert methods.lighting_methods(tmp_path, only) == []
+    assert methods.normal_methods(tmp_path, ("lcnet+least-squares",))[-1].name == "lcnet + least-squares (shipped)"
     with pytest.raises(InputError, match="did you mean 'sdps'"):
         methods.normal_methods(tmp_path, ("sdpss",))
     for name in ("lcnet-soft", "nenet-plus"):
