@@ -89,7 +89,8 @@ def rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[list[Meth
         method = methods.chosen(out, args.lights, args.normals, args.second, args.intensities)
         reference = Method(name="least-squares, true lights", lights="true", normals="least-squares")
         return [], [method, *([reference] if method.name != reference.name else []), constant]
-    lighting, normals = methods.lighting_methods(out, preset), methods.normal_methods(out, preset.test.shipped)
+    normals = methods.normal_methods(out, preset.test.shipped)
+    lighting = methods.lighting_methods(out, preset, normals)
     if not lighting and all(not method.models() for method in normals):
         raise InputError(
             f"{out / 'models'}: no trained models; train them with `sdps train --preset {preset.name} --out {out}`"

@@ -1,18 +1,15 @@
 """The rows of the paper's tables, and which of them the weights in a folder can fill."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from pipelines.presets import ALL, Preset
 from sdps import recipes, weights
-from sdps.methods import CLASSICAL, NONE, Method, as_combination, combine, combined, parse
+from sdps.methods import NONE, Method, combine, combined, label, parse
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
-if TYPE_CHECKING:
-    from pipelines.presets import Preset
-
-ALL = ("all",)
 NORMAL_ROWS = (  # lighting, normals, second, row of the paper
     (TRUE_LIGHTS, "psfcn", NONE, "B0"),
     ("lcnet", "nenet", NONE, "B1"),
@@ -44,8 +41,14 @@ def finder(out: Path | None) -> "partial[Path]":
     return partial(weights.require, out=out)
 
 
-def lighting_methods(out: Path, preset: "Preset") -> list[Method]:
-    """Return one method per lighting model trained in `out` or shipped, the paper's first, and LCNet's read-outs."""
+def lighting_methods(out: Path, preset: Preset, ways: Sequence[Method]) -> list[Method]:
+    """Return one method per lighting model trained in `out` or shipped, the paper's first, and LCNet's read-outs.
+
+    Args:
+        out: Folder of the runs.
+        preset: Names runs of its own, and which shipped ways are wanted.
+        ways: Those of `normal_methods`: where only some shipped ones are wanted, their lights are.
+    """
     names = [name for name, item in MODELS.items() if item.role == "lighting"]
     names += [name for name in preset.runs if name not in names and _role(name, preset) == "lighting"]
     names.append("lcnet-joint")
@@ -54,12 +57,11 @@ def lighting_methods(out: Path, preset: "Preset") -> list[Method]:
     if "lcnet" in trained:
         others = (how for how in ("centre", "expectation", "peak") if how != preset.test.read_out)
         methods += [Method(name=f"lcnet, {how}", lights="lcnet", read_out=how) for how in others]
-    ways = normal_methods(out, preset.test.shipped)
-    told = {way.lights for way in ways}
+    available, told = weights.shipped(), {way.lights for way in ways}
     kept = [
-        Method(name=f"{name} (shipped)", lights=weights.SHIPPED + name, paper=MODELS[name].paper)
+        Method(name=label(weights.SHIPPED + name, NONE), lights=weights.SHIPPED + name, paper=MODELS[name].paper)
         for name in names
-        if name in weights.shipped() and (preset.test.shipped == ALL or weights.SHIPPED + name in told)
+        if name in available and (preset.test.shipped == ALL or weights.SHIPPED + name in told)
     ]
     averaged = {way.lights: way.light_views for way in ways if way.light_views}
     rows = [*methods, *kept]
@@ -71,7 +73,7 @@ def _in_views(method: Method, count: int) -> Method:
     return replace(method, name=f"{method.name}, {count} views", light_views=count, paper="")
 
 
-def _role(name: str, preset: "Preset") -> str:
+def _role(name: str, preset: Preset) -> str:
     model = preset.run(name).model
     return "joint" if model == recipes.JOINT else MODELS[model].role
 
@@ -89,34 +91,33 @@ def normal_methods(out: Path, shipped: tuple[str, ...] = ALL) -> list[Method]:
             trained.append(method)
         if method.models() and method.models() <= available:
             kept.append(as_shipped(method))
-    return trained + (kept if shipped == ALL else [_shipped_way(text) for text in shipped])
-
-
-def _shipped_way(text: str) -> Method:
-    parts = [part if part in (TRUE_LIGHTS, *CLASSICAL) else weights.SHIPPED + part for part in text.split("+")]
-    method = parse("+".join(parts), finder(None))
-    return replace(method, paper=paper_row(method))
+    if shipped != ALL:
+        kept = [_with_row(as_shipped(parse(text, finder(None)))) for text in shipped]
+    return trained + kept
 
 
 def _every_row() -> list[Method]:
     """Return the tables' rows, and after them the combinations that average over views."""
     rows = [combined(lights, normals, second, paper=paper) for lights, normals, second, paper in NORMAL_ROWS]
     for name, pair in COMBINATIONS.items():
-        named = as_combination(name, combined(pair.lighting, pair.normals, pair.second))
-        rows += [named] if named.light_views or named.normal_views else []
+        if pair.light_views or pair.normal_views:
+            rows.append(combined(pair.lighting, pair.normals, pair.second, combination=name))
     return rows
 
 
 def as_shipped(method: Method) -> Method:
-    """Return the same way with the weights that travel with the package."""
+    """Return the same way with the weights that travel with the package, where it needs any."""
     parts = {part: getattr(method, part) for part in ("lights", "normals", "second")}
     placed = {part: weights.SHIPPED + name for part, name in parts.items() if name in method.models()}
-    return replace(method, name=f"{method.name} (shipped)", **placed)
+    return replace(method, name=f"{method.name} (shipped)", **placed) if placed else method
 
 
 def chosen(out: Path, lights: str | None, normals: str | None, second: str | None, intensities: str | None) -> Method:
     """Return the method that flags describe, with its row in the paper's table; see `sdps.methods.combine`."""
-    method = combine(lights, normals, second, intensities, finder(out))
+    return _with_row(combine(lights, normals, second, intensities, finder(out)))
+
+
+def _with_row(method: Method) -> Method:
     return replace(method, paper=paper_row(method))
 
 

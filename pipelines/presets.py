@@ -19,6 +19,8 @@ from sdps.lighting import ReadOut
 from sdps.models.registry import MODELS
 from sdps.symmetry import check_views
 
+ALL = ("all",)
+
 
 @dataclass(frozen=True, kw_only=True)
 class TestConfig:
@@ -45,7 +47,7 @@ class TestConfig:
     """
 
     shapes: tuple[str, ...] = ("sphere", "bunny")
-    materials: tuple[str, ...] = ("all",)
+    materials: tuple[str, ...] = ALL
     lights: str = "merltest"
     size: int = 128
     spp: int = 128
@@ -60,7 +62,7 @@ class TestConfig:
     light_views: int = 1
     normal_views: int = 1
     precision: Literal["float32", "bfloat16"] = "bfloat16"
-    shipped: tuple[str, ...] = ("all",)
+    shipped: tuple[str, ...] = ALL
 
     def __post_init__(self) -> None:
         for name in ("spp", "repeats", "pictures", "rotations"):

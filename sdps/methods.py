@@ -31,8 +31,6 @@ CONSTANT = "constant"
 """A predictor that sees nothing: what knowing nothing scores."""
 CLASSICAL = (*classical.METHODS, CONSTANT)
 _VIEWS = ("light_views", "normal_views")
-_SHIPPED = " (shipped)"
-"""Ends the label of a method with shipped weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,28 +207,40 @@ class Runner:
         return {item.name: item.value for item in score(estimate, mask, **truth)}
 
 
-def label(lights: str, normals: str, second: str = NONE) -> str:
-    """Name a combination."""
-    suffix = _SHIPPED if any(part.startswith(weights.SHIPPED) for part in (lights, normals, second)) else ""
+def label(lights: str, normals: str, second: str = NONE, *, combination: str = NONE) -> str:
+    """Name what parts make together, by the combination's name and its parts where it has one."""
+    suffix = " (shipped)" if any(part.startswith(weights.SHIPPED) for part in (lights, normals, second)) else ""
     lights, normals, second = (part.removeprefix(weights.SHIPPED) for part in (lights, normals, second))
     if lights == TRUE_LIGHTS:
-        return f"{normals}, true lights{suffix}"
-    return " + ".join(part for part in (lights, second, normals) if part) + suffix
+        text = f"{normals}, true lights"
+    else:
+        text = " + ".join(part for part in (lights, second, normals) if part)
+    return (f"{combination} ({text})" if combination else text) + suffix
 
 
-def combined(lights: str, normals: str, second: str = NONE, *, paper: str = "", intensities: str = NONE) -> Method:
-    """Return the method of parts that go together, with its label."""
-    name = label(*map(_stem, (lights, normals, second))) + (", true intensities" if intensities else "")
-    return Method(name=name, lights=lights, normals=normals, second=second, intensities=intensities, paper=paper)
-
-
-def as_combination(name: str, method: Method) -> Method:
-    """Return a method made of a combination's parts with the combination's name and views, where it has views."""
-    views = {field: count for field in _VIEWS if (count := getattr(COMBINATIONS[name], field)) is not None}
-    if not views:
-        return method
-    parts, suffix = method.name.removesuffix(_SHIPPED), _SHIPPED if method.name.endswith(_SHIPPED) else ""
-    return replace(method, name=f"{name} ({parts}){suffix}", **views)
+def combined(
+    lights: str,
+    normals: str,
+    second: str = NONE,
+    *,
+    paper: str = "",
+    intensities: str = NONE,
+    combination: str = NONE,
+) -> Method:
+    """Return the method of parts that go together, with its label; asked for as a combination, with its views."""
+    pair = COMBINATIONS[combination] if combination else None
+    views = {field: getattr(pair, field, None) for field in _VIEWS}  # None: the runner's choice
+    named = combination if any(views.values()) else NONE  # others are their parts, and called so
+    name = label(*map(_stem, (lights, normals, second)), combination=named)
+    return Method(
+        name=name + (", true intensities" if intensities else ""),
+        lights=lights,
+        normals=normals,
+        second=second,
+        intensities=intensities,
+        paper=paper,
+        **views,
+    )
 
 
 def combine(
@@ -249,9 +259,10 @@ def combine(
         InputError: a name without weights, or choices that do not go together.
     """
     prefix = weights.SHIPPED if normals and normals.startswith(weights.SHIPPED) else ""
-    named = normals.removeprefix(prefix) if normals else NONE
-    if named in COMBINATIONS:
-        pair = COMBINATIONS[named]
+    name = normals.removeprefix(prefix) if normals else NONE
+    combination = name if name in COMBINATIONS else NONE
+    if combination:
+        pair = COMBINATIONS[combination]
         if pair.second and lights != TRUE_LIGHTS:  # of lights that are given nothing is left to correct
             second = second or prefix + pair.second
         lights = lights or prefix + pair.lighting
@@ -263,8 +274,7 @@ def combine(
         _check_classical(normals, lights, second, intensities)
     if second and lights in (NONE, TRUE_LIGHTS):
         raise InputError("--second corrects estimated lights; name a lighting model with --lights")
-    method = combined(lights, normals, second or NONE, intensities=intensities or NONE)
-    method = as_combination(named, method) if named in COMBINATIONS else method
+    method = combined(lights, normals, second or NONE, intensities=intensities or NONE, combination=combination)
     for needed in sorted(method.models()):
         find(needed)
     return method

@@ -169,6 +169,10 @@ def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCap
     assert evaluation._FORMAT in (tmp_path / "scores.jsonl").read_text()
 
 
+def lighting_rows(out: Path, preset: presets.Preset) -> list[Method]:
+    return methods.lighting_methods(out, preset, methods.normal_methods(out, preset.test.shipped))
+
+
 def test_a_preset_says_which_shipped_ways_stand_beside_what_is_trained(kept: Path, tmp_path: Path) -> None:
     for name in ("psfcn", "nenet"):
         write_weights(kept.with_name(f"{name}.safetensors"), name)
@@ -178,16 +182,16 @@ def test_a_preset_says_which_shipped_ways_stand_beside_what_is_trained(kept: Pat
         ("psfcn, true lights (shipped)", "B0"),
         ("lcnet + nenet (shipped)", "B1"),
     ]
-    assert [m.name for m in methods.lighting_methods(tmp_path, preset)] == ["lcnet (shipped)"]
+    assert [m.name for m in lighting_rows(tmp_path, preset)] == ["lcnet (shipped)"]
     only = presets.load("demo", ["test.shipped=[true+psfcn]"])
-    assert methods.lighting_methods(tmp_path, only) == []
+    assert lighting_rows(tmp_path, only) == []
     assert methods.normal_methods(tmp_path, ("lcnet+least-squares",))[-1].name == "lcnet + least-squares (shipped)"
     with pytest.raises(InputError, match="did you mean 'sdps'"):
         methods.normal_methods(tmp_path, ("sdpss",))
     for name in ("lcnet-soft", "nenet-plus"):
         write_weights(kept.with_name(f"{name}.safetensors"), name)
     plus = presets.load("demo", ["test.shipped=[sdps-plus]"])
-    averaged = [(m.name, m.light_views) for m in methods.lighting_methods(tmp_path, plus)]
+    averaged = [(m.name, m.light_views) for m in lighting_rows(tmp_path, plus)]
     assert averaged == [("lcnet-soft (shipped)", None), ("lcnet-soft (shipped), 8 views", 8)]
 
 
