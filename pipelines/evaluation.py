@@ -103,15 +103,18 @@ class Evaluation:
         return self.results(item, [runner], [keep_normals])[0]
 
     def results(self, item: TestObject, runners: "Sequence[Runner]", keep_normals: Sequence[bool]) -> list[Result]:
-        """Return what several methods make of an object, whose images are read once, and only if they are needed."""
-        images, found = None, []
+        """Return what several methods make of an object.
+
+        Its images are read once, and only if they are needed; lights that several methods see alike are estimated once.
+        """
+        images, lights, found = None, {}, []
         for runner, keep in zip(runners, keep_normals, strict=True):
             key = (runner.method.name, runner.identity(), item.name, item.digest)
             maps = self._maps(key)
             known = self._cache.get(key)
             if known is None or (keep and known["normals"] and not maps.is_file()):
                 images = item.load() if images is None else images
-                known = self._run(item, images, runner, maps if keep else None)
+                known = self._run(item, images, runner, maps if keep else None, lights)
                 self._cache.add(key, known)
             found.append(_result(known, maps))
         return found
@@ -119,10 +122,12 @@ class Evaluation:
     def _maps(self, key: tuple[str, ...]) -> Path:
         return self.folder / "maps" / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.npz"
 
-    def _run(self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None) -> dict[str, Any]:
+    def _run(
+        self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: dict[Any, Any]
+    ) -> dict[str, Any]:
         """Run a method and return what is kept of it, JSON ready."""
         try:
-            estimate = runner.estimate(images, item.mask, item.light_directions, item.intensities)
+            estimate = runner.estimate(images, item.mask, item.light_directions, item.intensities, lights)
         except InputError as error:  # such as least squares under lights that were all estimated alike
             _log.warning("%s, %s: no score (%s)", item.name, runner.method.name, error)
             return {"scores": {}, "reason": str(error), "seconds": 0.0, "normals": False, "lights": [], "gains": []}

@@ -98,6 +98,8 @@ class Estimator:
         mask: np.ndarray,
         lights: np.ndarray | None = None,
         intensities: np.ndarray | None = None,
+        *,
+        found: Estimate | None = None,
     ) -> Estimate:
         """Estimate normals, and whichever of light directions and intensities are not given.
 
@@ -110,6 +112,8 @@ class Estimator:
             mask: (H, W) bool.
             lights: (L, 3) known light directions.
             intensities: (L,) or (L, 3) known intensities, of any overall scale.
+            found: What `estimate_lights` of an estimator with the same lighting networks and options gave for these
+                images and intensities; it saves estimating the lights again, and changes nothing else.
 
         Returns:
             The estimate. Directions or intensities that nobody gave, estimated or assumed are empty, (0, 3) and (0,),
@@ -118,8 +122,8 @@ class Estimator:
             likeliest direction classes.
 
         Raises:
-            InputError: sizes that do not fit, non-finite values, an empty mask, or lights wanted without a lighting
-                model.
+            InputError: sizes that do not fit, non-finite values, an empty mask, lights wanted without a lighting
+                model, or lights found though they are given.
         """
         if self.normals is None:
             raise InputError("no normal model was loaded, so only lights can be estimated; load one")
@@ -130,20 +134,23 @@ class Estimator:
         scene = survey(images, mask, self.margin)
         known = self._known(lights, intensities)
         diagnostics: dict[str, Any] = {"exposure": {}}
-        if self.lighting is not None and (lights is None or intensities is None):
-            found = self._estimate_lights(scene, known, diagnostics)
+        if found is not None:
+            lit = self._taken(found, lights, len(images), diagnostics)
+            began -= found.diagnostics["seconds"]
+        elif self.lighting is not None and (lights is None or intensities is None):
+            lit = self._estimate_lights(scene, known, diagnostics)
         elif self.needs_lights:
             equal = np.full(len(images), self._mean_intensity(), np.float32)
-            found = self._lights(known.directions, equal if known.intensities is None else known.intensities)
+            lit = self._lights(known.directions, equal if known.intensities is None else known.intensities)
         else:
-            found = None
+            lit = None
         multiple = 1 if self.normals.role == "pixels" else self.normals.network.size_multiple
         view = self._view(scene, "normals", known.balance, pad_to(multiple), scene.mask.size, diagnostics)
         normals = np.zeros((*mask.shape, 3), np.float32)
-        box = self._normals(view, found)[0].permute(1, 2, 0).cpu().numpy()  # padded (h, w, 3)
+        box = self._normals(view, lit)[0].permute(1, 2, 0).cpu().numpy()  # padded (h, w, 3)
         box = box[: scene.mask.shape[0], : scene.mask.shape[1]]
         normals[scene.rows, scene.columns] = np.where(scene.mask[..., None], box, np.float32(0.0))
-        directions, gains = known[:2] if found is None else (part[0].float().cpu().numpy() for part in found[:2])
+        directions, gains = known[:2] if lit is None else (part[0].float().cpu().numpy() for part in lit[:2])
         diagnostics["seconds"] = time.perf_counter() - began
         return Estimate(
             normals,
@@ -192,6 +199,14 @@ class Estimator:
         if lights.confidence is not None:
             diagnostics["confidence"] = lights.confidence[0].float().cpu().numpy()
         return self._merged(known, lights)
+
+    def _taken(self, found: Estimate, lights: np.ndarray | None, count: int, diagnostics: dict[str, Any]) -> Lights:
+        """Return lights (1, L, ...) that were estimated before, and what was noted of them."""
+        if lights is not None or len(found.light_directions) != count:
+            raise InputError("found holds lights of other images, or of images whose lights are given")
+        diagnostics["exposure"].update(found.diagnostics["exposure"])
+        diagnostics.update({name: found.diagnostics[name] for name in ("confidence",) if name in found.diagnostics})
+        return self._lights(found.light_directions, found.intensities)
 
     def _lighting_pass(
         self, place: str, scene: ObjectImages, read_out: ReadOut, diagnostics: dict[str, Any], context: Any = None

@@ -144,7 +144,12 @@ class Runner:
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
     def estimate(
-        self, images: ImageSource, mask: np.ndarray, lights: np.ndarray | None, intensities: np.ndarray | None
+        self,
+        images: ImageSource,
+        mask: np.ndarray,
+        lights: np.ndarray | None,
+        intensities: np.ndarray | None,
+        found: dict[tuple, Estimate] | None = None,
     ) -> Estimate:
         """Run the method; of the lights it sees what it is to be given.
 
@@ -153,6 +158,7 @@ class Runner:
             mask: (H, W) bool.
             lights: (L, 3) directions, or None where the method is given none.
             intensities: (L,) or (L, 3), or None where they are not known.
+            found: Lights that methods found of these very images, by what they depend on; read, and added to.
 
         Raises:
             InputError: images or lights the method cannot work with, in one line.
@@ -165,20 +171,38 @@ class Runner:
         if method.normals == CONSTANT:
             return constant_estimate(len(images), mask)
         if method.normals in classical.METHODS:
-            return self._classical(images, mask, given)
+            return self._classical(images, mask, given, found)
         if not method.normals:
-            return self.estimator.estimate_lights(images, mask, given.get("intensities"))
+            return self._lights(images, mask, given, found)
+        if found is not None and method.lights not in (NONE, TRUE_LIGHTS):
+            given["found"] = self._lights(images, mask, given, found)
         return self.estimator.estimate(images, mask, **given)
 
-    def _classical(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any]) -> Estimate:
+    def _lights(
+        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: dict[tuple, Estimate] | None
+    ) -> Estimate:
+        """Estimate the lights, or take what another method with the same lighting networks found."""
+        found = {} if found is None else found
+        places = ("lights", "second", "normals") if self.method.second else ("lights",)  # a second pass sees normals
+        views = tuple(self.views.values()) if self.method.second else (self.views["light_views"],)
+        used = (_digest(self.files[getattr(self.method, place)]) for place in places)
+        options = self.method.read_out or self.config.read_out, self.config.precision, *views, "intensities" in given
+        key = (*used, *options)
+        if key not in found:
+            found[key] = self.estimator.estimate_lights(images, mask, given.get("intensities"))
+        return found[key]
+
+    def _classical(
+        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: dict[tuple, Estimate] | None
+    ) -> Estimate:
         """Run a classical method, which holds the object's box of all images at once."""
         name, told = self.method.normals, ()
         if classical.METHODS[name].calibrated:
             if self.method.lights == TRUE_LIGHTS:
                 told = given["lights"], given.get("intensities")
             else:
-                found = self.estimator.estimate_lights(images, mask, given.get("intensities"))
-                told = found.light_directions, found.intensities
+                lit = self._lights(images, mask, given, found)
+                told = lit.light_directions, lit.intensities
         if isinstance(images, np.ndarray):
             return classical.run(name, images, mask, *told)
         scene = survey(images, mask, margin=2)

@@ -1,5 +1,6 @@
 """Methods by expression, weights by name, and results that are kept until something they depend on changes."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import classical_scenes as scenes
@@ -14,6 +15,7 @@ from render.errors import InputError
 from sdps import weights
 from sdps.augment import Augmentation
 from sdps.checkpoint import TrainedModel, save_weights
+from sdps.inference import Estimator
 from sdps.methods import Method, Runner, RunnerConfig, combine, parse
 from sdps.models.registry import create
 
@@ -133,6 +135,24 @@ def test_a_lazy_source_gives_a_classical_method_what_an_array_does() -> None:
     whole = runner.estimate(item.load(), item.mask, LIGHTS, np.ones(12))
     lazy = runner.estimate(Lazy(), item.mask, LIGHTS, np.ones(12))
     np.testing.assert_allclose(lazy.normals, whole.normals, atol=1e-5)
+
+
+def test_lights_that_methods_share_are_estimated_once(
+    tmp_path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    item, find = hills(), methods.finder(runs)
+    named = [parse(text, find) for text in ("lcnet", "lcnet+nenet", "lcnet+psfcn", "lcnet+least-squares", "true+nenet")]
+    named += [replace(named[1], name="two views", light_views=2), combine("lcnet", "nenet", None, "true", find)]
+    runners = [Runner(method, find, RunnerConfig()) for method in named]
+    alone = [Evaluation(tmp_path / "alone").result(item, runner) for runner in runners]
+    asked = []
+    whole = Estimator.estimate_lights
+    monkeypatch.setattr(Estimator, "estimate_lights", lambda *given: asked.append(given) or whole(*given))
+    together = Evaluation(tmp_path / "together").results(item, runners, [False] * len(runners))
+    assert len(asked) == 3  # LCNet, over two views, and with the intensities given
+    for one, other in zip(together, alone, strict=True):
+        assert one.scores == other.scores
+        np.testing.assert_array_equal(one.light_directions, other.light_directions)
 
 
 def test_results_are_kept_until_something_changes(tmp_path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -276,6 +276,26 @@ def test_networks_told_no_lights_work_without(estimator: Estimator, lighting: st
     np.testing.assert_array_equal(told.normals, estimate.normals)
 
 
+@pytest.mark.parametrize("names", [("lcnet", "nenet"), ("lcnet-soft", "nenet-plus", "lcnet-second")])
+def test_lights_found_before_change_nothing(names: tuple[str, ...]) -> None:
+    images, mask, lights = scene(size=72)
+    gains = np.linspace(0.5, 2.0, 6)
+    places = dict(zip(("lighting", "normals", "second"), map(trained, names), strict=False))
+    estimator = Estimator(**places, device=torch.device("cpu"), light_views=2)
+    for given in ({}, {"intensities": gains}):
+        expected = estimator.estimate(images, mask, **given)
+        found = estimator.estimate_lights(images, mask, **given)
+        estimate = estimator.estimate(images, mask, **given, found=found)
+        for part in ("normals", "light_directions", "intensities"):
+            np.testing.assert_array_equal(getattr(estimate, part), getattr(expected, part))
+        seconds, _ = estimate.diagnostics.pop("seconds"), expected.diagnostics.pop("seconds")
+        assert seconds > found.diagnostics["seconds"]  # of both
+        np.testing.assert_equal(estimate.diagnostics, expected.diagnostics)
+    for wrong in ({"images": images[:5]}, {"lights": lights, "intensities": gains}):
+        with pytest.raises(InputError, match="found holds lights of other images"):
+            estimator.estimate(**{"images": images, "mask": mask, "found": found, **wrong})
+
+
 def test_second_pass_is_the_one_of_training() -> None:
     """On images of 128x128 inference does what `SecondStage` did."""
     images, mask, lights = scene(size=128)
