@@ -35,8 +35,9 @@ class Augmentation:
         intensity_range: Uniform range of the light intensity of each image; the labels of LCNet.
         noise: Full width of the uniform noise added to every pixel, background included.
         biased: Share of the samples whose lights are not all around: those nearest to a random direction, at most half
-            of a scene's. Real sets are often so (DiLiGenT's lights all lie within 45 degrees of the camera), and what a
-            network fuses over the images depends on which lights there are.
+            of a scene's. What a network fuses over the images depends on which lights there are.
+        frontal: Share of the samples with the lights nearest to the camera, at most half of a scene's. Real sets are
+            often so (DiLiGenT's lights all lie within 45 degrees of it); of biased samples next to none are.
         symmetries: Mirror and quarter-turn scenes at random, with their normals and lights (not in the
             paper): eight views for the price of one rendering.
     """
@@ -49,6 +50,7 @@ class Augmentation:
     intensity_range: tuple[float, float] = (0.2, 2.0)
     noise: float = 0.05
     biased: float = 0.0
+    frontal: float = 0.0
     symmetries: bool = False
 
     def __post_init__(self) -> None:
@@ -61,8 +63,11 @@ class Augmentation:
                 raise InputError(f"augmentation.{name} must be positive, got {getattr(self, name)}")
         if self.mean_level >= self.clip:
             raise InputError(f"augmentation.mean_level {self.mean_level} must be below augmentation.clip {self.clip}")
-        if not 0.0 <= self.biased <= 1.0:
-            raise InputError(f"augmentation.biased must be in [0, 1], got {self.biased}")
+        for name in ("biased", "frontal"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InputError(f"augmentation.{name} must be in [0, 1], got {getattr(self, name)}")
+        if self.biased + self.frontal > 1.0:
+            raise InputError(f"augmentation.frontal must leave biased its share {self.biased}, got {self.frontal}")
         if not 0.0 <= self.noise < 1.0:
             raise InputError(f"augmentation.noise must be in [0, 1), got {self.noise}")
 

@@ -165,12 +165,19 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
 
 
 def choose_images(directions: np.ndarray, options: SampleOptions, rng: np.random.Generator) -> np.ndarray:  # (Q,)
-    """Draw which of a scene's images a sample has, in random order; a biased one has those around one direction."""
-    share, count = options.augmentation.biased, len(directions)
-    if not share or rng.random() >= share:
+    """Draw which of a scene's images a sample has, in random order.
+
+    A biased sample has those around one direction, a frontal one those around the camera's.
+    """
+    biased, shares = options.augmentation.biased, options.augmentation.biased + options.augmentation.frontal
+    count, kind = len(directions), rng.random() if shares else 1.0
+    if kind >= shares:
         return rng.permutation(count)[: options.images]
-    radius, angle = np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * np.pi)  # uniform over the unit disc
-    centre = np.array([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius**2)])
+    if kind < biased:
+        radius, angle = np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * np.pi)  # uniform over the unit disc
+        centre = np.array([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius**2)])
+    else:
+        centre = np.array([0.0, 0.0, 1.0])
     nearest = np.argsort(-(directions @ centre), kind="stable")
     kept = rng.integers(options.images, max(options.images, count // 2), endpoint=True)
     return rng.permutation(nearest[:kept])[: options.images]

@@ -90,7 +90,7 @@ class Stage(ABC):
     def validation_options(self) -> SampleOptions:
         """Return how validation samples are made: whole images in the pose they were rendered."""
         options = self.sample_options()
-        augmentation = replace(options.augmentation, symmetries=False, biased=0.0)
+        augmentation = replace(options.augmentation, symmetries=False, biased=0.0, frontal=0.0)
         return replace(options, crop=0, rescale=False, augmentation=augmentation)
 
     @abstractmethod

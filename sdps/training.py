@@ -337,11 +337,14 @@ class Trainer:
         return about | self.stage.origin() | {f"config.{key}": value for key, value in fixed.items()}
 
     def _compare(self, path: Path, saved: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another run; of settings that its day did not know, it had the defaults."""
+        defaults = {f"config.{key}": value for key, value in to_plain(type(self.config)()).items()}
         for key, value in self._identity().items():
-            if saved.get(key) != value:
-                raise InputError(
-                    f"{path}: of another run ({key} was {saved.get(key)!r}, now {value!r}); choose another --out"
-                )
+            was = saved.get(key, defaults.get(key))
+            if isinstance(was, dict) and isinstance(defaults.get(key), dict):
+                was = defaults[key] | was
+            if was != value:
+                raise InputError(f"{path}: of another run ({key} was {was!r}, now {value!r}); choose another --out")
 
     def save_weights(self, metrics: dict[str, float], suffix: str = "") -> None:
         """Write each network with everything needed to use and to trace it."""

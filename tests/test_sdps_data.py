@@ -278,6 +278,8 @@ def test_augmentation_fields_are_checked() -> None:
         Augmentation(intensity_range=(0.0, 2.0))
     with pytest.raises(InputError, match=r"augmentation\.mean_level"):
         Augmentation(mean_level=5.0, clip=4.0)
+    with pytest.raises(InputError, match=r"frontal must leave biased its share 0\.7"):
+        Augmentation(biased=0.7, frontal=0.4)
 
 
 # ---- Seeds of samples, and crops of large scenes -----------------------------------------------------
@@ -414,3 +416,14 @@ def test_biased_samples_have_the_lights_around_one_direction() -> None:
         np.testing.assert_array_equal(choose_images(directions, plain, rng(seed)), rng(seed).permutation(64)[:8])
     assert np.mean(spread[biased]) > np.mean(spread[plain]) + 0.15
     assert np.std(centres, axis=0)[:2].min() > 0.3  # now around one direction, now around another
+
+
+def test_frontal_samples_have_the_lights_nearest_to_the_camera() -> None:
+    directions = hemisphere_lights(64, rng(), lowest=0.05)
+    nearest = np.argsort(-directions[:, 2])
+    frontal = options(augmentation=replace(PLAIN, frontal=1.0), images=8)
+    counts = [np.isin(nearest, choose_images(directions, frontal, rng(seed))).nonzero()[0].max() for seed in range(60)]
+    assert 7 <= min(counts) < 12 and 24 < max(counts) <= 31  # from as many as asked for to half of them
+    mixed = options(augmentation=replace(PLAIN, biased=0.4, frontal=0.3), images=8)
+    heights = np.array([directions[choose_images(directions, mixed, rng(seed)), 2].min() for seed in range(400)])
+    assert 0.25 < np.mean(heights >= directions[nearest[31], 2]) < 0.4  # the frontal share, and a few biased ones

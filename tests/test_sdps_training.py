@@ -17,7 +17,7 @@ from render.config import build
 from render.errors import InputError
 from sdps import recipes
 from sdps.augment import Augmentation
-from sdps.checkpoint import TrainedModel, load_state, load_weights, save_weights
+from sdps.checkpoint import TrainedModel, load_state, load_weights, save_state, save_weights
 from sdps.config import JointTraining, LightingTraining, NormalTraining
 from sdps.dataset import SampleKey, SceneDataset, collate
 from sdps.joint import JointStage
@@ -118,6 +118,18 @@ def test_checkpoint_of_another_run_is_refused(folder: Path, uninterrupted: tuple
     (tmp_path / CHECKPOINT).write_bytes((uninterrupted[0] / CHECKPOINT).read_bytes()[:5000])
     with pytest.raises(InputError, match="not a checkpoint; delete it"):
         train(NormalStage(QUICK), folder, tmp_path)
+
+
+def test_a_checkpoint_older_than_a_setting_had_its_default(folder: Path, tmp_path: Path) -> None:
+    train(NormalStage(QUICK), folder, tmp_path, loggers=[StopAt(2)])
+    state = load_state(tmp_path / CHECKPOINT)
+    del state["identity"]["config.augmentation"]["frontal"], state["identity"]["config.accumulate"]
+    save_state(tmp_path / CHECKPOINT, state)
+    augmentation = replace(QUICK.augmentation, frontal=0.5)
+    for change, named in (({"augmentation": augmentation}, "augmentation"), ({"accumulate": 2}, "accumulate was 1")):
+        with pytest.raises(InputError, match=named):
+            train(NormalStage(replace(QUICK, **change)), folder, tmp_path)
+    assert train(NormalStage(QUICK), folder, tmp_path).steps == 8
 
 
 def test_minutes_are_counted_across_resumed_runs(folder: Path, tmp_path: Path) -> None:
