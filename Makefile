@@ -28,7 +28,7 @@ ASSETS_READY := $(VENV)/.assets-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow lint bench bench-train bench-classical bench-infer clean
+	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow lint bench bench-train bench-classical bench-infer bench-surface clean
 .DEFAULT_GOAL := help
 
 help:
@@ -160,6 +160,10 @@ bench-classical: $(READY)
 bench-infer: OUT = out/bench-infer
 bench-infer: $(READY)
 	$(SDPS) bench-infer --out $(OUT) $(if $(METHODS),--methods '$(METHODS)') $(if $(RUNS),--models $(RUNS))
+
+bench-surface: OUT = out/bench-surface
+bench-surface: $(READY)
+	$(SDPS) bench-surface $(DATA) --out $(OUT)
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

@@ -40,6 +40,7 @@ COMMANDS = {
     "bench-classical": ("bench_classical", "add_arguments", "main", "time the classical methods on a large object"),
     "bench-checks": ("bench_checks", "add_arguments", "main", "count false alarms and hits of the photograph checks"),
     "bench-infer": ("bench_infer", "add_arguments", "main", "time sdps infer on photographs of a large object"),
+    "bench-surface": ("bench_surface", "add_arguments", "main", "score and time depth, meshes and relit pictures"),
     "bench": ("bench", "add_arguments", "main", "measure the renderer against Mitsuba's path integrator"),
 }
 

@@ -1,12 +1,19 @@
 """Albedo, relit pictures, cast shadows, residuals, and views of the depth."""
 
+import json
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from classical_scenes import glossy, lambertian, lights
 from classical_scenes import sphere as shaded_sphere
+from sdps_scenes import write_data
 from surface_scenes import sphere
 
+from pipelines import bench_surface
+from pipelines.cli import main
 from render.errors import InputError
+from render.shards import Shard
 from sdps.surface.integration import integrate
 from sdps.surface.relight import fit_albedo, lit, relit, residuals
 from sdps.surface.views import depth_normals, strip, turned
@@ -169,3 +176,50 @@ def test_directions_are_refused(scene):
     depth = integrate(scene[0].normals, scene[0].mask)
     with pytest.raises(InputError, match="degrees"):
         turned(depth, 90.0, 64)
+
+
+def test_the_bench_scores_scenes_and_times_steps(tmp_path, capsys):
+    write_data(tmp_path / "data", ("train",), lights=8, size=64)
+    flags = ["--height", "48", "--width", "64", "--images", "12", "--steps", "albedo", "--out", str(tmp_path / "out")]
+    assert main(["bench-surface", str(tmp_path / "data"), *flags]) == 0
+    found = json.loads((tmp_path / "out" / "bench_surface.json").read_text())
+    assert [row["normals"] for row in found["depths"]] == ["true normals", "least squares"]
+    assert found["depths"][0]["mae"] < 0.1 < found["depths"][1]["mae"] < 10.0  # attached shadows mislead least squares
+    assert found["depths"][0]["plain"]["residual"] < 0.1
+    (row,) = found["pictures"]
+    assert row["residual"] < 0.01 and row["shadows"] == {}
+    assert found["steps"]["albedo"]["seconds"] > 0
+    for step in bench_surface.STEPS:  # all of them, without a process each
+        sent = []
+        config = bench_surface.BenchClassicalConfig(height=32, width=40, lights=12)
+        bench_surface._work(step, config, SimpleNamespace(send=sent.append))
+        assert sent[0]["pixels"] > 500 and sent[0]["seconds"] > 0
+    assert "pixels of object, 12 images" in capsys.readouterr().out
+    assert main(["bench-surface", str(tmp_path / "nowhere"), *flags]) == 2
+    assert main(["bench-surface", "--steps", "albdo"]) == 2
+    assert "did you mean 'albedo'" in capsys.readouterr().err
+
+
+def test_cast_shadows_are_counted_on_a_step():
+    """A wall before a floor: its shadow is found by the true depth, and lowers the error of the relit pictures."""
+    size = 64
+    depth = np.where(np.arange(size) < 24, 0.5, 0.0) * np.ones((size, 1))  # in half image widths, as shards have it
+    normals = np.broadcast_to(np.float32([0, 0, 1]), (size, size, 3)).copy()
+    direction = np.float32([-0.8, 0.0, 0.6])
+    reach = int(0.5 * size / 2 * 0.8 / 0.6)  # of the shadow, in pixels
+    image = np.full((1, size, size, 3), 0.6 * 0.5, np.float32)
+    image[:, :, 24 : 24 + reach] = 0.0
+    shard = Shard(
+        scene_id="step",
+        images=image,
+        normals=normals,
+        depth=depth.astype(np.float32),
+        mask=np.ones((size, size), bool),
+        coverage=np.ones((size, size), np.float32),
+        light_directions=direction[None],
+        provenance={},
+    )
+    found = bench_surface._shadows(shard, np.full((size, size, 3), 0.5, np.float32))
+    assert found["true depth"]["found"] > 0.9 and found["true depth"]["wrong"] < 0.1
+    assert found["true depth"]["rms"] < 0.5 * found["none"]["rms"]
+    assert found["plain"]["found"] == 0.0  # normals that know of no wall
