@@ -207,7 +207,7 @@ def test_cast_shadows_are_counted_on_a_step():
     normals = np.broadcast_to(np.float32([0, 0, 1]), (size, size, 3)).copy()
     direction = np.float32([-0.8, 0.0, 0.6])
     reach = int(0.5 * size / 2 * 0.8 / 0.6)  # of the shadow, in pixels
-    image = np.full((1, size, size, 3), 0.6 * 0.5, np.float32)
+    image = np.full((1, size, size, 3), 0.6 * 0.5, np.float16)
     image[:, :, 24 : 24 + reach] = 0.0
     shard = Shard(
         scene_id="step",
