@@ -63,14 +63,18 @@ def lighting_methods(out: Path, preset: Preset, ways: Sequence[Method]) -> list[
         for name in names
         if name in available and (preset.test.shipped == ALL or weights.SHIPPED + name in told)
     ]
-    averaged = {way.lights: way.light_views for way in ways if way.light_views}
-    rows = [*methods, *kept]
-    return rows + [_in_views(row, averaged[row.lights]) for row in rows if row.lights in averaged]
+    return with_views([*methods, *kept], ways)
 
 
-def _in_views(method: Method, count: int) -> Method:
-    """Return the same lights averaged over turned views, beside the paper's one."""
-    return replace(method, name=f"{method.name}, {count} views", light_views=count, paper="")
+def with_views(rows: Sequence[Method], ways: Sequence[Method]) -> list[Method]:
+    """Return rows of lights, and after them those that one of `ways` averages over turned views, averaged so."""
+    counts = {way.lights: way.light_views for way in ways if way.light_views}
+    averaged = [
+        replace(row, name=f"{row.name}, {count} views", light_views=count, paper="")
+        for row in rows
+        if (count := counts.get(row.lights))
+    ]
+    return [*rows, *averaged]
 
 
 def _role(name: str, preset: Preset) -> str:

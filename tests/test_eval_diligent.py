@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from pipelines import published_real
-from pipelines.benchmarks import choose
+from pipelines.benchmarks import choose, suite
 from pipelines.benchmarks.diligent import OBJECTS, DiligentConfig, diligent_objects
 from pipelines.benchmarks.object_tables import object_table
 from pipelines.evaluation import Result
@@ -222,6 +222,17 @@ def test_expressions(models):
         names
     )
     assert choose.runs_folder(models / "models") == models.resolve()
+
+
+def test_lights_over_eight_views_have_a_row_of_their_own(models):
+    learned = {method.name: method for method in choose.selected(["learned"], models)}
+    views = learned["lcnet-soft (shipped), 8 views"]
+    assert (views.normals, views.light_views) == ("", 8)
+    assert list(suite.lighting_only(learned, list(learned.values())))[:2] == ["lcnet", "lcnet (shipped)"]
+    told = suite.lighting_only(learned, list(learned.values()))
+    assert views.name in told and not any("+" in name for name in told)
+    few = choose.selected(["shipped:lcnet-soft", "shipped:sdps-plus"], models)
+    assert len(suite.lighting_only({method.name: method for method in few}, few)) == 2  # one view, eight views
 
 
 @pytest.mark.skipif(not DATA, reason="SDPS_SHARED_DATA names no folder with diligent_ball.zip")

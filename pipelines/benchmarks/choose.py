@@ -46,7 +46,7 @@ def selected(expressions: list[str], out: Path | None) -> list[Method]:
     for text in expressions:
         if text == LEARNED:
             normals = methods.normal_methods(weights.shipped_folder() if out is None else out)  # nothing trained there
-            found += [*lighting_rows(out), *normals]
+            found += [*methods.with_views(lighting_rows(out), normals), *normals]
         elif text == CLASSICAL:
             found += classical_rows(calibrated=True)
         else:

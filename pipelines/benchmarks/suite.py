@@ -149,13 +149,15 @@ def text_of(tables: Sequence[Table], found: Found) -> str:
 
 def lighting_only(found: Found, chosen: Sequence[Method]) -> Found:
     """Leave out methods whose lights are those of another that tells lights alone."""
-    alone = {(method.lights, method.read_out) for method in chosen if method.lights and not method.normals}
+    alone = {_lights_of(method) for method in chosen if method.lights and not method.normals}
     kept = [
-        method.name
-        for method in chosen
-        if not (method.normals and not method.second and (method.lights, method.read_out) in alone)
+        method.name for method in chosen if not (method.normals and not method.second and _lights_of(method) in alone)
     ]
     return {name: found[name] for name in kept}
+
+
+def _lights_of(method: Method) -> tuple[str, str | None, int | None]:
+    return method.lights, method.read_out, method.light_views
 
 
 def add_arguments(parser: Any, out: str) -> None:
