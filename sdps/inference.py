@@ -25,6 +25,8 @@ from sdps.models.lighting_variants import LCNetSecond
 from sdps.symmetry import SYMMETRIES, KeptView, TurnedView, check_views, mean_lights, turned_context
 
 _ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels"), "second": ("second",)}
+_CHUNK_PIXELS = {"cpu": 2**17}
+"""On CPUs fewer images at once: their feature maps fit the caches, a quarter to a half faster with the same result."""
 
 
 class _Known(NamedTuple):
@@ -50,7 +52,8 @@ class Estimator:
             the second's training.
         margin: Pixels kept around the mask's bounding box.
         antialias: Average when the lighting networks' input is shrunk to 128x128 (the authors' code only interpolates).
-        chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images.
+        chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images. None: what
+            suits the device.
         rotations: Rotations about the view axis that pixel networks average over.
         light_views: Lights are the mean over so many turned and mirrored views of the object, 1, 2, 4 or 8.
         normal_views: The same for normals; every view costs as much again.
@@ -67,7 +70,7 @@ class Estimator:
     read_out: ReadOut = "centre"
     margin: int = 15
     antialias: bool = True
-    chunk_pixels: int = 2**19
+    chunk_pixels: int | None = None
     rotations: int = 10
     light_views: int = 1
     normal_views: int = 1
@@ -82,8 +85,9 @@ class Estimator:
         if self.second is not None and self.lighting is None:
             raise InputError(f"second: {self.second.name!r} starts from estimated lights; give a lighting model too")
         for name, least in (("margin", 0), ("chunk_pixels", 1), ("rotations", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise InputError(f"{name} must be at least {least}, got {value}")
         check_views(self.light_views, self.normal_views)
 
     @property
@@ -246,7 +250,8 @@ class Estimator:
         """Return the scene as the model in `place` saw scenes in training."""
         exposure = measure_exposure(scene.sample, getattr(self, place).augmentation())
         diagnostics["exposure"][place] = exposure.scale
-        return View(scene, exposure, balance, fit, max(1, self.chunk_pixels // pixels), self.device)
+        chunk = self.chunk_pixels or _CHUNK_PIXELS.get(self.device.type, 2**19)
+        return View(scene, exposure, balance, fit, max(1, chunk // pixels), self.device)
 
     @property
     def _shrink(self) -> Any:
