@@ -51,15 +51,20 @@ def in_order(preset: Preset, names: list[str]) -> list[str]:
     """Return the runs named and those they need, each after what it needs.
 
     Raises:
-        InputError: runs that need each other.
+        InputError: runs that need each other, or weights that are not there and that no run makes.
     """
+    from sdps.weights import is_run, require
+
     ordered: list[str] = []
 
     def visit(name: str, above: tuple[str, ...]) -> None:
         if name in above:
             raise InputError(f"runs.{name}: needs itself (by way of {', '.join(above)}); change its lights")
         for needed in preset.run(name).requires.values():
-            visit(needed, (*above, name))
+            if is_run(needed):
+                visit(needed, (*above, name))
+            else:
+                require(needed)  # said before hours of training, not after
         if name not in ordered:
             ordered.append(name)
 
@@ -107,11 +112,11 @@ def document(folder: Path, data: Path, result: "TrainingResult") -> None:
 
 
 def required(out: Path, name: str) -> "TrainedModel":
-    """Load the weights of a run that another one needs."""
+    """Load the weights that a run needs: those of another, shipped ones, or a file's."""
     from sdps.checkpoint import load_weights
-    from sdps.weights import trained_file
+    from sdps.weights import is_run, require, trained_file
 
-    return load_weights(trained_file(out, name))
+    return load_weights(trained_file(out, name) if is_run(name) else require(name))
 
 
 def describe(name: str, result: "TrainingResult") -> str:

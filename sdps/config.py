@@ -20,7 +20,8 @@ class TrainingConfig:
 
     Attributes:
         seed: Root seed of weights, order, image subsets and augmentation.
-        start: Run of the same network whose weights training starts from; empty for random ones.
+        start: What of the same network training starts from: a run, `shipped:<name>` or a `.safetensors` file; empty
+            for random weights.
         epochs: Passes over the training scenes, unless `steps` or `minutes` is set.
         steps: Optimiser steps to take instead.
         minutes: Minutes of training to spend instead, counted across resumed runs.
@@ -161,7 +162,8 @@ class NormalTraining(TrainingConfig):
 
     Attributes:
         loss: `masked` averages over the object, `faithful` over all pixels as the authors' code does.
-        lights: The run of a lighting model, or `true`; empty: what the model's registry entry names.
+        lights: The run of a lighting model, `shipped:<name>`, a `.safetensors` file, or `true`; empty: what the
+            model's registry entry names.
         read_out: How light classes become lights: `centre` (the paper's), `expectation` or `peak`.
         crop: Side of the random crop the network sees (0: the whole image); the lighting model always sees the whole.
         min_object: Least share of object pixels a crop should have; the best of a few draws is taken.

@@ -30,7 +30,8 @@ class Run(NamedTuple):
         name: Names the folder and the weights.
         model: Name in the registry, or `sdps-joint`.
         config: Resolved configuration.
-        requires: Runs whose weights it needs, by what they are for (`lighting`, `normals`, `start`).
+        requires: Runs whose weights it needs, or weights themselves (`shipped:<name>`, a `.safetensors` file), by what
+            they are for (`lighting`, `normals`, `start`).
     """
 
     name: str

@@ -30,6 +30,11 @@ def trained(out: Path | None) -> list[str]:
     return [path.stem for path in files if not path.stem.endswith("-best")]
 
 
+def is_run(name: str) -> bool:
+    """Return whether a name is a run's: not one of shipped weights, nor a file."""
+    return not name.startswith(SHIPPED) and not name.endswith(_SUFFIX)
+
+
 def trained_file(out: Path, name: str) -> Path:
     """Return where the weights of a run lie, or would lie, in the folder of the runs."""
     own = out / MODELS_FOLDER / name / f"{name}{_SUFFIX}"
@@ -63,7 +68,9 @@ def require(name: str, out: Path | None = None) -> Path:
     path = locate(name, out)
     if path.is_file():
         return path
+    if name.endswith(_SUFFIX):
+        raise InputError(f"{path}: no such weights; correct the path, or name a run or `{SHIPPED}<name>`")
     plain = name.removeprefix(SHIPPED)
-    if plain not in MODELS and not name.endswith(_SUFFIX):
+    if plain not in MODELS:
         raise unknown("model or method", plain, {*trained(out), *shipped(), *MODELS, *COMBINATIONS, *METHODS})
     raise InputError(f"{path}: no such weights; train them with `sdps train --models {plain}`")

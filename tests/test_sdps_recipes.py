@@ -3,9 +3,9 @@
 import pytest
 
 from pipelines import presets
-from pipelines.train import in_order
+from pipelines.train import in_order, required
 from render.errors import InputError
-from sdps import recipes
+from sdps import recipes, weights
 from sdps.config import JointTraining, LightingTraining, NormalTraining, PixelTraining
 from sdps.models.registry import MODELS
 
@@ -81,3 +81,13 @@ def test_runs_are_trained_after_what_they_need() -> None:
     ]  # fmt: skip
     with pytest.raises(InputError, match="needs itself"):
         in_order(presets.load("smoke", ["runs.a={base: nenet, lights: a}"]), ["a"])
+
+
+def test_weights_that_are_there_need_no_run(tmp_path):
+    own = "runs.further={base: nenet, start: shipped:nenet, lights: shipped:lcnet}"
+    assert in_order(presets.load("smoke", [own]), ["further"]) == ["further"]
+    assert required(tmp_path, "shipped:lcnet").name == "lcnet"
+    assert required(tmp_path, str(weights.shipped_folder() / "psfcn.safetensors")).name == "psfcn"
+    gone = tmp_path / "gone.safetensors"
+    with pytest.raises(InputError, match=r"gone.safetensors: no such weights"):
+        in_order(presets.load("smoke", [f"runs.further={{base: nenet, start: {gone}}}"]), ["further"])
