@@ -33,8 +33,8 @@ from sdps.weights import SHIPPED
 DEFINITION = (
     "Means over scenes (one per material). Normals: mean angular error in degrees over mask pixels. Directions: mean "
     "angular error in degrees over images. Intensities: mean relative error after one least-squares scale. Inputs: "
-    "linear half-float radiance times random intensities, multiplied by the mask, whole frame. In brackets: the "
-    "paper's figure, of its own rendering of the same materials."
+    "linear half-float radiance times random intensities, multiplied by the mask; networks see the object's box with "
+    "15 pixels of margin. In brackets: the paper's figure, of its own rendering of the same materials."
 )
 
 
