@@ -1,5 +1,7 @@
 """Runs: how a model's recipe, a preset's sections and a run's own settings make one configuration."""
 
+from pathlib import Path
+
 import pytest
 
 from pipelines import presets
@@ -83,7 +85,7 @@ def test_runs_are_trained_after_what_they_need() -> None:
         in_order(presets.load("smoke", ["runs.a={base: nenet, lights: a}"]), ["a"])
 
 
-def test_weights_that_are_there_need_no_run(tmp_path):
+def test_weights_that_are_there_need_no_run(tmp_path: Path) -> None:
     own = "runs.further={base: nenet, start: shipped:nenet, lights: shipped:lcnet}"
     assert in_order(presets.load("smoke", [own]), ["further"]) == ["further"]
     assert required(tmp_path, "shipped:lcnet").name == "lcnet"
