@@ -30,13 +30,6 @@ from sdps.methods import CONSTANT, Method, Runner, runner_config
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.weights import SHIPPED
 
-DEFINITION = (
-    "Means over scenes (one per material). Normals: mean angular error in degrees over mask pixels. Directions: mean "
-    "angular error in degrees over images. Intensities: mean relative error after one least-squares scale. Inputs: "
-    "linear half-float radiance times random intensities, multiplied by the mask; networks see the object's box with "
-    "15 pixels of margin. In brackets: the paper's figure, of its own rendering of the same materials."
-)
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps eval-merltest`."""
@@ -74,8 +67,19 @@ def main(args: argparse.Namespace) -> int:
     page = report.write(out, preset)
     listed = (render_text(f"\n{table.title}", list(table.header), list(table.rows), left=(0, 1)) for table in tables)
     sys.stdout.write("\n".join(listed))
-    sys.stdout.write(f"\n{DEFINITION}\n{page}\n")
+    sys.stdout.write(f"\n{definition(preset.test)}\n{page}\n")
     return 0
+
+
+def definition(config: TestConfig) -> str:
+    """Return what the tables' numbers are and what the methods saw."""
+    seen = "whole frame" if config.margin is None else f"object's box with {config.margin} pixels of margin"
+    return (
+        "Means over scenes (one per material). Normals: mean angular error in degrees over mask pixels. Directions: "
+        "mean angular error in degrees over images. Intensities: mean relative error after one least-squares scale. "
+        "Inputs: linear half-float radiance times random intensities, multiplied by the mask; networks see the "
+        f"{seen}. In brackets: the paper's figure, of its own rendering of the same materials."
+    )
 
 
 def rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[list[Method], list[Method]]:
@@ -152,7 +156,7 @@ def build_tables(results: list[SceneScores], lighting: list[Method], normals: li
 def results_json(results: list[SceneScores], tables: list[Table], preset: Preset, weights: dict[str, str]) -> dict:
     """Collect everything a reader needs to judge the numbers."""
     return {
-        "definition": DEFINITION,
+        "definition": definition(preset.test),
         "weights": weights,
         "config": to_plain(preset.test),
         "tables": {table.title: {"header": table.header, "rows": table.rows} for table in tables},

@@ -41,7 +41,8 @@ def write(
     repeats = f"{config.repeats} draws of intensities" if config.repeats > 1 else "one draw of intensities"
     text = (
         f"{len(results)} scenes of {config.size}x{config.size} pixels, {len(results[0].scene.lights)} lights, "
-        f"{repeats}. {eval_merltest.DEFINITION} Error maps run from 0 (black) to {ERROR_LIMIT:g} degrees (yellow)."
+        f"{repeats}. {eval_merltest.definition(config)} "
+        f"Error maps run from 0 (black) to {ERROR_LIMIT:g} degrees (yellow)."
     )
     names = [runner.method.name for runner in runners]
     section = Section(

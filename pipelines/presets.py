@@ -40,6 +40,8 @@ class TestConfig:
         pictures: Scenes shown in the report, per shape.
         read_out: How LCNet's classes become lights: `centre` (the paper's) or `expectation`.
         rotations: Rotations about the view axis that pixel networks average over.
+        margin: Pixels around the object's box that networks see, as of photographs; null: the whole frame, as in
+            training.
         light_views: Turned and mirrored views that lights are averaged over, 1, 2, 4 or 8.
         normal_views: The same for normals.
         precision: Arithmetic of the networks, `float32` or `bfloat16`.
@@ -59,6 +61,7 @@ class TestConfig:
     pictures: int = 5
     read_out: ReadOut = "centre"
     rotations: int = 10
+    margin: int | None = None
     light_views: int = 1
     normal_views: int = 1
     precision: Literal["float32", "bfloat16"] = "bfloat16"
@@ -76,6 +79,8 @@ class TestConfig:
             raise InputError("shapes and materials must name at least one each")
         if self.seed < 0 or self.bounces < 0:
             raise InputError("seed and bounces must not be negative")
+        if self.margin is not None and self.margin < 0:
+            raise InputError(f"margin must be 0 pixels or more, or null for the whole frame, got {self.margin}")
         check_views(self.light_views, self.normal_views)
         light_sets.load(self.lights)
 

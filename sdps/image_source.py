@@ -40,7 +40,7 @@ class ObjectImages:
 
     Attributes:
         source: All images.
-        rows, columns: The box around the mask, with its margin.
+        rows, columns: The box around the mask, with its margin, or the whole frame.
         mask: (h, w) bool, the mask inside the box.
         shape: (H, W).
         sample: (L, P, 3) float32, radiance of object pixels: all, or those the exposure is measured on.
@@ -69,13 +69,13 @@ class ObjectImages:
             yield range(start, min(start + count, len(self)), step)
 
 
-def survey(source: ImageSource, mask: np.ndarray, margin: int) -> ObjectImages:
+def survey(source: ImageSource, mask: np.ndarray, margin: int | None) -> ObjectImages:
     """Go through all images once: check them, find the object's box, gather what the exposure is measured on.
 
     Args:
         source: (L, H, W, 3), L >= 1.
         mask: (H, W) bool.
-        margin: Pixels kept around the mask's bounding box.
+        margin: Pixels kept around the mask's bounding box; None keeps the whole frame.
 
     Raises:
         InputError: sizes that do not fit, an empty mask, or values that are not finite inside it.
@@ -175,7 +175,9 @@ def _sampled_pixels(pixels: int, images: int) -> np.ndarray:
     return np.sort(generator(0, "exposure").choice(pixels, wanted, replace=False))
 
 
-def _box(occupied: np.ndarray, margin: int) -> slice:
-    """Return the range of the true values of (N,) bool, `margin` wider and inside [0, N)."""
+def _box(occupied: np.ndarray, margin: int | None) -> slice:
+    """Return the range of the true values of (N,) bool, `margin` wider and inside [0, N); all of that without one."""
+    if margin is None:
+        return slice(0, len(occupied))
     inside = np.flatnonzero(occupied)
     return slice(max(int(inside[0]) - margin, 0), min(int(inside[-1]) + 1 + margin, len(occupied)))

@@ -50,7 +50,8 @@ class Estimator:
         precision: `bfloat16` runs the networks under autocast.
         read_out: How light classes become lights. A first pass that a second follows is read out as expectation, as in
             the second's training.
-        margin: Pixels kept around the mask's bounding box.
+        margin: Pixels kept around the mask's bounding box; None for images framed as in training, which are not cut. A
+            box is brought to the lighting networks' 128x128, and the lights they find depend on its size.
         antialias: Average when the lighting networks' input is shrunk to 128x128 (the authors' code only interpolates).
         chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images. None: what
             suits the device.
@@ -68,7 +69,7 @@ class Estimator:
     device: torch.device
     precision: Literal["float32", "bfloat16"] = "float32"
     read_out: ReadOut = "centre"
-    margin: int = 15
+    margin: int | None = 15
     antialias: bool = True
     chunk_pixels: int | None = None
     rotations: int = 10

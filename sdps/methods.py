@@ -72,6 +72,7 @@ class RunnerConfig:
         read_out: How light classes become lights.
         precision: Arithmetic of the networks.
         rotations: Rotations about the view axis that pixel networks average over.
+        margin: Pixels kept around the mask's bounding box, for photographs; None for the whole frame, as in training.
         light_views: Turned and mirrored views that lights are averaged over, 1, 2, 4 or 8.
         normal_views: The same for normals.
     """
@@ -79,6 +80,7 @@ class RunnerConfig:
     read_out: ReadOut = "expectation"
     precision: Literal["float32", "bfloat16"] = "bfloat16"
     rotations: int = 10
+    margin: int | None = 15
     light_views: int = 1
     normal_views: int = 1
 
@@ -101,7 +103,7 @@ class Runner:
     Args:
         method: What to do.
         find: Gives the weights file of a name, or raises InputError.
-        config: Read-out, precision and rotations.
+        config: Read-out, precision, rotations, margin and views.
 
     Raises:
         InputError: weights that are missing, damaged, or of another role.
@@ -127,6 +129,7 @@ class Runner:
                 precision=config.precision,
                 read_out=method.read_out or config.read_out,
                 rotations=config.rotations,
+                margin=config.margin,
                 **self.views,
             )
 
@@ -139,7 +142,7 @@ class Runner:
         if self.estimator is not None:
             named = {place: getattr(method, place) for place in ("lights", "normals", "second")}
             parts += [(place, _digest(self.files[name])) for place, name in named.items() if name in self.files]
-            parts += [method.read_out or config.read_out, config.precision, config.rotations]
+            parts += [method.read_out or config.read_out, config.precision, config.rotations, config.margin]
             parts += [*self.views.values(), _inference_digest()]
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
@@ -186,8 +189,8 @@ class Runner:
         places = ("lights", "second", "normals") if self.method.second else ("lights",)  # a second pass sees normals
         views = tuple(self.views.values()) if self.method.second else (self.views["light_views"],)
         used = (_digest(self.files[getattr(self.method, place)]) for place in places)
-        options = self.method.read_out or self.config.read_out, self.config.precision, *views, "intensities" in given
-        key = (*used, *options)
+        options = self.method.read_out or self.config.read_out, self.config.precision, self.config.margin
+        key = (*used, *options, *views, "intensities" in given)
         if key not in found:
             found[key] = self.estimator.estimate_lights(images, mask, given.get("intensities"))
         return found[key]

@@ -16,7 +16,7 @@ from sdps import weights
 from sdps.augment import Augmentation
 from sdps.checkpoint import TrainedModel, save_weights
 from sdps.inference import Estimator
-from sdps.methods import Method, Runner, RunnerConfig, combine, parse
+from sdps.methods import Method, Runner, RunnerConfig, combine, parse, runner_config
 from sdps.models.registry import create
 
 LIGHTS = hemisphere_lights(12, np.random.default_rng(0))
@@ -175,8 +175,25 @@ def test_results_are_kept_until_something_changes(tmp_path: Path, runs: Path, mo
     networks = [Runner(parse(text, methods.finder(runs)), methods.finder(runs), config)
                 for text, config in (("sdps", RunnerConfig()), ("sdps", RunnerConfig(read_out="centre")),
                                      ("sdps", RunnerConfig(light_views=8)), ("sdps", RunnerConfig(normal_views=2)),
+                                     ("sdps", RunnerConfig(margin=None)),
                                      ("true+nenet", RunnerConfig()), ("lcnet+psfcn", RunnerConfig()))]  # fmt: skip
-    assert len({item.identity() for item in networks}) == 6
+    assert len({item.identity() for item in networks}) == 7
+
+
+def test_rendered_scenes_are_seen_whole_and_photographs_cut(
+    tmp_path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    whole = Estimator.estimate_lights
+    monkeypatch.setattr(Estimator, "estimate_lights", lambda *given: seen.append(given[0].margin) or whole(*given))
+    preset, find = presets.load("smoke"), methods.finder(runs)
+    for config in (runner_config(preset.test), runner_config(replace(preset.test, margin=15)), RunnerConfig()):
+        Evaluation(tmp_path).result(hills(), Runner(parse("lcnet", find), find, config))
+    assert seen == [None, 15, 15]  # the last as `infer` does
+    with pytest.raises(InputError, match="margin must be 0 pixels or more, or null"):
+        replace(preset.test, margin=-1)
+    assert "whole frame" in eval_merltest.definition(preset.test)
+    assert "box with 15 pixels" in eval_merltest.definition(replace(preset.test, margin=15))
 
 
 def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -96,6 +96,8 @@ def test_object_is_found_wherever_it_is(estimator: Estimator) -> None:
     moved = estimator.estimate(wide, np.pad(mask, ((40, 0), (24, 60))))
     np.testing.assert_array_equal(moved.light_directions, reference.light_directions)
     np.testing.assert_allclose(moved.normals[40:, 24:114], reference.normals, atol=1e-5)
+    framed = replace(estimator, margin=None).estimate(wide, np.pad(mask, ((40, 0), (24, 60))))
+    assert np.abs(framed.light_directions - reference.light_directions).max() > 1e-3  # a smaller object
 
 
 def test_given_lights_are_used_and_their_scale_is_not(estimator: Estimator) -> None:
@@ -301,7 +303,7 @@ def test_second_pass_is_the_one_of_training() -> None:
     images, mask, lights = scene(size=128)
     models = {"lighting": trained("lcnet-soft"), "normals": trained("nenet-plus")}
     second = trained("lcnet-second")
-    estimator = Estimator(**models, second=second, device=torch.device("cpu"), margin=128)
+    estimator = Estimator(**models, second=second, device=torch.device("cpu"), margin=None)
     estimate = estimator.estimate(images, mask)
     exposed, _ = normalise_exposure(images, mask, Augmentation())
     batch = Batch(
