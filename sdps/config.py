@@ -49,6 +49,8 @@ class TrainingConfig:
         log_every: Steps between lines of metrics.
         validate_every: Steps between validations; 0 validates at the end only.
         validation_scenes: Scenes of split `val` to validate on (0: none).
+        validation_images: Images drawn per validation scene; as in training where it is not set. In use there are more,
+            and what is better with few need not be with many.
         checkpoint_minutes: Minutes between checkpoints.
         augmentation: How images are altered.
     """
@@ -81,12 +83,13 @@ class TrainingConfig:
     log_every: int = 20
     validate_every: int = 0
     validation_scenes: int = 16
+    validation_images: int | None = None
     checkpoint_minutes: float = 5.0
     augmentation: Augmentation = field(default_factory=Augmentation)
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "steps", "minutes", "batch_scenes", "accumulate", "images", "learning_rate",
-                     "log_every", "checkpoint_minutes"):  # fmt: skip
+        for name in ("epochs", "steps", "minutes", "batch_scenes", "accumulate", "images", "validation_images",
+                     "learning_rate", "log_every", "checkpoint_minutes"):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not (value > 0 and math.isfinite(value)):
                 raise InputError(f"{name} must be positive, got {value}")
@@ -165,6 +168,8 @@ class NormalTraining(TrainingConfig):
         lights: The run of a lighting model, `shipped:<name>`, a `.safetensors` file, or `true`; empty: what the
             model's registry entry names.
         read_out: How light classes become lights: `centre` (the paper's), `expectation` or `peak`.
+        light_blend: Largest share of the way to the true lights that estimated ones are moved, drawn evenly for each
+            training sample. The many images and views of use give better lights than a sample's few.
         crop: Side of the random crop the network sees (0: the whole image); the lighting model always sees the whole.
         min_object: Least share of object pixels a crop should have; the best of a few draws is taken.
         lighting_weight: Weight of the lighting loss beside the normal loss, for models that learn both.
@@ -176,6 +181,7 @@ class NormalTraining(TrainingConfig):
     loss: Literal["masked", "faithful"] = "masked"
     lights: str = ""
     read_out: ReadOut = "centre"
+    light_blend: float = 0.0
     crop: int = 0
     min_object: float = 0.3
     lighting_weight: float = 0.1
@@ -184,6 +190,8 @@ class NormalTraining(TrainingConfig):
         super().__post_init__()
         if self.crop and (self.crop % 4 or not 16 <= self.crop <= self.size):
             raise InputError(f"crop must be 0 or a multiple of 4 from 16 to size ({self.size}), got {self.crop}")
+        if not 0.0 <= self.light_blend <= 1.0:
+            raise InputError(f"light_blend must be in [0, 1], got {self.light_blend}")
         if not 0.0 <= self.min_object < 1.0:
             raise InputError(f"min_object must be in [0, 1), got {self.min_object}")
         if self.lighting_weight < 0.0:
@@ -239,5 +247,7 @@ class JointTraining(NormalTraining):
         super().__post_init__()
         if self.read_out != "expectation":
             raise InputError(f"read_out must be expectation, the only one with a gradient, got {self.read_out}")
+        if self.light_blend:
+            raise InputError("light_blend must be 0: the normals' error reaches the lighting model through its lights")
         if not self.normal_weight > 0.0:
             raise InputError(f"normal_weight must be positive, got {self.normal_weight}")

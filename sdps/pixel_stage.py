@@ -68,7 +68,7 @@ class PixelStage(NormalStage):
         A scene without object pixels adds zero.
         """
         config = self.config
-        lights = self.lights(batch)
+        lights = self.training_lights(batch)
         pixels = draw_pixels(
             batch, lights, batch.seed.tolist(), count=config.pixels_per_scene, min_lights=config.min_lights
         )

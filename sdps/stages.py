@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from render.errors import InputError
-from render.seeds import derived_seed
+from render.seeds import derived_seed, generator
 from sdps.checkpoint import TrainedModel
 from sdps.config import LightingTraining, NormalTraining, TrainingConfig
 from sdps.dataset import Batch, SampleOptions
@@ -91,7 +92,8 @@ class Stage(ABC):
         """Return how validation samples are made: whole images in the pose they were rendered."""
         options = self.sample_options()
         augmentation = replace(options.augmentation, symmetries=False, biased=0.0, frontal=0.0)
-        return replace(options, crop=0, rescale=False, augmentation=augmentation)
+        images = self.config.validation_images or options.images
+        return replace(options, images=images, crop=0, rescale=False, augmentation=augmentation)
 
     @abstractmethod
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -176,9 +178,20 @@ class NormalStage(Stage):
         network = self.lighting.network
         return network.lights(network(*resize_input(batch.images, batch.mask)), self.config.read_out)
 
+    def training_lights(self, batch: Batch) -> Lights | None:
+        """Return the lights the network is given in training, some of the way towards the true ones (`light_blend`)."""
+        lights, limit = self.lights(batch), self.config.light_blend
+        if self.lighting is None or not limit:
+            return lights
+        drawn = [generator(seed, "light_blend").uniform(0.0, limit) for seed in batch.seed.tolist()]
+        share = torch.tensor(drawn, device=batch.images.device)[:, None]  # (B, 1)
+        directions = torch.lerp(lights.directions.float(), batch.directions, share[..., None])  # (B, Q, 3)
+        intensities = torch.lerp(lights.intensities.float(), batch.intensities, share)  # (B, Q)
+        return Lights(functional.normalize(directions, dim=-1), intensities)
+
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the configured normal loss on the crops, and the lighting loss of models that learn both."""
-        lights = self.lights(batch)
+        lights = self.training_lights(batch)
         side = self.config.crop or self.config.size
         images, mask, truth = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
         seen = self.network.observe(images, mask, lights)

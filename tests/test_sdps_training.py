@@ -261,6 +261,35 @@ def test_stage_two_leaves_the_lighting_network_as_it_is(folder: Path, tmp_path: 
     torch.testing.assert_close(classes.decode(*labels)[0], lights.directions)
 
 
+def test_lights_are_moved_some_of_the_way_to_the_true_ones(folder: Path) -> None:
+    lighting = TrainedModel("lcnet", create("lcnet").eval(), {"direction_classes": 36, "intensity_classes": 20},
+                            {"config": {"augmentation": {}}, "data": "d", "step": 1})  # fmt: skip
+    stages = [NormalStage(replace(QUICK, lights="lcnet", light_blend=blend), lighting) for blend in (0.0, 1.0)]
+    dataset = SceneDataset(folder, "train", stages[0].sample_options())
+    batch = collate([dataset.sample(SampleKey(scene, 0, scene)) for scene in range(4)])
+    found, blended = (stage.training_lights(batch) for stage in stages)
+    torch.testing.assert_close(stages[1].lights(batch).directions, found.directions)  # in validation all as found
+    torch.testing.assert_close(blended.directions.norm(dim=-1), torch.ones(4, 2))
+    share = (blended.intensities - found.intensities) / (batch.intensities - found.intensities)  # one for a sample
+    torch.testing.assert_close(share[:, 0], share[:, 1], rtol=1e-3, atol=1e-3)
+    assert ((share > 0.0) & (share < 1.0)).all() and share[:, 0].std() > 0.05
+    whole = (found.directions * batch.directions).sum(-1).arccos()
+    np.testing.assert_array_less((blended.directions * batch.directions).sum(-1).arccos(), whole + 1e-4)
+    torch.testing.assert_close(stages[1].training_lights(batch), blended)  # by the samples' seeds alone
+    true = NormalStage(replace(QUICK, light_blend=1.0)).training_lights(batch)
+    torch.testing.assert_close(true.directions, batch.directions)
+
+
+def test_validation_may_see_more_images_than_training(folder: Path, tmp_path: Path) -> None:
+    stage = NormalStage(replace(QUICK, validation_images=4))
+    assert (stage.sample_options().images, stage.validation_options().images) == (2, 4)
+    few, many = (train(NormalStage(replace(QUICK, steps=1, validation_images=count)), folder, tmp_path / str(count))
+                 for count in (None, 4))  # fmt: skip
+    assert few.metrics["val_normal_mae"] != many.metrics["val_normal_mae"]
+    saved = [load_file(result.weights["nenet"]) for result in (few, many)]
+    assert all(torch.equal(tensor, saved[1][name]) for name, tensor in saved[0].items())
+
+
 def test_weights_carry_their_origin(uninterrupted: tuple) -> None:
     model = load_weights(uninterrupted[1].weights["nenet"], "normals")
     assert model.metadata["step"] == 8
