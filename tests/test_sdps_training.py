@@ -245,9 +245,13 @@ def test_accumulated_gradients_are_those_of_the_whole_batch(folder: Path, tmp_pa
     assert outs[0] == pytest.approx(outs[1], rel=1e-5)
 
 
+def untrained_lcnet() -> TrainedModel:
+    return TrainedModel("lcnet", create("lcnet").eval(), {"direction_classes": 36, "intensity_classes": 20},
+                        {"config": {"augmentation": {}}, "data": "d", "step": 1})  # fmt: skip
+
+
 def test_stage_two_leaves_the_lighting_network_as_it_is(folder: Path, tmp_path: Path) -> None:
-    lighting = TrainedModel("lcnet", create("lcnet").eval(), {"direction_classes": 36, "intensity_classes": 20},
-                            {"config": {"augmentation": {}}, "data": "d", "step": 1})  # fmt: skip
+    lighting = untrained_lcnet()
     before = {name: tensor.clone() for name, tensor in lighting.network.state_dict().items()}
     stage = NormalStage(replace(QUICK, steps=2, lights="lcnet"), lighting)
     result = train(stage, folder, tmp_path)
@@ -262,8 +266,7 @@ def test_stage_two_leaves_the_lighting_network_as_it_is(folder: Path, tmp_path: 
 
 
 def test_lights_are_moved_some_of_the_way_to_the_true_ones(folder: Path) -> None:
-    lighting = TrainedModel("lcnet", create("lcnet").eval(), {"direction_classes": 36, "intensity_classes": 20},
-                            {"config": {"augmentation": {}}, "data": "d", "step": 1})  # fmt: skip
+    lighting = untrained_lcnet()
     stages = [NormalStage(replace(QUICK, lights="lcnet", light_blend=blend), lighting) for blend in (0.0, 1.0)]
     dataset = SceneDataset(folder, "train", stages[0].sample_options())
     batch = collate([dataset.sample(SampleKey(scene, 0, scene)) for scene in range(4)])
