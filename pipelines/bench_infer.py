@@ -1,8 +1,8 @@
 """`sdps bench-infer`: seconds and memory from a folder of photographs to everything `sdps infer` writes.
 
 The photographs are 16-bit pictures of the object of `bench-classical`, which fills the frame but for a margin. Every
-run is a process of its own. With `--many`, a second folder repeats the pictures up to that number, to show that memory
-does not grow with them.
+run is a process of its own; both kinds of processor are measured (`pipelines.machines`). With `--many`, a second folder
+repeats the pictures up to that number, to show that memory does not grow with them.
 """
 
 import argparse
@@ -10,13 +10,14 @@ import shutil
 import sys
 import tempfile
 import time
-from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
 
+from pipelines import using
 from pipelines.bench_classical import BenchClassicalConfig, scene
+from pipelines.machines import hold, kinds, processor
 from pipelines.memory import apart, peak_gib
 from pipelines.regenerate import split_list
 from pipelines.tables import render_text
@@ -24,6 +25,7 @@ from render.errors import InputError
 from render.exchange.images import quantise, write_png
 from render.files import write_json
 from render.progress import progress_bar
+from sdps.inference_config import InferenceConfig, inference_config
 
 SECONDS, GIBIBYTES = 180.0, 3.0
 """The limits of a folder of 96 pictures of 612x512 on two cores."""
@@ -34,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps bench-infer`."""
     parser.add_argument("--methods", action="append", help="commas or repeat (default: sdps)")
     parser.add_argument("--models", type=Path, default=None, help="folder of trained runs (default: shipped weights)")
-    parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"))
+    using.add_arguments(parser)
     parser.add_argument("--height", type=int, default=BenchClassicalConfig.height)
     parser.add_argument("--width", type=int, default=BenchClassicalConfig.width)
     parser.add_argument("--images", type=int, default=BenchClassicalConfig.lights)
@@ -45,17 +47,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Write the photographs, infer them with every method, print the table and write bench_infer.json."""
-    config = BenchClassicalConfig(height=args.height, width=args.width, lights=args.images)
+    """Write the photographs, infer them with every method, print the tables and write bench_infer.json."""
+    config, used = (
+        BenchClassicalConfig(height=args.height, width=args.width, lights=args.images),
+        inference_config(args),
+    )
     folders = {args.images: photograph(args.out / "photographs", config)}
     if args.many:
         folders[args.many] = repeated(args.out / "many", folders[args.images], args.many)
-    found: dict[str, dict] = {}
-    for name in split_list(args.methods) or ["sdps"]:
-        for count, folder in folders.items():
-            found[f"{name}, {count} pictures"] = measure(folder, name, args.models, args.precision)
-    write_json(args.out / "bench_infer.json", {"config": vars(config), "precision": args.precision, "runs": found})
-    sys.stdout.write(f"{table(found, config)}{args.out / 'bench_infer.json'}\n")
+    found: dict[str, dict[str, dict]] = {}
+    for kind in kinds():
+        with hold(kind):
+            found[kind] = {
+                f"{name}, {count} pictures": measure(folder, name, args.models, used)
+                for name in split_list(args.methods) or ["sdps"]
+                for count, folder in folders.items()
+            }
+    write_json(args.out / "bench_infer.json", {"config": vars(config), "networks": used.options(), "kinds": found})
+    tables = (table(rows, config, f"{processor()}, {kind}") for kind, rows in found.items())
+    sys.stdout.write("\n".join(tables) + f"{args.out / 'bench_infer.json'}\n")
     return 0
 
 
@@ -89,14 +99,14 @@ def repeated(folder: Path, source: Path, count: int) -> Path:
     return folder
 
 
-def measure(folder: Path, method: str, models: Path | None, precision: str) -> dict:
-    """Infer a folder in a fresh process: seconds per step and in all, peak_gib, pixels, error."""
-    return apart(_work, folder, method, models, precision)
+def measure(folder: Path, method: str, models: Path | None, config: InferenceConfig) -> dict:
+    """Infer a folder in a fresh process: seconds per step and in all, peak_gib, pixels, precision, error."""
+    return apart(_work, folder, method, models, config)
 
 
-def _work(folder: Path, method: str, models: Path | None, precision: str, results: Connection) -> None:
+def _work(folder: Path, method: str, models: Path | None, config: InferenceConfig, results: Connection) -> None:
     """Do what `sdps infer` does, and send what it took."""
-    from sdps.api import INFER_CONFIG, infer, load
+    from sdps.api import infer, load
     from sdps.photos import check
 
     marks = [time.perf_counter()]
@@ -105,9 +115,7 @@ def _work(folder: Path, method: str, models: Path | None, precision: str, result
         marks.append(time.perf_counter())
         findings = tuple(check(photos))
         marks.append(time.perf_counter())
-        result = infer(
-            photos, method, models=models, config=replace(INFER_CONFIG, precision=precision), findings=findings
-        )
+        result = infer(photos, method, models=models, config=config, findings=findings)
         marks.append(time.perf_counter())
         with tempfile.TemporaryDirectory() as out:
             result.save(out)
@@ -122,23 +130,24 @@ def _work(folder: Path, method: str, models: Path | None, precision: str, result
             "seconds": marks[-1] - marks[0],
             "peak_gib": peak_gib(),
             "pixels": int(photos.mask.sum()),
+            "precision": result.estimate.diagnostics.get("precision", "-"),
             "error": "",
         }
     )
 
 
-def table(found: dict[str, dict], config: BenchClassicalConfig) -> str:
-    """Lay the figures out as text, with the limits."""
+def table(found: dict[str, dict], config: BenchClassicalConfig, machine: str) -> str:
+    """Lay the figures of one kind of machine out as text, with the limits."""
     rows = []
     for name, item in found.items():
         if item["error"]:
-            rows.append([name, *["-"] * (len(STEPS) + 2), item["error"]])
+            rows.append([name, *["-"] * (len(STEPS) + 3), item["error"]])
             continue
         size = "-" if item["peak_gib"] is None else f"{item['peak_gib']:.2f}"
         kept = item["seconds"] <= SECONDS and (item["peak_gib"] or 0.0) <= GIBIBYTES
         seconds = [f"{item[step]:.1f}" for step in STEPS]
-        rows.append([name, *seconds, f"{item['seconds']:.1f}", size, "yes" if kept else "no"])
+        rows.append([name, item["precision"], *seconds, f"{item['seconds']:.1f}", size, "yes" if kept else "no"])
     pixels = next((item["pixels"] for item in found.values() if not item["error"]), 0)
-    title = f"pictures of {config.width}x{config.height}, 16 bits, {pixels:,} pixels of object"
+    title = f"{machine}: pictures of {config.width}x{config.height}, 16 bits, {pixels:,} pixels of object"
     limit = f"within {SECONDS:.0f} s, {GIBIBYTES:.0f} GiB"
-    return render_text(title, ["method", *STEPS, "seconds", "peak GiB", limit], rows)
+    return render_text(title, ["method", "precision", *STEPS, "seconds", "peak GiB", limit], rows)

@@ -1,13 +1,13 @@
 """`sdps bench-train`: what a training step costs, the trainer's against a plain float32 loop, in one run.
 
-The ways of taking a step are timed in turn, round after round, so that a change of the machine's load meets all of
-them. Images per second are medians of wall time; images per second of processor time stand beside them, since these
-hold on a machine that is not idle. Normal models are given true lights, so that no lighting model runs with them.
+Both kinds of processor are measured: this one, and this one held to AVX2 (`pipelines.machines`). The ways of taking a
+step are timed in turn, round after round, so that a change of the machine's load meets all of them. Images per second
+are medians of wall time; images per second of processor time stand beside them, since these hold on a machine that is
+not idle. Normal models are given true lights, so that no lighting model runs with them.
 """
 
 import argparse
 import os
-import platform
 import shutil
 import sys
 import tempfile
@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.bench_scenes import write_scenes
+from pipelines.machines import hold, kinds, processor
 from pipelines.memory import peak_bytes
 from pipelines.tables import number
 from render.config import to_plain
@@ -35,12 +36,16 @@ if TYPE_CHECKING:
     from sdps.dataset import Batch
     from sdps.training import Trainer
 
-RATIO_TARGET = 2.7
+RATIO_TARGETS = {"bfloat16": 2.7, "float32": 1.0}
+"""Trainer over plain loop, by what the trainer computes in."""
+MUON_TARGET = 0.15
+"""Share of a step in float32 that Muon may take; it is not held to it beside layers in bfloat16."""
 WAITING_TARGETS = {"lighting": 0.10, "normals": 0.02}
-PLAIN, OURS = "plain float32 loop", "trainer"
+PLAIN, OURS, MUON = "plain float32 loop", "trainer", "trainer, Muon"
 # What the trainer's configuration is changed by, beside its own lines.
 VARIANTS: dict[str, dict[str, Any]] = {
     OURS: {},
+    MUON: {"optimiser": "muon"},
     "trainer, NCHW": {"channels_last": False},
     "trainer, float32": {"precision": "float32"},
     "trainer, torch.compile": {"compile": True},
@@ -93,8 +98,9 @@ def run(config: BenchTrainConfig) -> dict[str, Any]:
     """Time the steps of every model, in processes of their own.
 
     Returns:
-        `config`, `machine`, and per model `ways` and `per_processor_second` (images per second), `ratio`, `waiting`,
-        `memory_mb` and `skipped` (what was not measured, and why); plain values, ready for JSON.
+        `config` and, by kind of processor under `kinds`, `machine` and `models`: per model `ways` and
+        `per_processor_second` (images per second), `ratio`, `muon_share`, `waiting`, `memory_mb` and `skipped` (what
+        was not measured, and why); plain values, ready for JSON.
 
     Raises:
         InputError: an unusable data folder or configuration.
@@ -103,11 +109,15 @@ def run(config: BenchTrainConfig) -> dict[str, Any]:
         folder = Path(config.data or made)
         if not config.data:
             write_scenes(folder, max(_SCENES, config.scenes), size=config.size, seed=config.seed)
-        result: dict[str, Any] = {"config": to_plain(config), "machine": _apart(machine), "models": {}}
-        for model in progress_bar(config.models, unit="model", desc="bench-train"):
-            found = _apart(measure, config, model, folder)
-            found["memory_mb"] = {way: _apart(peak_memory, config, model, folder, way) for way in (PLAIN, OURS)}
-            result["models"][model] = found
+        result: dict[str, Any] = {"config": to_plain(config), "kinds": {}}
+        pairs = [(kind, model) for kind in kinds() for model in config.models]
+        for kind, model in progress_bar(pairs, unit="model", desc="bench-train"):
+            with hold(kind):
+                if kind not in result["kinds"]:
+                    result["kinds"][kind] = {"machine": _apart(machine), "models": {}}
+                found = _apart(measure, config, model, folder)
+                found["memory_mb"] = {way: _apart(peak_memory, config, model, folder, way) for way in (PLAIN, OURS)}
+            result["kinds"][kind]["models"][model] = found
     return result
 
 
@@ -118,19 +128,24 @@ def _apart(function: Callable, *arguments: Any) -> Any:
 
 
 def machine() -> dict[str, Any]:
-    """Describe the processor, and what it can do at most: rates of large matrix products.
+    """Describe the processor, what `auto` chooses on it, and what it can do at most: rates of large matrix products.
 
     Their ratio bounds what bfloat16 can gain on networks that are convolutions and little else.
     """
     import torch
 
+    from sdps.precision import arithmetic
+
+    chosen = arithmetic()
     rates = {}
     for name in ("float32", "bfloat16"):
         left, right = (torch.ones(2048, 2048, dtype=getattr(torch, name)) for _ in range(2))
         left @ right
         rates[name] = float(np.median([2 * 2048**3 / 1e9 / _timed(lambda a=left, b=right: a @ b)[0] for _ in range(5)]))
     return {
-        "processor": _processor(),
+        "processor": processor(),
+        "precision": chosen.precision,
+        "reason": chosen.reason,
         "instructions": torch.backends.cpu.get_cpu_capability(),
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
@@ -139,20 +154,14 @@ def machine() -> dict[str, Any]:
     }
 
 
-def _processor() -> str:
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-        return next(line.partition(":")[2].strip() for line in text.splitlines() if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
-
-
 def measure(config: BenchTrainConfig, model: str, folder: Path) -> dict[str, Any]:
     """Time a model's steps on one prepared batch, and its waiting for data."""
     with tempfile.TemporaryDirectory() as scratch:
         batch = first_batch(config, model, folder)
-        ways, skipped = _ways(config, model, folder, Path(scratch), batch)
+        clock = _Clock()
+        ways, skipped = _ways(config, model, folder, Path(scratch), batch, clock)
         skipped |= _warm_up(ways)
+        clock.seconds = 0.0
         wall, processor = _in_turn(ways, config, batch.images.shape[0] * batch.images.shape[1])
         waiting = {
             f"{workers} loader processes": _waiting(config, model, folder, Path(scratch), workers) for workers in (0, 1)
@@ -164,16 +173,34 @@ def measure(config: BenchTrainConfig, model: str, folder: Path) -> dict[str, Any
         "ways": rates,
         "per_processor_second": {name: _spread(values) for name, values in processor.items()},
         "ratio": _spread(ratios),
+        "muon_share": clock.seconds / config.seconds if MUON in ways else None,
         "waiting": waiting,
         "skipped": skipped,
     }
 
 
+class _Clock:
+    """Adds up the time of the calls that it wraps."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def timed(self, action: Callable[[], object]) -> Callable[[], object]:
+        def call() -> object:
+            seconds, value = _timed(action)
+            self.seconds += seconds
+            return value
+
+        return call
+
+
 def _ways(
-    config: BenchTrainConfig, model: str, folder: Path, scratch: Path, batch: "Batch"
+    config: BenchTrainConfig, model: str, folder: Path, scratch: Path, batch: "Batch", clock: _Clock
 ) -> tuple[dict[str, Callable[[], object]], dict[str, str]]:
     """Return the ways of taking a step by name, and what is left out with the reason."""
     import torch
+
+    from sdps.precision import arithmetic
 
     ways: dict[str, Callable[[], object]] = {PLAIN: plain_loop(model, batch)}
     skipped = {}
@@ -181,7 +208,12 @@ def _ways(
         if changes.get("compile") and not any(map(shutil.which, (os.environ.get("CXX", "g++"), "c++", "clang++"))):
             skipped[name] = "no C++ compiler"
             continue
+        if changes.get("precision") == arithmetic().precision:
+            skipped[name] = "what the trainer does"
+            continue
         trainer = make_trainer(replace(training(config, model), **changes), model, folder, scratch / name)
+        if name == MUON:
+            trainer.optimiser.step = clock.timed(trainer.optimiser.step)
         ways[name] = lambda trainer=trainer: trainer.take_step(batch, 0.5)
     threads = torch.get_num_threads()
     if threads > 1:
@@ -231,8 +263,8 @@ def training(config: BenchTrainConfig, model: str) -> "TrainingConfig":
     lighting = registry.entry(model).role == "lighting"
     values = {"lights": "true"} if registry.entry(model).lights else {}
     return (LightingTraining if lighting else NormalTraining)(
-        seed=config.seed, batch_scenes=config.scenes, images=config.images, size=config.size, precision="bfloat16",
-        channels_last=True, validation_scenes=0, **({} if lighting else values),
+        seed=config.seed, batch_scenes=config.scenes, images=config.images, size=config.size, optimiser="adamw",
+        validation_scenes=0, **({} if lighting else values),
     )  # fmt: skip
 
 
@@ -267,7 +299,7 @@ def first_batch(config: BenchTrainConfig, model: str, folder: Path) -> "Batch":
 
 
 def plain_loop(model: str, batch: "Batch") -> Callable[[], object]:
-    """Return a step as one would write it first: float32, default memory layout, Adam."""
+    """Return a step as one would write it first: float32, default memory layout, AdamW."""
     import torch
 
     from sdps.losses import masked_normal_loss
@@ -275,7 +307,7 @@ def plain_loop(model: str, batch: "Batch") -> Callable[[], object]:
     from sdps.models.base import Lights
 
     network = registry.create(model)
-    optimiser = torch.optim.Adam(network.parameters(), lr=1e-4)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=1e-4)
 
     def step() -> float:
         if registry.entry(model).role == "lighting":
@@ -357,35 +389,50 @@ def _spread(values: list[float]) -> dict[str, float]:
 
 def table(result: dict[str, Any]) -> str:
     """Format the result of `run` as Markdown."""
+    lines = []
+    for kind, found in result["kinds"].items():
+        about, rates = found["machine"], found["machine"]["matmul_gflops"]
+        load = "unknown" if about["load"] is None else f"{about['load']:.1f}"
+        lines += [
+            f"# {kind[0].upper()}{kind[1:]}",
+            "",
+            f"{about['processor']}, {about['instructions']}, {about['threads']} threads, torch {about['torch']}, load "
+            f"{load} at the start; matrix products {rates['float32']:.0f} GFLOP/s in float32, {rates['bfloat16']:.0f} "
+            f"in bfloat16 ({rates['bfloat16'] / rates['float32']:.2f}x). The trainer computes in {about['precision']}: "
+            f"{about['reason']}.",
+            "",
+        ]
+        for model, one in found["models"].items():
+            lines += [*_model_lines(model, one, about["precision"]), ""]
+    return "\n".join(lines)
+
+
+def _model_lines(model: str, found: dict[str, Any], precision: str) -> list[str]:
+    """Format what was measured of a model."""
     from sdps.models import registry
 
-    about, rates = result["machine"], result["machine"]["matmul_gflops"]
-    load = "unknown" if about["load"] is None else f"{about['load']:.1f}"
-    lines = [
-        f"{about['processor']}, {about['instructions']}, {about['threads']} threads, torch {about['torch']}, load "
-        f"{load} at the start; matrix products {rates['float32']:.0f} GFLOP/s in float32, {rates['bfloat16']:.0f} in "
-        f"bfloat16 ({rates['bfloat16'] / rates['float32']:.2f}x)",
-    ]
-    for model, found in result["models"].items():
-        scenes, images, _, height, width = found["batch"]
-        lines += ["", f"## {model}: {scenes} scenes of {images} images of {width}x{height}", ""]
-        lines += ["| a step | images/s (median) | least - most | images per processor second |", "|---|---|---|---|"]
-        for name, rate in found["ways"].items():
-            alone = found["per_processor_second"][name]["median"]
-            lines.append(f"| {name} | {rate['median']:.1f} | {rate['least']:.1f} - {rate['most']:.1f} | {alone:.1f} |")
-        lines += [f"| {name} | skipped: {why} | | |" for name, why in found["skipped"].items()]
-        lines += ["", "| | measured | target |", "|---|---|---|"]
-        ratio, bound = found["ratio"], WAITING_TARGETS[registry.entry(model).role]
-        lines.append(
-            f"| trainer / plain loop | {ratio['median']:.2f} ({ratio['least']:.2f} - {ratio['most']:.2f}) "
-            f"| at least {RATIO_TARGET} |"
-        )
-        for name, waited in found["waiting"].items():
-            rate = f"{waited['images_per_second']:.0f} images/s"
-            lines.append(f"| waiting for data, {name} | {waited['share']:.1%}, {rate} | under {bound:.0%} |")
-        for name, size in found["memory_mb"].items():
-            lines.append(f"| peak memory, {name} | {'unknown' if size is None else number(size) + ' MB'} | |")
-    return "\n".join(lines) + "\n"
+    scenes, images, _, height, width = found["batch"]
+    lines = [f"## {model}: {scenes} scenes of {images} images of {width}x{height}", ""]
+    lines += ["| a step | images/s (median) | least - most | images per processor second |", "|---|---|---|---|"]
+    for name, rate in found["ways"].items():
+        alone = found["per_processor_second"][name]["median"]
+        lines.append(f"| {name} | {rate['median']:.1f} | {rate['least']:.1f} - {rate['most']:.1f} | {alone:.1f} |")
+    lines += [f"| {name} | skipped: {why} | | |" for name, why in found["skipped"].items()]
+    lines += ["", "| | measured | target |", "|---|---|---|"]
+    ratio, bound = found["ratio"], WAITING_TARGETS[registry.entry(model).role]
+    lines.append(
+        f"| trainer / plain loop | {ratio['median']:.2f} ({ratio['least']:.2f} - {ratio['most']:.2f}) "
+        f"| at least {RATIO_TARGETS[precision]} |"
+    )
+    if found["muon_share"] is not None:
+        target = f"under {MUON_TARGET:.0%}" if precision == "float32" else ""
+        lines.append(f"| Muon's share of a step | {found['muon_share']:.1%} | {target} |")
+    for name, waited in found["waiting"].items():
+        rate = f"{waited['images_per_second']:.0f} images/s"
+        lines.append(f"| waiting for data, {name} | {waited['share']:.1%}, {rate} | under {bound:.0%} |")
+    for name, size in found["memory_mb"].items():
+        lines.append(f"| peak memory, {name} | {'unknown' if size is None else number(size) + ' MB'} | |")
+    return lines
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

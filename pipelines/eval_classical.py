@@ -26,7 +26,7 @@ from render.materials import surfaces
 from render.progress import progress_bar
 from sdps import weights
 from sdps.classical import registry
-from sdps.methods import Runner, RunnerConfig, parse
+from sdps.methods import Runner, parse
 
 LIGHT_SETS = ("near-uniform:96", "biased:96")
 TABLES = {
@@ -102,7 +102,7 @@ def classical_runner(name: str) -> Runner:
         InputError: an unknown name, with the nearest.
     """
     registry.method(name)
-    return Runner(parse(name, weights.require), weights.require, RunnerConfig())
+    return Runner(parse(name, weights.require), weights.require)
 
 
 def evaluate(

@@ -15,8 +15,10 @@ from pipelines.benchmarks.object_tables import object_table
 from pipelines.evaluation import TestObject
 from pipelines.regenerate import split_list
 from pipelines.sections import Section, Table
+from pipelines.using import describe
 from render.config import to_plain
-from sdps.methods import Method, runner_config
+from sdps.inference_config import inference_config
+from sdps.methods import Method
 
 _PRINTED = "Published rows: bear with 96 images; 'this object' and 'mean of' are over the objects present."
 
@@ -34,14 +36,14 @@ def main(args: argparse.Namespace) -> int:
     """Evaluate, print the tables, and write <out>/diligent/results.json and the report's section."""
     config = DiligentConfig(bits=args.bits, bear=args.bear)
     models = choose.runs_folder(args.models)
-    chosen = choose.selected(split_list(args.methods), models)
+    using = inference_config(args)
+    chosen = choose.selected(split_list(args.methods), models, using)
     items = suite.pick(diligent_objects(args.data, config), split_list(args.objects))
-    chosen = chosen or choose.every_method(models)
-    using = runner_config(args)
+    chosen = chosen or choose.every_method(models, using)
     shown = suite.pictured(chosen)
     found, runners = suite.run(items, chosen, models, args.out / "diligent" / "cache", using, shown)
     tables = build_tables(items, found, chosen)
-    text = definition(items, config) + suite.describe(runners, using)
+    text = definition(items, config) + describe(runners, using)
     section = Section(
         name="diligent",
         title="DiLiGenT",

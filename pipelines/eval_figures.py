@@ -22,7 +22,8 @@ from render.config import to_plain
 from render.errors import InputError, unknown
 from render.files import atomic_path, read_text, write_json
 from sdps import weights
-from sdps.methods import NONE, Method, Runner, parse, runner_config
+from sdps.inference_config import inference_config
+from sdps.methods import NONE, Method, Runner, parse
 from sdps.models.registry import COMBINATIONS
 
 _log = logging.getLogger(__name__)
@@ -55,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
             raise unknown("figure", name, FIGURES)
     if args.draws < 1:
         raise InputError(f"--draws must be at least 1, got {args.draws}")
-    config = runner_config(preset.test)
+    config = inference_config(preset.test)
     runners = tuple(Runner(item, finder(out), config) for item in wanted_methods(split_list(args.methods), out))
     bench = Workbench(preset, out, runners, Evaluation(out / "eval"), args.draws)
     left_out = 0

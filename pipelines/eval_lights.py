@@ -15,9 +15,11 @@ from pipelines.benchmarks.object_tables import object_table
 from pipelines.evaluation import TestObject
 from pipelines.regenerate import split_list
 from pipelines.sections import Section, Table
+from pipelines.using import describe
 from render.config import to_plain
 from render.errors import InputError
-from sdps.methods import CONSTANT, Method, runner_config
+from sdps.inference_config import inference_config
+from sdps.methods import CONSTANT, Method
 from sdps.models.registry import TRUE_LIGHTS
 
 
@@ -80,15 +82,15 @@ def main(args: argparse.Namespace) -> int:
     _check(args)
     bench = BENCHMARKS[args.dataset]
     models = choose.runs_folder(args.models)
-    chosen = choose.selected(split_list(args.methods), models)
+    using = inference_config(args)
+    chosen = choose.selected(split_list(args.methods), models, using)
     _refuse_given([method for method in chosen if method.lights == TRUE_LIGHTS])
     items = suite.pick(bench.load(args), split_list(args.objects))
     chosen = chosen or default_methods(models)
-    using = runner_config(args)
     shown = suite.pictured(chosen)
     found, runners = suite.run(items, chosen, models, args.out / bench.name / "cache", using, shown)
     tables = build_tables(bench, items, found, chosen)
-    text = definition(bench, items, args) + suite.describe(runners, using)
+    text = definition(bench, items, args) + describe(runners, using)
     section = Section(
         name=bench.name,
         title=bench.title,

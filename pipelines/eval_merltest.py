@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines import methods, presets, scenes
+from pipelines import methods, presets, scenes, using
 from pipelines.evaluation import Evaluation
 from pipelines.lit import lit_object
 from pipelines.merltest_tables import SceneScores, lighting_table, normal_table
@@ -26,7 +26,8 @@ from render.errors import InputError
 from render.files import write_json
 from render.manifest import SceneSpec
 from render.progress import progress_bar
-from sdps.methods import CONSTANT, Method, Runner, runner_config
+from sdps.inference_config import inference_config
+from sdps.methods import CONSTANT, Method, Runner
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.weights import SHIPPED
 
@@ -48,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
 
     preset, out = presets.from_arguments(args)
     lighting, normals = rows(args, out, preset)
-    config = runner_config(preset.test)
+    config = inference_config(preset.test)
     runners = [Runner(method, methods.finder(out), config) for method in (*lighting, *normals)]
     wanted = scenes.test_scenes(preset.test)
     folder = out / "merltest"
@@ -59,21 +60,30 @@ def main(args: argparse.Namespace) -> int:
     tables = build_tables(results, lighting, normals)
     presets.save_resolved(preset, out / "eval")
     weights = {name: str(file) for runner in runners for name, file in runner.files.items()}
-    write_json(out / "eval" / "results.json", results_json(results, tables, preset, weights))
+    networks = using.describe(runners, config)
+    write_json(out / "eval" / "results.json", results_json(results, tables, preset, weights, networks))
     chosen = {runner.method.name: runner for runner in runners}
     merltest_section.write(
-        out, preset, tables, results, folder, evaluation, [chosen[name] for name in pictured if name in chosen]
+        out,
+        preset,
+        tables,
+        results,
+        folder,
+        evaluation,
+        [chosen[name] for name in pictured if name in chosen],
+        networks,
     )
     page = report.write(out, preset)
     listed = (render_text(f"\n{table.title}", list(table.header), list(table.rows), left=(0, 1)) for table in tables)
     sys.stdout.write("\n".join(listed))
-    sys.stdout.write(f"\n{definition(preset.test)}\n{page}\n")
+    sys.stdout.write(f"\n{definition(preset.test)}{networks}\n{page}\n")
     return 0
 
 
 def definition(config: TestConfig) -> str:
     """Return what the tables' numbers are and what the methods saw."""
-    seen = "whole frame" if config.margin is None else f"object's box with {config.margin} pixels of margin"
+    margin = config.margin_of((config.size, config.size))
+    seen = "whole frame" if margin is None else f"object's box with {margin} pixels of margin"
     return (
         "Means over scenes (one per material). Normals: mean angular error in degrees over mask pixels. Directions: "
         "mean angular error in degrees over images. Intensities: mean relative error after one least-squares scale. "
@@ -153,10 +163,13 @@ def build_tables(results: list[SceneScores], lighting: list[Method], normals: li
     return [*first, normal_table(results, normals, all_rows=whole)]
 
 
-def results_json(results: list[SceneScores], tables: list[Table], preset: Preset, weights: dict[str, str]) -> dict:
+def results_json(
+    results: list[SceneScores], tables: list[Table], preset: Preset, weights: dict[str, str], networks: str
+) -> dict:
     """Collect everything a reader needs to judge the numbers."""
     return {
         "definition": definition(preset.test),
+        "networks": networks.strip(),
         "weights": weights,
         "config": to_plain(preset.test),
         "tables": {table.title: {"header": table.header, "rows": table.rows} for table in tables},

@@ -182,12 +182,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Compare, print the table, and write results.json and a picture per object into the output folder."""
     from sdps.classical import registry
-    from sdps.methods import Runner, RunnerConfig, parse
+    from sdps.methods import Runner, parse
 
     names = split_list(args.objects) or list_objects(args.folder)
     chosen = split_list(args.methods) or [name for name, entry in registry.METHODS.items() if not entry.calibrated]
     find = finder(args.models)
-    runners = [Runner(parse(name, find), find, RunnerConfig()) for name in chosen]
+    runners = [Runner(parse(name, find), find) for name in chosen]
     methods = [runner.method.name for runner in runners]
     if not registry.method(args.reference).calibrated:
         raise InputError(f"--reference {args.reference}: finds the lights itself; choose a calibrated method")

@@ -1,13 +1,15 @@
 """Methods on objects: one interface and one metric code for every benchmark, each result kept as it is found.
 
-A result is filed under the method (with its weights, settings and code) and the object (with its images), so that a
-stopped evaluation goes on where it was, and a changed method or object is evaluated again.
+A result is filed under the method (with its weights, settings and arithmetic), the object (with its images) and the
+code, so that a stopped evaluation goes on where it was, and what has changed is evaluated again.
 """
 
 import hashlib
+import importlib.metadata
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,14 +17,15 @@ import numpy as np
 
 from pipelines.score_cache import ScoreCache
 from render.errors import InputError
-from render.files import atomic_path
+from render.files import atomic_path, source_digest
 
 if TYPE_CHECKING:
     from sdps.image_source import ImageSource
     from sdps.methods import Runner
 
 _log = logging.getLogger(__name__)
-_FORMAT = "evaluation-1"
+_FORMAT = "evaluation-2"
+_LIBRARIES = ("torch", "numpy", "scipy", "opencv-python-headless")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +93,7 @@ class Evaluation:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._cache = ScoreCache(folder / "scores.jsonl", _FORMAT)
+        self._cache = ScoreCache(folder / "scores.jsonl", code_identity())
 
     def result(self, item: TestObject, runner: "Runner", *, keep_normals: bool = False) -> Result:
         """Return what the method makes of the object, from the cache or by running it.
@@ -143,6 +146,14 @@ class Evaluation:
             "lights": np.round(np.asarray(estimate.light_directions, np.float64), 6).tolist(),
             "gains": np.round(np.asarray(estimate.intensities, np.float64), 6).tolist(),
         }
+
+
+@cache
+def code_identity() -> str:
+    """Return what tells results of this code and its libraries from others: any file of the project may matter."""
+    root = Path(__file__).parents[1]
+    code = source_digest(*(root / package for package in ("render", "sdps", "pipelines")))
+    return " ".join([_FORMAT, code, *(f"{name}-{importlib.metadata.version(name)}" for name in _LIBRARIES)])
 
 
 def _result(known: dict[str, Any], maps: Path) -> Result:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines import pictures, report
+from pipelines import pictures, report, using
 from pipelines.sections import Section, SectionWriter, Table
 from render.errors import InputError
 
@@ -36,12 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--images", action="append", default=None, metavar="PATTERN",
                         help="files to use, in this order; one that begins with ! leaves files out")  # fmt: skip
     parser.add_argument("--discontinuities", action="store_true", help="let the depth jump where slopes disagree")
-    parser.add_argument("--read-out", default="expectation", choices=("centre", "expectation", "peak"))
-    parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"))
-    parser.add_argument("--light-views", type=int, default=8, metavar="N",
-                        help="views that a network's lights are averaged over: 1, 2, 4 or 8 (default: 8)")  # fmt: skip
-    parser.add_argument("--normal-views", type=int, default=1, metavar="N",
-                        help="the same for normals, each at full cost (default: 1)")  # fmt: skip
+    using.add_arguments(parser)
     parser.add_argument("--self-test", action="store_true",
                         help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
 
@@ -68,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
 def infer_folder(args: argparse.Namespace) -> "Inference":
     """Read the photographs, say what was found about them, and run the method."""
     from sdps.api import check_out, infer, load
-    from sdps.methods import runner_config
+    from sdps.inference_config import inference_config
     from sdps.photos import check
 
     check_out(args.out, args.folder)
@@ -81,7 +76,7 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is taken for orthographic\n")
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
     return infer(
-        photos, args.method, models=args.models, config=runner_config(args), discontinuities=args.discontinuities,
+        photos, args.method, models=args.models, config=inference_config(args), discontinuities=args.discontinuities,
         findings=findings,
     )  # fmt: skip
 

@@ -25,6 +25,7 @@ def write(
     folder: Path,
     evaluation: Evaluation,
     runners: Sequence[Runner],
+    networks: str,
 ) -> Path:
     """Write the section.
 
@@ -36,12 +37,13 @@ def write(
         folder: The rendered scenes.
         evaluation: Holds the normal maps.
         runners: The methods whose pictures are shown, the main one first.
+        networks: How networks were used, in words.
     """
     config = preset.test
     repeats = f"{config.repeats} draws of intensities" if config.repeats > 1 else "one draw of intensities"
     text = (
         f"{len(results)} scenes of {config.size}x{config.size} pixels, {len(results[0].scene.lights)} lights, "
-        f"{repeats}. {eval_merltest.definition(config)} "
+        f"{repeats}. {eval_merltest.definition(config)}{networks} "
         f"Error maps run from 0 (black) to {ERROR_LIMIT:g} degrees (yellow)."
     )
     names = [runner.method.name for runner in runners]

@@ -63,7 +63,8 @@ def lighting_methods(out: Path, preset: Preset, ways: Sequence[Method]) -> list[
         for name in names
         if name in available and (preset.test.shipped == ALL or weights.SHIPPED + name in told)
     ]
-    return with_views([*methods, *kept], ways)
+    rows = [*methods, *kept]
+    return rows if preset.test.light_views else with_views(rows, ways)
 
 
 def with_views(rows: Sequence[Method], ways: Sequence[Method]) -> list[Method]:

@@ -4,7 +4,7 @@ import argparse
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 
@@ -15,16 +15,15 @@ from render.errors import InputError, unknown
 from render.files import write_text
 from render.plan import DataConfig
 from sdps import recipes
-from sdps.lighting import ReadOut
+from sdps.inference_config import InferenceConfig
 from sdps.models.registry import MODELS
-from sdps.symmetry import check_views
 
 ALL = ("all",)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TestConfig:
-    """The MERL-Test scenes and how they are scored.
+class TestConfig(InferenceConfig):
+    """The MERL-Test scenes and how they are scored; how networks are used is in its base.
 
     Attributes:
         shapes: Shape names.
@@ -38,13 +37,6 @@ class TestConfig:
         intensity_range: Range the light intensities are drawn from, uniformly.
         repeats: Draws of random intensities per scene; scores are averaged over them.
         pictures: Scenes shown in the report, per shape.
-        read_out: How LCNet's classes become lights: `centre` (the paper's) or `expectation`.
-        rotations: Rotations about the view axis that pixel networks average over.
-        margin: Pixels around the object's box that networks see, as of photographs; null: the whole frame, as in
-            training.
-        light_views: Turned and mirrored views that lights are averaged over, 1, 2, 4 or 8.
-        normal_views: The same for normals.
-        precision: Arithmetic of the networks, `float32` or `bfloat16`.
         shipped: Shipped ways beside what is trained, such as `sdps` or `lcnet-soft+psfcn`; `all` for every one.
     """
 
@@ -59,16 +51,11 @@ class TestConfig:
     intensity_range: tuple[float, float] = (0.2, 2.0)
     repeats: int = 1
     pictures: int = 5
-    read_out: ReadOut = "centre"
-    rotations: int = 10
-    margin: int | None = None
-    light_views: int = 1
-    normal_views: int = 1
-    precision: Literal["float32", "bfloat16"] = "bfloat16"
     shipped: tuple[str, ...] = ALL
 
     def __post_init__(self) -> None:
-        for name in ("spp", "repeats", "pictures", "rotations"):
+        super().__post_init__()
+        for name in ("spp", "repeats", "pictures"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.size < 16 or self.size % 4:
@@ -79,9 +66,6 @@ class TestConfig:
             raise InputError("shapes and materials must name at least one each")
         if self.seed < 0 or self.bounces < 0:
             raise InputError("seed and bounces must not be negative")
-        if self.margin is not None and self.margin < 0:
-            raise InputError(f"margin must be 0 pixels or more, or null for the whole frame, got {self.margin}")
-        check_views(self.light_views, self.normal_views)
         light_sets.load(self.lights)
 
 

@@ -61,8 +61,7 @@ def results_text(out: Path) -> str:
     about = (
         f"MERL-Test, regenerated: {len(scenes)} scenes ({shapes}; {len({s['material'] for s in scenes})} materials), "
         f"{config['spp']} samples a pixel, {config['repeats']} draw{'s' if config['repeats'] > 1 else ''} of light "
-        f"intensities each, networks in {config['precision']}, lights read out by {config['read_out']} unless a row "
-        "says otherwise. In brackets the paper's figure, of its own rendering."
+        f"intensities each. {merltest['networks']} In brackets the paper's figure, of its own rendering."
     )
     parts = [about, *(_markdown(title, _measured(table)) for title, table in merltest["tables"].items())]
     files = dict(merltest["weights"])

@@ -1,5 +1,6 @@
 """Writing files so that a reader meets either the whole file or none."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -165,3 +166,12 @@ def read_text(path: str | Path) -> str:
         raise InputError(f"{path}: no such file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as text ({error})") from error
+
+
+def source_digest(*folders: Path) -> str:
+    """Return a short hash of all Python files in folders, by name and content."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(str(path.relative_to(folder.parent)).encode() + path.read_bytes())
+    return digest.hexdigest()[:12]

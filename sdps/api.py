@@ -31,7 +31,8 @@ from render.shards import write_exr
 from sdps import weights
 from sdps.classical import registry as classical
 from sdps.estimate import Estimate
-from sdps.methods import Runner, RunnerConfig, parse
+from sdps.inference_config import InferenceConfig
+from sdps.methods import Runner, parse
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load, write_lights
 from sdps.photos.curves import display
@@ -46,8 +47,6 @@ _LEARNED = ("sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
 """Tried in this order; the parts may be trained or shipped one by one."""
 _CALIBRATED = ("psfcn", "robust-least-squares")
 _FALLBACK = "pf14"
-INFER_CONFIG = RunnerConfig(precision="float32", light_views=8)
-"""LCNet sees 128x128 whatever the photographs' size, so that seven more views cost little."""
 RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
          "grazing": (-0.85, 0.45, 0.25)}  # fmt: skip
 
@@ -148,6 +147,9 @@ class Inference:
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
             "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
         }  # fmt: skip
+        if "precision" in self.estimate.diagnostics:
+            facts["precision"] = self.estimate.diagnostics["precision"]
+            facts["stray_light"] = round(float(self.estimate.diagnostics["stray_light"].mean()), 6)
         confidence = self.estimate.diagnostics.get("confidence")
         if confidence is not None:
             facts["light_confidence"] = dict(
@@ -216,7 +218,7 @@ def infer(
     method: str = AUTO,
     *,
     models: str | Path | None = None,
-    config: RunnerConfig | None = None,
+    config: InferenceConfig | None = None,
     discontinuities: bool = False,
     findings: tuple[Finding, ...] | None = None,
 ) -> Inference:
@@ -227,7 +229,7 @@ def infer(
         method: A combination (`sdps`), lights and normals (`lcnet+psfcn`), a normal model or a classical method;
             `auto` for the best there is: a shipped network, or a classical method where there is none.
         models: Folder of trained runs to take weights from before the shipped ones.
-        config: How networks are used; by default in float32, lights averaged over eight views.
+        config: How networks are used; the defaults are those of every command.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
 
@@ -240,9 +242,7 @@ def infer(
         raise InputError(f"{photos.folder}: {grave.text}")
     find = partial(weights.require, out=None if models is None else Path(models))
     chosen = _automatic(photos, find) if method == AUTO else method
-    # Eight views of large photographs take hours, so that `config` decides here, not the combination.
-    told = dataclasses.replace(_told(chosen, photos, find), light_views=None, normal_views=None)
-    runner = Runner(told, find, config or INFER_CONFIG)
+    runner = Runner(_told(chosen, photos, find), find, config)
     began = time.perf_counter()
     estimate = runner.estimate(photos, photos.mask, photos.light_directions, photos.intensities)
     seconds = time.perf_counter() - began

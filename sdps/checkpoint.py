@@ -3,7 +3,6 @@
 Neither file can execute code when loaded, and neither is ever half-written.
 """
 
-import hashlib
 import json
 import pickle
 import struct
@@ -19,7 +18,7 @@ from torch import nn
 
 from render.config import build
 from render.errors import InputError
-from render.files import atomic_path
+from render.files import atomic_path, source_digest
 from sdps.augment import Augmentation
 from sdps.models import registry
 
@@ -59,11 +58,7 @@ class TrainedModel:
 @cache
 def code_version() -> str:
     """Return a short hash of this package's source files."""
-    digest = hashlib.sha256()
-    root = Path(__file__).parent
-    for path in sorted(root.rglob("*.py")):
-        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
-    return digest.hexdigest()[:12]
+    return source_digest(Path(__file__).parent)
 
 
 def save_weights(path: str | Path, model: TrainedModel, *, half: bool = False) -> None:

@@ -12,6 +12,7 @@ from render.errors import InputError
 from sdps.augment import Augmentation
 from sdps.lighting import LightClasses, ReadOut
 from sdps.models.lcnet import EARLY_SIZE, INPUT_SIZE
+from sdps.precision import Precision
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +41,9 @@ class TrainingConfig:
         clip_gradient: Largest gradient norm; 0 leaves gradients alone.
         ema: Decay of an exponential moving average of the weights, which is then validated and saved (0: none).
         compile: Compile the network with `torch.compile`.
-        precision: `bfloat16` runs the networks under autocast; weights and loss stay float32.
-        channels_last: Keep feature maps channels-last, faster for NENet on CPUs.
+        precision: `auto` (what is faster on this machine, `sdps.precision`), `float32`, or `bfloat16`, which runs the
+            networks under autocast; weights and loss stay float32.
+        channels_last: Keep feature maps channels-last, which is faster on every processor tried (docs/training.md).
         workers: Loader processes; 0 loads in the trainer's own.
         cache: Keep decoded scenes as memory-mapped arrays in `<data>/cache`.
         rescale: Scenes larger than `size` are drawn at a random scale and cropped, instead of being shrunk whole.
@@ -74,8 +76,8 @@ class TrainingConfig:
     clip_gradient: float = 0.0
     ema: float = 0.0
     compile: bool = False
-    precision: Literal["float32", "bfloat16"] = "float32"
-    channels_last: bool = False
+    precision: Precision = "auto"
+    channels_last: bool = True
     workers: int = 2
     cache: bool = True
     rescale: bool = False

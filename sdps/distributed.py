@@ -3,12 +3,13 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import distributed
 
 from render.errors import InputError
+from sdps.precision import Arithmetic, arithmetic
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,17 @@ class Team:
         tensor = torch.tensor(list(values.values()), dtype=torch.float64, device=self.device)
         distributed.all_reduce(tensor)
         return dict(zip(values, (tensor / self.world).tolist(), strict=True))
+
+    def same_arithmetic(self, precision: str) -> Arithmetic:
+        """Resolve a precision as the leader does: a measurement need not come out alike in every process.
+
+        Raises:
+            InputError: an unknown precision.
+        """
+        own = arithmetic(precision, self.device)
+        (half,) = self.agree([float(own.precision == "bfloat16")])
+        agreed = "bfloat16" if half else "float32"
+        return own if own.precision == agreed else replace(own, precision=agreed, reason="as the leading process")
 
     def wait(self) -> None:
         """Return once every process has come this far."""

@@ -14,6 +14,7 @@ from torch import Tensor
 from render.errors import InputError
 from render.seeds import generator
 from sdps.augment import Exposure
+from sdps.stray_light import stray_light, without
 
 EXPOSURE_VALUES = 4_000_000
 """Values the exposure is measured on at most; of more, the same random pixels of every image are taken."""
@@ -43,7 +44,8 @@ class ObjectImages:
         rows, columns: The box around the mask, with its margin, or the whole frame.
         mask: (h, w) bool, the mask inside the box.
         shape: (H, W).
-        sample: (L, P, 3) float32, radiance of object pixels: all, or those the exposure is measured on.
+        stray: (L, 3) float32, stray light that is taken off every image; zero where none is.
+        sample: (L, P, 3) float32, radiance of object pixels without it: all, or those the exposure is measured on.
     """
 
     source: ImageSource
@@ -51,14 +53,16 @@ class ObjectImages:
     columns: slice
     mask: np.ndarray
     shape: tuple[int, int]
+    stray: np.ndarray
     sample: np.ndarray
 
     def __len__(self) -> int:
         return len(self.source)
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Return images of the box, (stop - start, h, w, 3) float32, black outside the mask."""
+        """Return images of the box, (stop - start, h, w, 3) float32, without stray light, black outside the mask."""
         images = _read(self.source, start, stop, self.shape)[:, self.rows, self.columns].astype(np.float32)
+        images = without(images, self.stray[start:stop])
         # Not a product: outside the mask there may be NaN.
         return np.where(self.mask[..., None], images, np.float32(0.0))
 
@@ -69,13 +73,14 @@ class ObjectImages:
             yield range(start, min(start + count, len(self)), step)
 
 
-def survey(source: ImageSource, mask: np.ndarray, margin: int | None) -> ObjectImages:
+def survey(source: ImageSource, mask: np.ndarray, margin: int | None, *, stray: bool = False) -> ObjectImages:
     """Go through all images once: check them, find the object's box, gather what the exposure is measured on.
 
     Args:
         source: (L, H, W, 3), L >= 1.
         mask: (H, W) bool.
         margin: Pixels kept around the mask's bounding box; None keeps the whole frame.
+        stray: Measure stray light, to be taken off.
 
     Raises:
         InputError: sizes that do not fit, an empty mask, or values that are not finite inside it.
@@ -97,7 +102,8 @@ def survey(source: ImageSource, mask: np.ndarray, margin: int | None) -> ObjectI
             raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
         sample[start:stop] = inside[:, chosen]
     rows, columns = (_box(mask.any(axis=axis), margin) for axis in (1, 0))
-    return ObjectImages(source, rows, columns, mask[rows, columns], shape, sample)
+    level = stray_light(sample) if stray else np.zeros((len(source), 3), np.float32)
+    return ObjectImages(source, rows, columns, mask[rows, columns], shape, level, without(sample, level))
 
 
 @dataclass(frozen=True, eq=False)

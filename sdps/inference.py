@@ -1,11 +1,10 @@
 """Using trained networks: images and a mask in, lights and normals out, in memory that many images do not fill."""
 
 import time
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,11 +17,13 @@ from sdps.checkpoint import TrainedModel, load_weights
 from sdps.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map
 from sdps.estimate import Estimate
 from sdps.image_source import ImageSource, ObjectImages, View, survey
+from sdps.inference_config import InferenceConfig
 from sdps.lighting import ReadOut
 from sdps.models.base import Lights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
 from sdps.models.lighting_variants import LCNetSecond
-from sdps.symmetry import SYMMETRIES, KeptView, TurnedView, check_views, mean_lights, turned_context
+from sdps.precision import Arithmetic, arithmetic
+from sdps.symmetry import SYMMETRIES, KeptView, TurnedView, mean_lights, turned_context
 
 _ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels"), "second": ("second",)}
 _CHUNK_PIXELS = {"cpu": 2**17}
@@ -38,8 +39,10 @@ class _Known(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Estimator:
-    """Trained networks that work together: any lighting model with any normal model.
+class Estimator(InferenceConfig):
+    """Trained networks that work together: any lighting model with any normal model; its options are those of its base.
+
+    A first lighting pass that a second follows is read out as expectation, as in the second's training.
 
     Attributes:
         lighting: Trained lighting model, or None when lights are always given or `normals` is told none.
@@ -47,17 +50,9 @@ class Estimator:
         second: Trained second lighting pass. It sees the normals that `normals` finds at 128x128 under the first
             lights; `normals` then works again, under the second lights.
         device: Where all networks are.
-        precision: `bfloat16` runs the networks under autocast.
-        read_out: How light classes become lights. A first pass that a second follows is read out as expectation, as in
-            the second's training.
-        margin: Pixels kept around the mask's bounding box; None for images framed as in training, which are not cut. A
-            box is brought to the lighting networks' 128x128, and the lights they find depend on its size.
         antialias: Average when the lighting networks' input is shrunk to 128x128 (the authors' code only interpolates).
         chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images. None: what
             suits the device.
-        rotations: Rotations about the view axis that pixel networks average over.
-        light_views: Lights are the mean over so many turned and mirrored views of the object, 1, 2, 4 or 8.
-        normal_views: The same for normals; every view costs as much again.
 
     Raises:
         InputError: a model of another role than its place, or an option out of range.
@@ -67,16 +62,11 @@ class Estimator:
     normals: TrainedModel | None
     second: TrainedModel | None = None
     device: torch.device
-    precision: Literal["float32", "bfloat16"] = "float32"
-    read_out: ReadOut = "centre"
-    margin: int | None = 15
     antialias: bool = True
     chunk_pixels: int | None = None
-    rotations: int = 10
-    light_views: int = 1
-    normal_views: int = 1
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for place, roles in _ROLES.items():
             model = getattr(self, place)
             if model is not None and model.role not in roles:
@@ -85,11 +75,13 @@ class Estimator:
             raise InputError(f"second: {self.second.name!r} sees estimated normals; give a normal model too")
         if self.second is not None and self.lighting is None:
             raise InputError(f"second: {self.second.name!r} starts from estimated lights; give a lighting model too")
-        for name, least in (("margin", 0), ("chunk_pixels", 1), ("rotations", 1)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise InputError(f"{name} must be at least {least}, got {value}")
-        check_views(self.light_views, self.normal_views)
+        if self.chunk_pixels is not None and self.chunk_pixels < 1:
+            raise InputError(f"chunk_pixels must be at least 1, got {self.chunk_pixels}")
+
+    @property
+    def arithmetic(self) -> Arithmetic:
+        """What the networks compute in, resolved."""
+        return arithmetic(self.precision, self.device)
 
     @property
     def needs_lights(self) -> bool:
@@ -122,9 +114,9 @@ class Estimator:
 
         Returns:
             The estimate. Directions or intensities that nobody gave, estimated or assumed are empty, (0, 3) and (0,),
-            so that scoring them is refused. Diagnostics hold `seconds`, `exposure` (factor applied for each network)
-            and, where classes of light were estimated, `confidence` (L,), the product of the probabilities of the two
-            likeliest direction classes.
+            so that scoring them is refused. Diagnostics hold `seconds`, `precision` (what was computed in), `exposure`
+            (factor applied for each network), `stray_light` (L, 3) (taken off before that) and, where classes of light
+            were estimated, `confidence` (L,), the product of the probabilities of the two likeliest direction classes.
 
         Raises:
             InputError: sizes that do not fit, non-finite values, an empty mask, lights wanted without a lighting
@@ -136,9 +128,9 @@ class Estimator:
             raise InputError("no lighting model was loaded, so light directions must be given")
         began = time.perf_counter()
         _check_lights(len(images), lights, intensities)
-        scene = survey(images, mask, self.margin)
+        scene = self._survey(images, mask)
         known = self._known(lights, intensities)
-        diagnostics: dict[str, Any] = {"exposure": {}}
+        diagnostics = self._diagnostics(scene)
         if found is not None:
             lit = self._taken(found, lights, len(images), diagnostics)
             began -= found.diagnostics["seconds"]
@@ -181,12 +173,18 @@ class Estimator:
             raise InputError("no lighting model was loaded; load one, or give the lights")
         began = time.perf_counter()
         _check_lights(len(images), None, intensities)
-        diagnostics: dict[str, Any] = {"exposure": {}}
-        scene = survey(images, mask, self.margin)
+        scene = self._survey(images, mask)
+        diagnostics = self._diagnostics(scene)
         found = self._estimate_lights(scene, self._known(None, intensities), diagnostics)
         directions, gains = (part[0].float().cpu().numpy() for part in found[:2])
         diagnostics["seconds"] = time.perf_counter() - began
         return Estimate(np.zeros((0, 0, 3), np.float32), directions, gains, diagnostics)
+
+    def _survey(self, images: ImageSource, mask: np.ndarray) -> ObjectImages:
+        return survey(images, mask, self.margin_of(mask.shape), stray=self.stray_light)
+
+    def _diagnostics(self, scene: ObjectImages) -> dict[str, Any]:
+        return {"precision": self.arithmetic.precision, "stray_light": scene.stray, "exposure": {}}
 
     def _estimate_lights(self, scene: ObjectImages, known: _Known, diagnostics: dict[str, Any]) -> Lights:
         """Return the lights (1, L, ...) after one or two passes; what is known stays."""
@@ -219,12 +217,13 @@ class Estimator:
         """Return the lights (1, L, ...) that the lighting network in `place` finds, the mean over the views."""
         network = getattr(self, place).network
         view = self._view(scene, place, None, self._shrink, INPUT_SIZE**2, diagnostics)
-        if self.light_views > 1:
+        views = self.light_views or 1
+        if views > 1:
             view = KeptView(view)
         found = []
-        for symmetry in SYMMETRIES[: self.light_views]:
+        for symmetry in SYMMETRIES[:views]:
             turned, extra = TurnedView(view, symmetry), turned_context(symmetry, context)
-            prediction = lighting_prediction(network, turned, self._autocast, extra)
+            prediction = lighting_prediction(network, turned, self.arithmetic.autocast, extra)
             found.append((symmetry, network.lights(prediction, read_out)))
         return mean_lights(found)
 
@@ -232,10 +231,10 @@ class Estimator:
         """Return normals (1, 3, h, w) of a view, the mean over the views it is turned into."""
         network = self.normals.network
         if self.normals.role == "pixels":
-            return pixel_normal_map(network, view, lights, self._autocast, rotations=self.rotations)
+            return pixel_normal_map(network, view, lights, self.arithmetic.autocast, rotations=self.rotations)
         found = []
-        for symmetry in SYMMETRIES[: self.normal_views]:
-            turned = normal_map(network, TurnedView(view, symmetry), symmetry.lights(lights), self._autocast)
+        for symmetry in SYMMETRIES[: self.normal_views or 1]:
+            turned = normal_map(network, TurnedView(view, symmetry), symmetry.lights(lights), self.arithmetic.autocast)
             found.append(symmetry.back.vectors(symmetry.back.images(turned), dim=1))
         return functional.normalize(torch.stack(found).mean(0), dim=1) if len(found) > 1 else found[0]
 
@@ -257,9 +256,6 @@ class Estimator:
     @property
     def _shrink(self) -> Any:
         return partial(resize_input, antialias=self.antialias)
-
-    def _autocast(self) -> AbstractContextManager:
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
 
     def _mean_intensity(self) -> float:
         model = self.lighting if self.normals is None else self.normals
@@ -302,7 +298,7 @@ def load_estimator(
         normals: Safetensors of a normal model.
         second: Safetensors of a second lighting pass.
         device: Torch device; CUDA when there is one, else CPU.
-        options: Other fields of `Estimator`.
+        options: Other fields of `Estimator`; the defaults are those of every command (`sdps.inference_config`).
 
     Raises:
         InputError: a file is missing, damaged, or of a model for something else.
@@ -327,17 +323,6 @@ def load_model(file: str | Path, device: torch.device, role: str | tuple[str, ..
     model = load_weights(file, role)
     model.network.to(device, memory_format=torch.channels_last)  # a third faster on CPUs
     return model
-
-
-def load_pair(
-    lighting_file: str | Path | None,
-    normals_file: str | Path,
-    *,
-    device: str | torch.device | None = None,
-    **options: Any,
-) -> Estimator:
-    """Load a lighting model, or None for known lights only, and a normal model; see `load_estimator`."""
-    return load_estimator(lighting=lighting_file, normals=normals_file, device=device, **options)
 
 
 def _check_lights(count: int, lights: np.ndarray | None, intensities: np.ndarray | None) -> None:

@@ -1,12 +1,11 @@
 """Methods, learned and classical, behind one interface: images in, normals and lights out."""
 
 import hashlib
-import re
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from sdps.classical import registry as classical
 from sdps.estimate import Estimate
 from sdps.image_source import ImageSource, survey
 from sdps.inference import Estimator, default_device, load_model
+from sdps.inference_config import InferenceConfig
 from sdps.lighting import ReadOut
 from sdps.metrics import score
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
@@ -31,6 +31,7 @@ CONSTANT = "constant"
 """A predictor that sees nothing: what knowing nothing scores."""
 CLASSICAL = (*classical.METHODS, CONSTANT)
 _VIEWS = ("light_views", "normal_views")
+_PLACES = ("lights", "second", "normals")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,8 +44,8 @@ class Method:
         normals: A normal model, a classical method, or empty for lighting alone.
         second: A second lighting pass, or empty.
         intensities: `true` where only the intensities are given, else empty.
-        read_out: How light classes become lights; None for the runner's.
-        light_views: Turned views that lights are averaged over; None for the runner's.
+        read_out: How light classes become lights; None for the configuration's.
+        light_views: Turned views that lights are averaged over where the configuration does not say; None for one.
         normal_views: The same for normals.
         paper: Row of the paper's table.
     """
@@ -64,33 +65,6 @@ class Method:
         return {self.lights, self.normals, self.second} - {NONE, TRUE_LIGHTS, *CLASSICAL}
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunnerConfig:
-    """How networks are used.
-
-    Attributes:
-        read_out: How light classes become lights.
-        precision: Arithmetic of the networks.
-        rotations: Rotations about the view axis that pixel networks average over.
-        margin: Pixels kept around the mask's bounding box, for photographs; None for the whole frame, as in training.
-        light_views: Turned and mirrored views that lights are averaged over, 1, 2, 4 or 8.
-        normal_views: The same for normals.
-    """
-
-    read_out: ReadOut = "expectation"
-    precision: Literal["float32", "bfloat16"] = "bfloat16"
-    rotations: int = 10
-    margin: int | None = 15
-    light_views: int = 1
-    normal_views: int = 1
-
-
-def runner_config(settings: Any) -> RunnerConfig:
-    """Return how networks are used, from what parsed flags or a preset's section say of it by the same names."""
-    names = (field.name for field in fields(RunnerConfig))
-    return RunnerConfig(**{name: getattr(settings, name) for name in names if hasattr(settings, name)})
-
-
 @cache
 def _loaded(path: Path) -> "TrainedModel":
     """Load a model once, however many methods use it."""
@@ -103,22 +77,20 @@ class Runner:
     Args:
         method: What to do.
         find: Gives the weights file of a name, or raises InputError.
-        config: Read-out, precision, rotations, margin and views.
+        config: How networks are used; what the method itself says of its read-out and views is filled in.
 
     Raises:
         InputError: weights that are missing, damaged, or of another role.
     """
 
-    def __init__(self, method: Method, find: Callable[[str], Path], config: RunnerConfig) -> None:
-        self.method, self.config = method, config
+    def __init__(self, method: Method, find: Callable[[str], Path], config: InferenceConfig | None = None) -> None:
+        self.method, self.config = method, _filled(config or InferenceConfig(), method)
         self.files = {name: find(name) for name in sorted(method.models())}
 
         def model(name: str) -> "TrainedModel | None":
             return _loaded(self.files[name]) if name in self.files else None
 
         lighting, normals, second = (model(name) for name in (method.lights, method.normals, method.second))
-        own = {name: getattr(method, name) for name in _VIEWS}
-        self.views = {name: getattr(config, name) if count is None else count for name, count in own.items()}
         self.estimator = None
         if lighting is not None or normals is not None:
             self.estimator = Estimator(
@@ -126,24 +98,17 @@ class Runner:
                 normals=normals,
                 second=second,
                 device=default_device(),
-                precision=config.precision,
-                read_out=method.read_out or config.read_out,
-                rotations=config.rotations,
-                margin=config.margin,
-                **self.views,
+                **self.config.options(),
             )
 
     def identity(self) -> str:
-        """Return a digest of what results depend on besides the images: weights, settings and code."""
-        method, config = self.method, self.config
-        parts = [method.lights == TRUE_LIGHTS, method.intensities, CONSTANT if method.normals == CONSTANT else ""]
-        if method.normals in classical.METHODS:
-            parts.append(classical.source_digest(method.normals))
+        """Return a digest of what results depend on besides images and code: weights, settings and arithmetic."""
+        method = self.method
+        names = {place: getattr(method, place) for place in _PLACES}
+        parts = [method.intensities]
+        parts += [(place, _digest(self.files[name]) if name in self.files else name) for place, name in names.items()]
         if self.estimator is not None:
-            named = {place: getattr(method, place) for place in ("lights", "normals", "second")}
-            parts += [(place, _digest(self.files[name])) for place, name in named.items() if name in self.files]
-            parts += [method.read_out or config.read_out, config.precision, config.rotations, config.margin]
-            parts += [*self.views.values(), _inference_digest()]
+            parts += [self.config.options(), self.estimator.arithmetic.precision, str(self.estimator.device)]
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
     def estimate(
@@ -186,11 +151,10 @@ class Runner:
     ) -> Estimate:
         """Estimate the lights, or take what another method with the same lighting networks found."""
         found = {} if found is None else found
-        places = ("lights", "second", "normals") if self.method.second else ("lights",)  # a second pass sees normals
-        views = tuple(self.views.values()) if self.method.second else (self.views["light_views"],)
+        places = _PLACES if self.method.second else ("lights",)  # a second pass sees normals
         used = (_digest(self.files[getattr(self.method, place)]) for place in places)
-        options = self.method.read_out or self.config.read_out, self.config.precision, self.config.margin
-        key = (*used, *options, *views, "intensities" in given)
+        options = self.config.options() | ({} if self.method.second else {"normal_views": None, "rotations": None})
+        key = (*used, *options.items(), "intensities" in given)
         if key not in found:
             found[key] = self.estimator.estimate_lights(images, mask, given.get("intensities"))
         return found[key]
@@ -234,6 +198,12 @@ class Runner:
         return {item.name: item.value for item in score(estimate, mask, **truth)}
 
 
+def _filled(config: InferenceConfig, method: Method) -> InferenceConfig:
+    """Return the configuration with what the method says where it says nothing, one view where neither does."""
+    views = {name: getattr(config, name) or getattr(method, name) or 1 for name in _VIEWS}
+    return replace(config, read_out=method.read_out or config.read_out, **views)
+
+
 def label(lights: str, normals: str, second: str = NONE, *, combination: str = NONE) -> str:
     """Name what parts make together, by the combination's name and its parts where it has one."""
     suffix = " (shipped)" if any(part.startswith(weights.SHIPPED) for part in (lights, normals, second)) else ""
@@ -256,7 +226,7 @@ def combined(
 ) -> Method:
     """Return the method of parts that go together, with its label; asked for as a combination, with its views."""
     pair = COMBINATIONS[combination] if combination else None
-    views = {field: getattr(pair, field, None) for field in _VIEWS}  # None: the runner's choice
+    views = {field: getattr(pair, field, None) for field in _VIEWS}
     named = combination if any(views.values()) else NONE  # others are their parts, and called so
     name = label(*map(_stem, (lights, normals, second)), combination=named)
     return Method(
@@ -375,13 +345,3 @@ def _check_classical(normals: str, lights: str, second: str | None, intensities:
         raise InputError(f"{normals} is told the lights; give --lights, `true` or a lighting model")
     if not calibrated and (lights or second or intensities):
         raise InputError(f"{normals} finds the lights itself; leave out --lights, --second and --intensities")
-
-
-@cache
-def _inference_digest() -> str:
-    """Return a digest of the code that uses trained networks, so that results of other code are told apart."""
-    root, digest = Path(__file__).parent, hashlib.sha256()
-    names = ("inference", "chunked", "image_source", "augment", "lighting", "observation_maps", "symmetry")
-    for path in [*(root / f"{name}.py" for name in names), *sorted((root / "models").glob("*.py"))]:
-        digest.update(re.sub(rb"\s+", b" ", path.read_bytes()))
-    return digest.hexdigest()

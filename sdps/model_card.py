@@ -203,6 +203,7 @@ def _training(source: _Sources) -> str:
     facts = [
         ("optimiser steps", UNKNOWN if step is None else f"{step:,}"),
         ("hours", UNKNOWN if seconds is None else f"{seconds / 3600:.2f}"),
+        ("computed in", _computed(metadata)),
         ("images per second", _mean(rows, "images_per_second", "{:.0f}")),
         ("share of time waiting for data", _mean(rows, "waiting_share", "{:.1%}")),
         ("last training loss", _last(rows, "loss")),
@@ -387,6 +388,12 @@ def _value(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:g}" if isinstance(value, float) else str(value) or "empty"
+
+
+def _computed(metadata: Mapping[str, Any]) -> str:
+    """Spell what the steps were computed in."""
+    parts = metadata.get("computed")
+    return "; ".join(f"{p['precision']} on {p['device']} from step {p['step']}" for p in parts) if parts else UNKNOWN
 
 
 def _counts(counts: Mapping[Any, int]) -> str:

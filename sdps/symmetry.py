@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from render.errors import InputError
 from sdps.image_source import View
 from sdps.models.base import Lights
 
@@ -51,15 +50,6 @@ class Symmetry(NamedTuple):
 
 SYMMETRIES = tuple(Symmetry(turns, mirror) for turns in (0, 2, 1, 3) for mirror in (False, True))
 """The first 1, 2, 4 or 8 of them are a group each."""
-
-_COUNTS = (1, 2, 4, 8)
-
-
-def check_views(light_views: int, normal_views: int) -> None:
-    """Refuse numbers of views that are no group."""
-    for name, count in (("light_views", light_views), ("normal_views", normal_views)):
-        if count not in _COUNTS:
-            raise InputError(f"{name} must be 1, 2, 4 or 8, got {count}")
 
 
 class TurnedView:

@@ -39,7 +39,7 @@ METRICS = "metrics.jsonl"
 # What may differ between the parts of one run: how long, and how it is carried out, but not what is computed.
 _MAY_CHANGE = {
     "epochs", "steps", "minutes", "workers", "cache",
-    "log_every", "validate_every", "validation_scenes", "checkpoint_minutes",
+    "log_every", "validate_every", "validation_scenes", "checkpoint_minutes", "precision", "channels_last",
 }  # fmt: skip
 
 _log = logging.getLogger(__name__)
@@ -102,6 +102,7 @@ def train(
 def _train(trainer: "Trainer", loggers: list[Logger], tensorboard: bool) -> TrainingResult:
     """Resume, run, validate and save."""
     trainer.resume()
+    trainer.note_arithmetic()
     if trainer.finished_metrics is not None and trainer.progress() >= 1.0:
         return trainer.result(trainer.finished_metrics, 0.0, interrupted=False)
     trainer.finished_metrics = None
@@ -184,6 +185,7 @@ class Trainer:
         self.stage, self.config, self.data, self.folder, self.team = stage, stage.config, data, folder, here
         config = self.config
         stage.to(here.device)
+        self.arithmetic = here.same_arithmetic(config.precision)
         options = {"cache": config.cache, "skip_missing": config.skip_missing}
         self.source = source or StoredScenes(
             SceneDataset(data, "train", stage.sample_options(), **options),
@@ -205,6 +207,8 @@ class Trainer:
         if here.world > 1:
             self._loss = DistributedDataParallel(self._loss)
         self.step = self.samples = 0
+        self.computed: list[dict[str, Any]] = []
+        """Step from which on, precision and processor: what the run was computed in, part by part."""
         self.best = math.inf
         self.learning_rate = config.learning_rate
         self.finished_metrics: dict[str, float] | None = None
@@ -240,7 +244,7 @@ class Trainer:
             group["lr"] = self.learning_rate
         totals: dict[str, float] = {}
         for part in _parts(batch, config.accumulate):
-            with self._autocast():
+            with self.arithmetic.autocast():
                 loss, terms = self._loss(part.to(self.team.device))
             (loss / config.accumulate).backward()
             for name, value in {"loss": loss, **terms}.items():
@@ -274,7 +278,7 @@ class Trainer:
         try:
             for index in np.linspace(0, len(self.validation) - 1, count).round().astype(int):
                 batch = collate([self.validation.sample(SampleKey(int(index), 0, int(index)))])
-                with self._autocast():
+                with self.arithmetic.autocast():
                     rows.append(self.stage.metrics(batch.to(self.team.device)))
         finally:
             self.stage.network = trained
@@ -288,9 +292,6 @@ class Trainer:
         """Return the network that is validated and saved: the trained one, or its moving average."""
         return self.stage.network if self.average is None else self.average.module
 
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast(self.team.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16")
-
     def save(self) -> None:
         """Write the checkpoint: weights, optimiser, random state, and place in the data."""
         cuda = torch.cuda.get_rng_state_all() if self.team.device.type == "cuda" else []
@@ -303,6 +304,7 @@ class Trainer:
             "step": self.step,
             "samples": self.samples,
             "best": self.best,
+            "computed": self.computed,
             "seconds": self.seconds(),
             "finished_metrics": self.finished_metrics,
         }
@@ -327,8 +329,18 @@ class Trainer:
         if self.team.device.type == "cuda" and state["random"]["cuda"]:
             torch.cuda.set_rng_state_all(state["random"]["cuda"])
         self.step, self.samples, self.best = state["step"], state["samples"], state["best"]
+        self.computed = state.get("computed", [])
         self.finished_metrics = state["finished_metrics"]
         self._earlier_seconds, self._started = state["seconds"], time.perf_counter()
+
+    def note_arithmetic(self) -> None:
+        """Record what the following steps are computed in, and say so where the run began with something else."""
+        now = {"step": self.step, "precision": self.arithmetic.precision, "device": self.arithmetic.device}
+        if self.computed and self.computed[-1]["precision"] != now["precision"]:
+            _log.warning("%s: began in %s and goes on in %s (%s)", self.stage.name, self.computed[-1]["precision"],
+                         now["precision"], self.arithmetic.reason)  # fmt: skip
+        if not self.computed or {**self.computed[-1], "step": 0} != {**now, "step": 0}:
+            self.computed.append(now)
 
     def _identity(self) -> dict[str, Any]:
         """Return what a checkpoint must share with the run that resumes it."""
@@ -353,6 +365,7 @@ class Trainer:
             **self.source.identity(),
             "code": code_version(),
             "step": self.step,
+            "computed": self.computed,
             "seconds": round(self.seconds(), 1),
             "metrics": metrics,
             **self.stage.origin(),

@@ -45,7 +45,7 @@ def main(count: int, normals: str, lighting: str = "", second: str = "") -> None
     torch.manual_seed(0)
     models = {"normals": normals, "lighting": lighting, "second": second}
     loaded = {place: trained(name) if name else None for place, name in models.items()}
-    estimator = Estimator(**loaded, device=torch.device("cpu"))
+    estimator = Estimator(**loaded, device=torch.device("cpu"), precision="float32")
     source = SphereSource(count)
     began = time.perf_counter()
     before = peak_bytes()

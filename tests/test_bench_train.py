@@ -11,7 +11,7 @@ import torch
 
 from pipelines import bench_train
 from pipelines.bench_scenes import ellipsoid, write_scenes
-from pipelines.bench_train import ONE_THREAD, OURS, PLAIN, BenchTrainConfig
+from pipelines.bench_train import MUON, ONE_THREAD, OURS, PLAIN, BenchTrainConfig
 from render.errors import InputError
 from render.manifest import read_manifest
 from render.seeds import derived_seed
@@ -62,14 +62,19 @@ def test_every_way_is_measured_and_told(folder: Path, monkeypatch: pytest.Monkey
     found = bench_train.measure(QUICK, "nenet", folder)
     assert torch.get_num_threads() == threads
     named = set(found["ways"]) | set(found["skipped"])
-    assert {PLAIN, OURS, "trainer, NCHW", "trainer, float32", "trainer, torch.compile", ONE_THREAD} == named
+    assert {PLAIN, OURS, MUON, "trainer, NCHW", "trainer, float32", "trainer, torch.compile", ONE_THREAD} == named
     assert found["skipped"]["trainer, torch.compile"] == "no C++ compiler"
     assert all(rate["least"] <= rate["median"] <= rate["most"] for rate in found["ways"].values())
     assert all(0.0 <= waited["share"] <= 1.0 for waited in found["waiting"].values())
     machine = {"processor": "one", "instructions": "AVX512", "threads": 1, "torch": "2", "load": None,
+               "precision": "bfloat16", "reason": "it is faster",
                "matmul_gflops": {"float32": 50.0, "bfloat16": 100.0}}  # fmt: skip
     text = bench_train.table(
-        {"machine": machine, "models": {"nenet": found | {"memory_mb": {PLAIN: 900.5, OURS: None}}}}
+        {
+            "kinds": {
+                "here": {"machine": machine, "models": {"nenet": found | {"memory_mb": {PLAIN: 900.5, OURS: None}}}}
+            }
+        }
     )
     for part in (
         "(2.00x)",

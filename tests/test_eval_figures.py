@@ -21,8 +21,9 @@ from render.errors import InputError
 from render.files import write_text
 from render.shards import Shard, to_half, write_shard
 from sdps import weights
+from sdps.inference_config import InferenceConfig
 from sdps.lighting import azimuth_elevation
-from sdps.methods import Method, Runner, RunnerConfig
+from sdps.methods import Method, Runner
 from sdps.metrics import angle_degrees
 
 SMALL = ["test.shapes=[sphere, bunny]", "test.materials=[red-phenolic, pink-plastic]",
@@ -247,7 +248,7 @@ def test_what_cannot_be_drawn_is_left_out(run, caplog):
 
 def test_materials_need_the_bunny(tmp_path):
     preset = presets.load("smoke", ["test.shapes=[sphere]"])
-    runner = Runner(Method(name="constant", normals="constant"), finder(None), RunnerConfig())
+    runner = Runner(Method(name="constant", normals="constant"), finder(None), InferenceConfig())
     bench = workbench.Workbench(preset, tmp_path, (runner,), Evaluation(tmp_path))
     with pytest.raises(workbench.LeftOut, match="bunny"):
         materials.make(bench)

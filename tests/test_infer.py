@@ -4,7 +4,6 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import classical_scenes as scenes
@@ -17,14 +16,15 @@ import trimesh
 from sdps_scenes import hemisphere_lights
 
 from pipelines import bench_infer
-from pipelines.cli import main
+from pipelines.cli import build_parser, main
+from pipelines.machines import HERE, kinds
 from render.config import to_plain
 from render.errors import InputError
 from sdps import api, methods, weights
 from sdps.api import infer, load
 from sdps.augment import Augmentation
 from sdps.checkpoint import TrainedModel, save_weights
-from sdps.methods import RunnerConfig
+from sdps.inference_config import InferenceConfig, inference_config
 from sdps.metrics import direction_mae, intensity_error, normal_mae
 from sdps.models.registry import create
 
@@ -136,26 +136,28 @@ def test_networks_with_and_without_known_lights(hills: tuple, tmp_path: Path, ca
     np.testing.assert_allclose(told.light_directions, LIGHTS, atol=1e-5)
     assert set(told.files) == {"nenet"}
     # Over all eight views an untrained network's lights average to a single one.
-    config = RunnerConfig(light_views=1)
+    config = InferenceConfig(light_views=1)
     only = infer(load(folder), "lcnet+least-squares", models=models, config=config)
     assert only.method == "lcnet + least-squares" and only.normals[mask].any()
 
 
-def test_a_combination_does_not_decide_over_how_many_views(
+def test_a_method_means_the_same_to_photographs_as_to_benchmarks(
     hills: tuple, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
 
-    def runner(method: methods.Method, find: Callable, config: RunnerConfig) -> None:
-        asked.append(method)
+    def runner(*given: object) -> None:
+        asked.append(given)
         raise InputError("enough")
 
-    assert methods.parse("sdps-plus", Path).normal_views == 4
     monkeypatch.setattr(api, "Runner", runner)
     monkeypatch.setattr(api.weights, "require", lambda name, out: Path(name))
     with pytest.raises(InputError, match="enough"):
         infer(load(hills[0]), "sdps-plus")
-    assert (asked[0].light_views, asked[0].normal_views) == (None, None)
+    method, _, config = asked[0]
+    assert method == methods.parse("sdps-plus", Path) and config is None
+    flags = build_parser("infer").parse_args(["infer", "photographs"])
+    assert inference_config(flags) == InferenceConfig()
 
 
 def test_folders_and_methods_that_do_not_fit_are_one_line(hills: tuple, tmp_path: Path, capsys) -> None:
@@ -216,7 +218,9 @@ def test_many_photographs_do_not_need_more_memory(tmp_path: Path) -> None:
 def test_the_bench_measures_every_step(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     flags = ["--height", "48", "--width", "64", "--images", "12", "--many", "20", "--out", str(tmp_path)]
     assert main(["bench-infer", *flags, "--methods", "factorisation"]) == 0
-    runs = json.loads((tmp_path / "bench_infer.json").read_text())["runs"]
+    found = json.loads((tmp_path / "bench_infer.json").read_text())["kinds"]
+    assert tuple(found) == kinds()  # this machine, and it held to AVX2 where it has more
+    runs = found[HERE]
     assert runs["factorisation, 20 pictures"]["peak_gib"] > 0 and runs["factorisation, 12 pictures"]["seconds"] > 0
     assert "within 180 s, 3 GiB" in capsys.readouterr().out
-    assert "too dark" in bench_infer.table({"pf14": {"error": "too dark"}}, bench_infer.BenchClassicalConfig())
+    assert "too dark" in bench_infer.table({"pf14": {"error": "too dark"}}, bench_infer.BenchClassicalConfig(), "here")

@@ -15,9 +15,12 @@ from render.errors import InputError
 from sdps import weights
 from sdps.augment import Augmentation
 from sdps.checkpoint import TrainedModel, save_weights
+from sdps.estimate import Estimate
 from sdps.inference import Estimator
-from sdps.methods import Method, Runner, RunnerConfig, combine, parse, runner_config
+from sdps.inference_config import InferenceConfig, inference_config
+from sdps.methods import Method, Runner, combine, parse
 from sdps.models.registry import create
+from sdps.precision import arithmetic
 
 LIGHTS = hemisphere_lights(12, np.random.default_rng(0))
 
@@ -131,7 +134,7 @@ def test_a_lazy_source_gives_a_classical_method_what_an_array_does() -> None:
         def __getitem__(self, part: slice) -> np.ndarray:
             return item.load()[part]
 
-    runner = Runner(parse("robust-least-squares", weights.require), weights.require, RunnerConfig())
+    runner = Runner(parse("robust-least-squares", weights.require), weights.require, InferenceConfig())
     whole = runner.estimate(item.load(), item.mask, LIGHTS, np.ones(12))
     lazy = runner.estimate(Lazy(), item.mask, LIGHTS, np.ones(12))
     np.testing.assert_allclose(lazy.normals, whole.normals, atol=1e-5)
@@ -143,7 +146,7 @@ def test_lights_that_methods_share_are_estimated_once(
     item, find = hills(), methods.finder(runs)
     named = [parse(text, find) for text in ("lcnet", "lcnet+nenet", "lcnet+psfcn", "lcnet+least-squares", "true+nenet")]
     named += [replace(named[1], name="two views", light_views=2), combine("lcnet", "nenet", None, "true", find)]
-    runners = [Runner(method, find, RunnerConfig()) for method in named]
+    runners = [Runner(method, find, InferenceConfig()) for method in named]
     alone = [Evaluation(tmp_path / "alone").result(item, runner) for runner in runners]
     asked = []
     whole = Estimator.estimate_lights
@@ -157,7 +160,7 @@ def test_lights_that_methods_share_are_estimated_once(
 
 def test_results_are_kept_until_something_changes(tmp_path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     item = hills()
-    runner = Runner(parse("least-squares", weights.require), weights.require, RunnerConfig())
+    runner = Runner(parse("least-squares", weights.require), weights.require, InferenceConfig())
     first = Evaluation(tmp_path).result(item, runner, keep_normals=True)
     assert first.scores["normal_mae"] < 10 and first.normals().shape == (40, 40, 3)
 
@@ -172,12 +175,14 @@ def test_results_are_kept_until_something_changes(tmp_path: Path, runs: Path, mo
         changed = TestObject("hills", "2", item.load, item.mask, item.normals, LIGHTS, np.ones(12))
         with pytest.raises(AssertionError, match="ran again"):
             Evaluation(tmp_path).result(changed, runner)
-    networks = [Runner(parse(text, methods.finder(runs)), methods.finder(runs), config)
-                for text, config in (("sdps", RunnerConfig()), ("sdps", RunnerConfig(read_out="centre")),
-                                     ("sdps", RunnerConfig(light_views=8)), ("sdps", RunnerConfig(normal_views=2)),
-                                     ("sdps", RunnerConfig(margin=None)),
-                                     ("true+nenet", RunnerConfig()), ("lcnet+psfcn", RunnerConfig()))]  # fmt: skip
-    assert len({item.identity() for item in networks}) == 7
+    find = methods.finder(runs)
+    options = ({}, {"read_out": "centre"}, {"light_views": 8}, {"normal_views": 2}, {"margin": None},
+               {"precision": "float32" if arithmetic().precision == "bfloat16" else "bfloat16"})  # fmt: skip
+    networks = [Runner(parse("sdps", find), find, InferenceConfig(**some)) for some in options]
+    networks += [Runner(parse(text, find), find) for text in ("true+nenet", "lcnet+psfcn")]
+    assert len({item.identity() for item in networks}) == 8
+    resolved = Runner(parse("sdps", find), find, InferenceConfig(precision=arithmetic().precision))
+    assert resolved.estimator.arithmetic.precision == networks[0].estimator.arithmetic.precision
 
 
 def test_rendered_scenes_are_seen_whole_and_photographs_cut(
@@ -185,12 +190,21 @@ def test_rendered_scenes_are_seen_whole_and_photographs_cut(
 ) -> None:
     seen = []
     whole = Estimator.estimate_lights
-    monkeypatch.setattr(Estimator, "estimate_lights", lambda *given: seen.append(given[0].margin) or whole(*given))
-    preset, find = presets.load("smoke"), methods.finder(runs)
-    for config in (runner_config(preset.test), runner_config(replace(preset.test, margin=15)), RunnerConfig()):
-        Evaluation(tmp_path).result(hills(), Runner(parse("lcnet", find), find, config))
-    assert seen == [None, 15, 15]  # the last as `infer` does
-    with pytest.raises(InputError, match="margin must be 0 pixels or more, or null"):
+
+    def look(self: Estimator, images: np.ndarray, mask: np.ndarray, *given: object) -> Estimate:
+        seen.append(self.margin_of(mask.shape))
+        return whole(self, images, mask, *given)
+
+    monkeypatch.setattr(Estimator, "estimate_lights", look)
+    preset, find, item = presets.load("demo"), methods.finder(runs), hills()
+    assert inference_config(preset.test) == InferenceConfig()
+    framed = np.pad(item.load(), ((0, 0), (44, 44), (44, 44), (0, 0)))
+    rendered = replace(item, mask=np.pad(item.mask, 44), normals=None, load=lambda: framed)
+    for one in (rendered, item):
+        for config in (InferenceConfig(), InferenceConfig(margin=4), InferenceConfig(margin=None)):
+            Evaluation(tmp_path / str(one.mask.shape)).result(one, Runner(parse("lcnet", find), find, config))
+    assert seen == [None, 4, None, 15, 4, None]
+    with pytest.raises(InputError, match="margin must be at least 0 pixels, auto, or null"):
         replace(preset.test, margin=-1)
     assert "whole frame" in eval_merltest.definition(preset.test)
     assert "box with 15 pixels" in eval_merltest.definition(replace(preset.test, margin=15))
@@ -199,7 +213,7 @@ def test_rendered_scenes_are_seen_whole_and_photographs_cut(
 def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     item = hills()
     dark = TestObject("dark", "1", lambda: np.zeros((12, 40, 40, 3), np.float32), item.mask, item.normals, LIGHTS)
-    runner = Runner(Method(name="pf14", normals="pf14"), weights.require, RunnerConfig())
+    runner = Runner(Method(name="pf14", normals="pf14"), weights.require, InferenceConfig())
     result = Evaluation(tmp_path).result(dark, runner)
     assert result.scores == {} and "black inside the mask" in result.reason
     assert Evaluation(tmp_path).result(dark, runner).reason == result.reason

@@ -19,7 +19,7 @@ from sdps.augment import Augmentation, normalise_exposure
 from sdps.checkpoint import TrainedModel, save_weights
 from sdps.config import LightingTraining
 from sdps.dataset import Batch
-from sdps.inference import Estimator, load_estimator, load_pair
+from sdps.inference import Estimator, load_estimator
 from sdps.joint import SecondStage
 from sdps.metrics import score
 from sdps.models.registry import create
@@ -39,7 +39,10 @@ def estimator(tmp_path_factory: pytest.TempPathFactory) -> Estimator:
     folder = tmp_path_factory.mktemp("weights")
     for name, options in (("lcnet", {"direction_classes": 36, "intensity_classes": 20}), ("nenet", {})):
         save_weights(folder / f"{name}.safetensors", trained(name, **options))
-    return load_pair(folder / "lcnet.safetensors", folder / "nenet.safetensors", device="cpu")
+    return load_estimator(
+        lighting=folder / "lcnet.safetensors", normals=folder / "nenet.safetensors", device="cpu",
+        precision="float32", read_out="centre",
+    )  # fmt: skip
 
 
 def scene(size: int = 90, count: int = 6) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -150,7 +153,7 @@ def test_swapped_files_are_noticed(estimator: Estimator, tmp_path: Path) -> None
     save_weights(file, estimator.lighting)
     save_weights(normals, estimator.normals)
     with pytest.raises(InputError, match="one for normals or pixels is needed"):
-        load_pair(None, file)
+        load_estimator(normals=file)
     with pytest.raises(InputError, match="one for second is needed"):
         load_estimator(lighting=file, second=file, normals=normals)
 
@@ -283,7 +286,7 @@ def test_lights_found_before_change_nothing(names: tuple[str, ...]) -> None:
     images, mask, lights = scene(size=72)
     gains = np.linspace(0.5, 2.0, 6)
     places = dict(zip(("lighting", "normals", "second"), map(trained, names), strict=False))
-    estimator = Estimator(**places, device=torch.device("cpu"), light_views=2)
+    estimator = Estimator(**places, device=torch.device("cpu"), precision="float32", light_views=2)
     for given in ({}, {"intensities": gains}):
         expected = estimator.estimate(images, mask, **given)
         found = estimator.estimate_lights(images, mask, **given)
@@ -303,7 +306,7 @@ def test_second_pass_is_the_one_of_training() -> None:
     images, mask, lights = scene(size=128)
     models = {"lighting": trained("lcnet-soft"), "normals": trained("nenet-plus")}
     second = trained("lcnet-second")
-    estimator = Estimator(**models, second=second, device=torch.device("cpu"), margin=None)
+    estimator = Estimator(**models, second=second, device=torch.device("cpu"), precision="float32", margin=None)
     estimate = estimator.estimate(images, mask)
     exposed, _ = normalise_exposure(images, mask, Augmentation())
     batch = Batch(

@@ -42,7 +42,9 @@ def combination(models: dict[str, TrainedModel], name: str, **options: Any) -> E
     places["normals" if role == "pixels" else role] = name
     chosen = {place: models[model] if model else None for place, model in places.items()}
     # Classes would hide small differences, or turn them into large ones at a tie.
-    return Estimator(**chosen, device=torch.device("cpu"), read_out="expectation", rotations=2, **options)
+    return Estimator(
+        **chosen, device=torch.device("cpu"), precision="float32", read_out="expectation", rotations=2, **options
+    )
 
 
 class Scene(NamedTuple):
@@ -102,7 +104,9 @@ def test_any_number_of_images(models: dict[str, TrainedModel], name: str, count:
 def test_any_lighting_model_works_with_any_normal_model(models: dict[str, TrainedModel], index: int) -> None:
     first = [name for name in LIGHTING if MODELS[name].role == "lighting"]
     pair = {"lighting": models[first[index % len(first)]], "normals": models[NORMALS[index]]}
-    estimate = Estimator(**pair, device=torch.device("cpu"), rotations=1).estimate(*scene_for("", 2, 12))
+    estimate = Estimator(**pair, device=torch.device("cpu"), precision="float32", rotations=1).estimate(
+        *scene_for("", 2, 12)
+    )
     assert np.isfinite(estimate.normals).all()
     assert len(estimate.light_directions) == len(estimate.intensities) == 2
 

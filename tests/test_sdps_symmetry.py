@@ -72,7 +72,7 @@ def estimator(lights: int, normals: int) -> Estimator:
     names = {"lighting": "lcnet-soft", "normals": "nenet"}
     models = {place: TrainedModel(name, create(name).eval(), {}, metadata) for place, name in names.items()}
     views = {"light_views": lights, "normal_views": normals}
-    return Estimator(**models, device=torch.device("cpu"), read_out="expectation", **views)
+    return Estimator(**models, device=torch.device("cpu"), precision="float32", read_out="expectation", **views)
 
 
 def differences(network: Estimator) -> tuple[float, float]:

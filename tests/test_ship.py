@@ -68,7 +68,7 @@ def evaluation(out: Path, used: Path) -> None:
     lights = [["A0", "LCNet", "not trained (3.47)"], ["A1", "LCNet_reg", "not trained (4.10)"]]
     table = {"header": ["row", "model", "sphere"], "rows": rows}
     merltest = {
-        "config": {"spp": 64, "repeats": 5, "precision": "bfloat16", "read_out": "expectation"},
+        "config": {"spp": 64, "repeats": 5}, "networks": "Networks: bfloat16.",
         "scenes": [{"shape": "sphere", "material": name} for name in ("chrome", "nylon")],
         "tables": {"Table A": {**table, "rows": lights}, "Table B, normal estimation (MAE)": table},
         "weights": {"lcnet": str(used)},

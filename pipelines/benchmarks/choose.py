@@ -6,6 +6,7 @@ from pipelines import methods
 from render.errors import InputError
 from sdps import weights
 from sdps.classical import registry as classical
+from sdps.inference_config import InferenceConfig
 from sdps.methods import CONSTANT, Method, model_of, parse
 from sdps.models.registry import COMBINATIONS, MODELS
 
@@ -35,18 +36,20 @@ def classical_rows(*, calibrated: bool) -> list[Method]:
     return [parse(name, methods.finder(None)) for name in [*names, CONSTANT]]
 
 
-def every_method(out: Path | None) -> list[Method]:
+def every_method(out: Path | None, config: InferenceConfig | None = None) -> list[Method]:
     """Return every method there is: lighting models, all rows of normals, all classical methods."""
-    return selected([LEARNED, CLASSICAL], out)
+    return selected([LEARNED, CLASSICAL], out, config)
 
 
-def selected(expressions: list[str], out: Path | None) -> list[Method]:
+def selected(expressions: list[str], out: Path | None, config: InferenceConfig | None = None) -> list[Method]:
     """Return the methods of `--methods`, each once; `learned` and `classical` stand for all of a kind."""
     found: list[Method] = []
+    fixed = config is not None and config.light_views is not None  # then no row has views of its own
     for text in expressions:
         if text == LEARNED:
             normals = methods.normal_methods(weights.shipped_folder() if out is None else out)  # nothing trained there
-            found += [*methods.with_views(lighting_rows(out), normals), *normals]
+            lights = lighting_rows(out)
+            found += [*(lights if fixed else methods.with_views(lights, normals)), *normals]
         elif text == CLASSICAL:
             found += classical_rows(calibrated=True)
         else:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines import pictures
+from pipelines import pictures, using
 from pipelines.benchmarks import choose
 from pipelines.evaluation import Evaluation, Result, TestObject
 from pipelines.methods import finder
@@ -17,7 +17,8 @@ from pipelines.tables import render_text
 from render.errors import unknown
 from render.files import write_json
 from render.progress import progress_bar
-from sdps.methods import Method, Runner, RunnerConfig
+from sdps.inference_config import InferenceConfig
+from sdps.methods import Method, Runner
 
 ERROR_LIMIT = 45.0
 _SHOWN_HEIGHT = 240
@@ -32,7 +33,7 @@ def run(
     chosen: Sequence[Method],
     models: Path | None,
     folder: Path,
-    config: RunnerConfig,
+    config: InferenceConfig,
     shown: Sequence[str],
 ) -> tuple[Found, list[Runner]]:
     """Run methods on objects, or take their results from the cache in `folder`.
@@ -168,11 +169,7 @@ def add_arguments(parser: Any, out: str) -> None:
     parser.add_argument("--models", type=Path, metavar="DIR",
                         help="--out of `sdps train`, whose models are evaluated (default: shipped ones)")  # fmt: skip
     parser.add_argument("--objects", action="append", help="commas or repeat (default: all in the folder)")
-    parser.add_argument("--read-out", default="expectation", choices=("centre", "expectation", "peak"),
-                        help="how light classes become lights (the paper: centre; default: %(default)s)")  # fmt: skip
-    parser.add_argument("--light-views", type=int, default=1, metavar="N",
-                        help="turned views that lights are averaged over: 1, 2, 4 or 8 (default: 1)")  # fmt: skip
-    parser.add_argument("--normal-views", type=int, default=1, metavar="N", help="the same for normals (default: 1)")
+    using.add_arguments(parser)
     parser.add_argument("--out", type=Path, default=Path(out), help="output folder (default: %(default)s)")
 
 
@@ -187,15 +184,6 @@ def pick(items: list[TestObject], names: Sequence[str]) -> list[TestObject]:
         if name not in known:
             raise unknown("object", name, known)
     return [known[name] for name in names] if names else items
-
-
-def describe(runners: Sequence[Runner], config: RunnerConfig) -> str:
-    """Say how networks were used, where there are any."""
-    if not any(runner.estimator for runner in runners):
-        return ""
-    views = f"lights averaged over {config.light_views} views, normals over {config.normal_views}"
-    views = "" if config.light_views == config.normal_views == 1 else f", {views}"
-    return f" Networks: light classes read out by {config.read_out}{views}, {config.precision}."
 
 
 def pictured(chosen: Sequence[Method]) -> list[str]:

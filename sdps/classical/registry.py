@@ -1,12 +1,9 @@
 """The classical methods by name, behind one call."""
 
-import hashlib
 import importlib
-import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -109,18 +106,6 @@ def method(name: str) -> ClassicalMethod:
     if name not in METHODS:
         raise unknown("classical method", name, METHODS)
     return METHODS[name]
-
-
-def source_digest(name: str) -> str:
-    """Return a digest of the source a method runs, so that results of other code are told apart."""
-    folder, wanted, found = Path(__file__).parent, [method(name).module], {}
-    while wanted:
-        module = wanted.pop()
-        if module not in found:
-            found[module] = (folder / f"{module}.py").read_text(encoding="utf-8")
-            wanted += re.findall(r"^from sdps\.classical\.(\w+) import", found[module], re.MULTILINE)
-    options = repr(method(name).options)
-    return hashlib.sha256((options + "".join(found[key] for key in sorted(found))).encode()).hexdigest()[:16]
 
 
 def run(

@@ -1,0 +1,49 @@
+"""Light that reaches the camera from elsewhere, taken off photographs: room light, flare, a sensor's black level.
+
+Where the object is in shadow, an image of one distant light is black, but for light from the object itself. Networks
+learn from such images, and answer to a veil of half a per cent over the shadows with errors of degrees
+(docs/photographs.md). Rendered images have no veil and stay as they are.
+
+Legend: L images, P pixels.
+"""
+
+import numpy as np
+
+SHADOW = 0.05
+"""A pixel counts as in shadow where it has less than this share of its brightest values."""
+_BRIGHTEST = 95.0
+_FEWEST = 50
+"""Pixels in shadow from which on an image tells its own level; others have the median of those that do."""
+
+
+def stray_light(values: np.ndarray) -> np.ndarray:
+    """Return what the images show in shadow: the level of stray light of every image and channel.
+
+    Args:
+        values: (L, P, 3) float32, linear radiance of object pixels, as many as tell (`image_source.survey`).
+
+    Returns:
+        (L, 3) float32, zero where nothing is in shadow.
+    """
+    strength = values.mean(axis=(1, 2), dtype=np.float64).astype(np.float32)  # of the light, about
+    relative = values / np.maximum(strength, np.float32(1e-12))[:, None, None]
+    shadow = relative < SHADOW * np.percentile(relative, _BRIGHTEST, axis=0)  # (L, P, 3)
+    level = np.full((len(values), 3), np.nan, np.float32)
+    for image, inside, found in zip(values, shadow, level, strict=True):
+        for channel in np.flatnonzero(inside.sum(0) >= _FEWEST):
+            found[channel] = np.median(image[inside[:, channel], channel])
+    for channel in level.T:
+        told = channel[np.isfinite(channel)]
+        channel[np.isnan(channel)] = np.median(told) if len(told) else 0.0
+    return level
+
+
+def without(images: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Return images less their stray light; up to twice its level they are black, as noise in shadow is.
+
+    Args:
+        images: (L, ..., 3) float32.
+        level: (L, 3), of `stray_light`.
+    """
+    level = level.reshape(len(level), *[1] * (images.ndim - 2), 3)
+    return np.where(images > 2.0 * level, images - level, np.float32(0.0))
