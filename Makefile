@@ -128,6 +128,76 @@ regenerate: $(ASSETS_READY)
 
 demo: PRESET = demo
 demo: $(ASSETS_READY)
+	$(SDPS) demo --preset $(PRESET) --out $(OUT) --materials '$(MATERIALS)' --lights '$(LIGHTS)' $(SETTINGS)
+
+test: $(ASSETS_READY)
+	$(SDPS) $@ --preset $(PRESET) --out $(OUT) $(SETTINGS)
+
+train: $(ASSETS_READY)
+	$(SDPS) train --preset $(PRESET) --out $(OUT) $(if $(MODELS),--models '$(MODELS)') $(if $(STREAM),--stream) $(SETTINGS)
+
+models: $(READY)
+	$(SDPS) models
+
+# The ablation study of docs/models.md: every model, the same data and steps.
+study: PRESET = study
+study: $(ASSETS_READY)
+	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
+	$(SDPS) train --preset $(PRESET) --out $(OUT) --models '$(or $(MODELS),all)' $(SETTINGS)
+	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
+
+eval-classical: OUT = out/classical
+eval-classical: $(ASSETS_READY)
+	$(SDPS) eval-classical --out $(OUT) $(SETTINGS)
+
+eval-photos: OUT = out/photos
+eval-photos: $(READY)
+	$(SDPS) eval-photos '$(DATA)' --out $(OUT)
+
+eval-diligent eval-lights: OUT = out/real
+eval-diligent: $(READY)
+	$(SDPS) eval-diligent '$(DATA)' --out $(OUT) $(if $(RUNS),--models $(RUNS)) $(if $(BITS),--bits $(BITS)) \
+		$(if $(BEAR),--bear $(BEAR))
+
+eval-lights: $(READY)
+	$(SDPS) eval-lights '$(DATA)' --dataset $(DATASET) --out $(OUT) $(if $(RUNS),--models $(RUNS))
+
+eval-figures: $(ASSETS_READY)
+	$(SDPS) eval-figures --preset $(PRESET) --out $(OUT) $(if $(FIGURES),--figures '$(FIGURES)') \
+		$(if $(METHODS),--methods '$(METHODS)') $(SETTINGS)
+
+infer: OUT = out/infer
+infer: $(READY)
+	$(SDPS) infer '$(PHOTOS)' --out $(OUT) $(if $(METHOD),--method '$(METHOD)') $(if $(RUNS),--models $(RUNS))
+
+# Weights of finished runs into assets/weights; then their tables, there and in the README. DATA: DiLiGenT's folder.
+ship: PRESET = ship
+ship: $(READY)
+	$(SDPS) ship --preset $(PRESET) --out $(OUT) $(if $(MODELS),--models '$(MODELS)')
+
+shipped-results: OUT = out/shipped
+shipped-results: PRESET = ship
+shipped-results: $(ASSETS_READY)
+	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) --set 'test.shipped=[all]' $(SETTINGS)
+	$(if $(DATA),$(SDPS) eval-diligent '$(DATA)' --out $(OUT) --methods '$(or $(METHODS),learned)')
+	$(SDPS) shipped-results --out $(OUT) --readme README.md
+
+report: $(READY)
+	$(SDPS) report $(OUT)
+
+data-plan: $(ASSETS_READY)
+	$(SDPS) data plan --preset $(PRESET) --out $(OUT) $(SETTINGS)
+
+data-status data-validate data-preview data-card: $(READY)
+	$(SDPS) data $(@:data-%=%) $(OUT)/data
+
+regenerate: OUT = out/regenerated
+regenerate: $(ASSETS_READY)
+	$(SDPS) regenerate --preset $(PRESET) --shapes '$(SHAPES)' --materials '$(MATERIALS)' --lights '$(LIGHTS)' \
+		--out $(OUT) $(if $(MITSUBA),--mitsuba) $(SETTINGS)
+
+demo: PRESET = demo
+demo: $(ASSETS_READY)
 	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
 	$(SDPS) train --preset $(PRESET) --out $(OUT) $(SETTINGS)
 	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)

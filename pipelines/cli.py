@@ -12,6 +12,7 @@ from render.errors import InputError, unknown
 COMMANDS = {
     "infer": ("infer", "add_arguments", "main", "find normals, lights and a surface in a folder of photographs"),
     "doctor": ("doctor", "add_arguments", "main", "show what this machine has and what is missing"),
+    "demo": ("demo", "add_arguments", "main", "render, train, evaluate and regenerate, fitted to this machine"),
     "render-data": ("render_data", "add_arguments", "main", "render the training scenes of a preset"),
     "data": ("data", "add_arguments", "main", "plan, check, preview, describe, export and import data folders"),
     "models": ("models", "add_arguments", "main", "list the learned models"),

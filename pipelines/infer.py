@@ -66,6 +66,7 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     from sdps.inference_config import inference_config
     from sdps.photos import check
 
+    config = inference_config(args)
     check_out(args.out, args.folder)
     photos = load(
         args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
@@ -76,7 +77,7 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is taken for orthographic\n")
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
     return infer(
-        photos, args.method, models=args.models, config=inference_config(args), discontinuities=args.discontinuities,
+        photos, args.method, models=args.models, config=config, discontinuities=args.discontinuities,
         findings=findings,
     )  # fmt: skip
 

@@ -23,7 +23,7 @@ PRECISIONS: tuple[Precision, ...] = ("auto", "float32", "bfloat16")
 
 _WORTHWHILE = 1.2
 """bfloat16 must be so many times as fast as float32: it costs digits, and a measurement may be off by some per cent."""
-_ROUNDS = 3
+_ROUNDS = 5
 _AMPERE = (8, 0)
 
 _log = logging.getLogger(__name__)

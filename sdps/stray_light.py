@@ -14,6 +14,8 @@ SHADOW = 0.05
 _BRIGHTEST = 95.0
 _FEWEST = 50
 """Pixels in shadow from which on an image tells its own level; others have the median of those that do."""
+_MOST = 2.0
+"""Times the images' median that a level is at most: what only some images show in shadow is light from the object."""
 
 
 def stray_light(values: np.ndarray) -> np.ndarray:
@@ -35,7 +37,7 @@ def stray_light(values: np.ndarray) -> np.ndarray:
     for channel in level.T:
         told = channel[np.isfinite(channel)]
         channel[np.isnan(channel)] = np.median(told) if len(told) else 0.0
-    return level
+    return np.minimum(level, _MOST * np.median(level, axis=0))
 
 
 def without(images: np.ndarray, level: np.ndarray) -> np.ndarray:
