@@ -28,7 +28,7 @@ ASSETS_READY := $(VENV)/.assets-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow lint bench bench-train bench-classical bench-infer bench-surface clean
+	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow test-gpu lint bench bench-train bench-classical bench-infer bench-surface clean
 .DEFAULT_GOAL := help
 
 help:
@@ -210,6 +210,9 @@ test: $(ASSETS_READY)
 
 test-slow: $(ASSETS_READY)
 	$(VENV)/bin/python -m pytest -m "slow and not gpu"
+
+test-gpu: $(ASSETS_READY)
+	$(VENV)/bin/python -m pytest -m gpu
 
 lint: $(READY)
 	$(VENV)/bin/ruff check --no-cache .

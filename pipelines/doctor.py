@@ -15,6 +15,10 @@ from render.shapes.primitives import bunny
 
 PACKAGES = ("mitsuba", "drjit", "torch", "numpy", "scipy", "trimesh", "OpenEXR", "scikit-image", "safetensors")
 LOW_DISK_GB = 5.0
+CUDA_TESTED = (
+    "nothing by the authors, who had no GPU; `make test-gpu` compares rendering, training and inference there with the "
+    "CPU's (not: several GPUs, torch.compile)"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -56,6 +60,7 @@ def examine(folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
             lines.append((package, "not installed"))
             problems.append(f"{package}: pip install -c constraints.txt .")
     lines += _variant_lines(problems)
+    lines.append(("arithmetic", _arithmetic()))
     lines.append(("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())))
     free = shutil.disk_usage(folder).free / 1e9
     lines.append(("free disk", f"{free:.1f} GB"))
@@ -89,9 +94,18 @@ def _variant_lines(problems: list[str]) -> list[tuple[str, str]]:
         name = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "driver present, torch is a CPU build"
         lines.append(("GPU", name))
         lines.append(("OptiX", "library found" if _loads("libnvoptix.so.1") else "libnvoptix.so.1 not found"))
+        lines.append(("tested on CUDA", CUDA_TESTED))
     else:
         lines.append(("GPU", "none; everything runs on the CPU"))
     return lines
+
+
+def _arithmetic() -> str:
+    """Say what networks compute in on this machine, and why."""
+    from sdps.inference import default_device
+    from sdps.precision import arithmetic
+
+    return arithmetic("auto", default_device()).describe()
 
 
 def _loads(library: str) -> bool:

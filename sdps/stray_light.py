@@ -2,7 +2,7 @@
 
 Where the object is in shadow, an image of one distant light is black, but for light from the object itself. Networks
 learn from such images, and answer to a veil of half a per cent over the shadows with errors of degrees
-(docs/photographs.md). Rendered images have no veil and stay as they are.
+(docs/studies/stray-light.md). Rendered images have no veil and stay as they are.
 
 Legend: L images, P pixels.
 """
@@ -10,12 +10,15 @@ Legend: L images, P pixels.
 import numpy as np
 
 SHADOW = 0.05
-"""A pixel counts as in shadow where it has less than this share of its brightest values."""
-_BRIGHTEST = 95.0
+"""A pixel counts as in shadow where it has less than this share of its bright values."""
+_BRIGHT = 75.0
+"""Percentile of a pixel's values over the images that is called bright; above are highlights, of metals above all."""
 _FEWEST = 50
 """Pixels in shadow from which on an image tells its own level; others have the median of those that do."""
 _MOST = 2.0
 """Times the images' median that a level is at most: what only some images show in shadow is light from the object."""
+_NOISE = 3.0
+"""Times the level up to which nothing can be told from it."""
 
 
 def stray_light(values: np.ndarray) -> np.ndarray:
@@ -29,7 +32,7 @@ def stray_light(values: np.ndarray) -> np.ndarray:
     """
     strength = values.mean(axis=(1, 2), dtype=np.float64).astype(np.float32)  # of the light, about
     relative = values / np.maximum(strength, np.float32(1e-12))[:, None, None]
-    shadow = relative < SHADOW * np.percentile(relative, _BRIGHTEST, axis=0)  # (L, P, 3)
+    shadow = relative < SHADOW * np.percentile(relative, _BRIGHT, axis=0)  # (L, P, 3)
     level = np.full((len(values), 3), np.nan, np.float32)
     for image, inside, found in zip(values, shadow, level, strict=True):
         for channel in np.flatnonzero(inside.sum(0) >= _FEWEST):
@@ -41,11 +44,11 @@ def stray_light(values: np.ndarray) -> np.ndarray:
 
 
 def without(images: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Return images less their stray light; up to twice its level they are black, as noise in shadow is.
+    """Return images less their stray light; up to three times its level they are black, as noise in shadow is.
 
     Args:
         images: (L, ..., 3) float32.
         level: (L, 3), of `stray_light`.
     """
     level = level.reshape(len(level), *[1] * (images.ndim - 2), 3)
-    return np.where(images > 2.0 * level, images - level, np.float32(0.0))
+    return np.where(images > _NOISE * level, images - level, np.float32(0.0))

@@ -242,14 +242,15 @@ class Trainer:
         self.learning_rate = config.learning_rate_at(progress)
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate
-        totals: dict[str, float] = {}
+        sums: dict[str, Tensor] = {}
         for part in _parts(batch, config.accumulate):
             with self.arithmetic.autocast():
                 loss, terms = self._loss(part.to(self.team.device))
             (loss / config.accumulate).backward()
             for name, value in {"loss": loss, **terms}.items():
-                totals[name] = totals.get(name, 0.0) + float(value.detach()) / config.accumulate
-        totals = self.team.mean(totals)
+                sums[name] = sums.get(name, 0.0) + value.detach().double() / config.accumulate
+        # One transfer a step: a GPU is waited for once.
+        totals = self.team.mean(dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True)))
         if not math.isfinite(totals["loss"]):
             raise InputError(f"the loss became {totals['loss']} at step {self.step + 1}; lower learning_rate")
         if config.clip_gradient:
