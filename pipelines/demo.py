@@ -38,7 +38,7 @@ class Need:
 
 NEEDS = {
     "early": Need(images=38_000, least=2.5, most=7.0),
-    "lcnet-soft": Need(images=8_000, least=3.5, most=6.0),
+    "lcnet-soft": Need(images=12_000, least=5.0, most=7.0),
     "nenet-plus": Need(images=22_000, least=7.0, most=10.0),
 }
 _OTHER_MINUTES = 6.0

@@ -103,7 +103,7 @@ def rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[list[Meth
         method = methods.chosen(out, args.lights, args.normals, args.second, args.intensities)
         reference = Method(name="least-squares, true lights", lights="true", normals="least-squares")
         return [], [method, *([reference] if method.name != reference.name else []), constant]
-    normals = methods.normal_methods(out, preset.test.shipped)
+    normals = methods.normal_methods(out, preset.test.shipped, preset.test)
     lighting = methods.lighting_methods(out, preset, normals)
     if not lighting and all(not method.models() for method in normals):
         raise InputError(

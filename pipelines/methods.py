@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pipelines.presets import ALL, Preset
 from sdps import recipes, weights
+from sdps.inference_config import InferenceConfig
 from sdps.methods import NONE, Method, combine, combined, label, parse
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
@@ -50,7 +51,9 @@ def lighting_methods(out: Path, preset: Preset, ways: Sequence[Method]) -> list[
         ways: Those of `normal_methods`: where only some shipped ones are wanted, their lights are.
     """
     names = [name for name, item in MODELS.items() if item.role == "lighting"]
-    names += [name for name in preset.runs if name not in names and _role(name, preset) == "lighting"]
+    starts = {settings.get("start") for settings in preset.runs.values()}  # no result of their own
+    names += [name for name in preset.runs
+              if name not in names and name not in starts and _role(name, preset) == "lighting"]  # fmt: skip
     names.append("lcnet-joint")
     trained = [name for name in names if weights.trained_file(out, name).is_file()]
     methods = [Method(name=name, lights=name, paper=MODELS[name].paper if name in MODELS else "") for name in trained]
@@ -83,15 +86,20 @@ def _role(name: str, preset: Preset) -> str:
     return "joint" if model == recipes.JOINT else MODELS[model].role
 
 
-def normal_methods(out: Path, shipped: tuple[str, ...] = ALL) -> list[Method]:
+def normal_methods(out: Path, shipped: tuple[str, ...] = ALL, config: InferenceConfig | None = None) -> list[Method]:
     """Return the tables' rows whose models are all trained in `out`, and those that are shipped, or some of these.
+
+    Combinations that differ from their parts by the views they average over have no row where `config` fixes these.
 
     Raises:
         InputError: `shipped` names what is not.
     """
     trained, kept = [], []
     available = set(weights.shipped())
+    fixed = config is not None and None not in (config.light_views, config.normal_views)
     for method in _every_row():
+        if fixed and (method.light_views or method.normal_views):
+            continue
         if all(weights.trained_file(out, name).is_file() for name in method.models()):
             trained.append(method)
         if method.models() and method.models() <= available:
