@@ -196,7 +196,7 @@ def test_rendered_scenes_are_seen_whole_and_photographs_cut(
         return whole(self, images, mask, *given)
 
     monkeypatch.setattr(Estimator, "estimate_lights", look)
-    preset, find, item = presets.load("demo"), methods.finder(runs), hills()
+    preset, find, item = presets.load("small"), methods.finder(runs), hills()
     assert inference_config(preset.test) == InferenceConfig()
     framed = np.pad(item.load(), ((0, 0), (44, 44), (44, 44), (0, 0)))
     rendered = replace(item, mask=np.pad(item.mask, 44), normals=None, load=lambda: framed)
@@ -241,7 +241,7 @@ def test_a_preset_says_which_shipped_ways_stand_beside_what_is_trained(kept: Pat
         methods.normal_methods(tmp_path, ("sdpss",))
     for name in ("lcnet-soft", "nenet-plus"):
         write_weights(kept.with_name(f"{name}.safetensors"), name)
-    plus = presets.load("demo", ["test.shipped=[sdps-plus]"])
+    plus = presets.load("small", ["test.shipped=[sdps-plus]"])
     averaged = [(m.name, m.light_views) for m in lighting_rows(tmp_path, plus)]
     assert averaged == [("lcnet-soft (shipped)", None), ("lcnet-soft (shipped), 8 views", 8)]
 
