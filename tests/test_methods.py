@@ -12,11 +12,13 @@ from pipelines import eval_merltest, evaluation, methods, presets
 from pipelines.evaluation import Evaluation, TestObject
 from render.config import to_plain
 from render.errors import InputError
+from render.files import source_digest
 from sdps import weights
 from sdps.augment import Augmentation
+from sdps.baselines import constant_estimate
 from sdps.checkpoint import TrainedModel, save_weights
 from sdps.estimate import Estimate
-from sdps.inference import Estimator
+from sdps.inference import Estimator, load_estimator
 from sdps.inference_config import InferenceConfig, inference_config
 from sdps.methods import Method, Runner, combine, parse
 from sdps.models.registry import create
@@ -259,3 +261,51 @@ def test_the_page_shows_the_pair_trained_here_and_the_best_shipped_way(runs: Pat
     assert eval_merltest.shown(methods.normal_methods(runs))[1] == "lcnet-soft + psfcn (shipped)"
     given = [Method(name="psfcn, true lights", lights="true", normals="psfcn")]
     assert eval_merltest.shown(given) == ["psfcn, true lights", least_squares]
+
+
+def test_the_documented_call_uses_networks_as_every_command_does(runs: Path) -> None:
+    files = {place: weights.trained_file(runs, name) for place, name in (("lighting", "lcnet"), ("normals", "nenet"))}
+    assert load_estimator(**files).options() == InferenceConfig().options()
+    item, find = hills(), methods.finder(runs)
+    one = load_estimator(**files).estimate(item.load(), item.mask)
+    other = Runner(parse("sdps", find), find).estimate(item.load(), item.mask, None, None)
+    np.testing.assert_array_equal(one.normals, other.normals)
+    np.testing.assert_array_equal(one.light_directions, other.light_directions)
+
+
+def test_what_is_asked_for_comes_before_what_a_combination_says(runs: Path) -> None:
+    for name in ("lcnet-soft", "nenet-plus"):
+        write_weights(weights.trained_file(runs, name), name)
+    find = methods.finder(runs)
+    counts = [
+        (runner.estimator.light_views, runner.estimator.normal_views)
+        for runner in (
+            Runner(parse("sdps-plus", find), find),
+            Runner(parse("sdps-plus", find), find, InferenceConfig(normal_views=1)),
+            Runner(parse("sdps", find), find),
+        )
+    ]
+    assert counts == [(8, 4), (8, 1), (1, 1)]
+
+
+def test_results_of_other_code_are_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    item, runner = hills(), Runner(parse("least-squares", weights.require), weights.require)
+    Evaluation(tmp_path).result(item, runner)
+    asked = []
+    monkeypatch.setattr(Runner, "estimate", lambda *given: asked.append(given) or constant_estimate(12, item.mask))
+    Evaluation(tmp_path).result(item, runner)
+    assert not asked
+    monkeypatch.setattr(evaluation, "code_identity", lambda: "other code")
+    Evaluation(tmp_path).result(item, runner)
+    assert len(asked) == 1
+
+
+def test_any_change_of_a_file_is_other_code(tmp_path: Path) -> None:
+    (tmp_path / "package").mkdir()
+    digests = set()
+    for name, text in (("a.py", "1"), ("a.py", "2"), ("b.py", "2"), ("metrics.py", "3")):
+        (tmp_path / "package" / name).write_text(text)
+        digests.add(source_digest(tmp_path / "package"))
+    (tmp_path / "package" / "b.py").rename(tmp_path / "package" / "moved.py")
+    digests.add(source_digest(tmp_path / "package"))
+    assert len(digests) == 5

@@ -22,7 +22,7 @@ COMMON = {
     "schedule": "cosine", "warmup": 0.05, "optimiser": "adamw", "workers": 0, "validation_scenes": 0,
     "augmentation": {"noise": 0.02}, "log_every": 1000,
 }  # fmt: skip
-LIGHTING = {"batch_scenes": 3, "images": 6, "learning_rate": 1e-3, "clip_gradient": 5.0, "precision": "bfloat16"}
+LIGHTING = {"batch_scenes": 3, "images": 6, "learning_rate": 1e-3, "clip_gradient": 5.0}
 NORMALS = {"batch_scenes": 3, "images": 6, "size": 16, "crop": 0, "learning_rate": 2e-3, "clip_gradient": 1.0}
 STEPS = {"lighting": 300, "second": 300, "normals": 600, "pixels": 900}
 QUICK = ("nenet",)  # the rest waits for `make test-slow`
@@ -89,7 +89,7 @@ def test_a_handful_of_scenes_is_learned(name: str, role: str, tmp_path: Path) ->
 def test_a_pair_is_learned_together(tmp_path: Path) -> None:
     write_data(tmp_path, ("train",) * 3, lights=6, size=128)
     settings = COMMON | {"batch_scenes": 3, "images": 6, "crop": 32, "learning_rate": 1.5e-3, "clip_gradient": 1.0}
-    config = build(JointTraining, settings | {"steps": 1400, "precision": "bfloat16", "min_object": 0.5})
+    config = build(JointTraining, settings | {"steps": 1400, "min_object": 0.5})
     torch.manual_seed(0)
     options = lighting_options("lcnet", recipes.run("lcnet", {}, {}).config)
     stage = create_stage(
