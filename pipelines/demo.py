@@ -41,15 +41,15 @@ NEEDS = {
     "lcnet-soft": Need(images=12_000, least=5.0, most=7.0),
     "nenet-plus": Need(images=22_000, least=7.0, most=10.0),
 }
-_OTHER_MINUTES = 6.0
+_OTHER_MINUTES = 5.0
 """Setting up, rendering of training and test scenes, and the page."""
 _EVALUATION_MINUTES = 6.0
 _EVALUATIONS = ((16, ("sdps",)), (8, ("sdps",)), (8, ()), (4, ()))
 """Test materials, and pretrained ways beside the pair trained here; the first that fits is taken."""
 _NETWORKS_SHARE = 0.75
 """Of a step's time; loading, augmentation and the optimiser take the rest."""
-_FORWARD = 3.0
-"""Times as fast as a training step that a forward pass is."""
+_FORWARD = 5.0
+"""Times as fast as an image of training that one of evaluation is."""
 
 
 @dataclass(frozen=True, kw_only=True)

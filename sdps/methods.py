@@ -108,7 +108,8 @@ class Runner:
         parts = [method.intensities]
         parts += [(place, _digest(self.files[name]) if name in self.files else name) for place, name in names.items()]
         if self.estimator is not None:
-            parts += [self.config.options(), self.estimator.arithmetic.precision, str(self.estimator.device)]
+            used = self.config.options() | {"precision": self.estimator.arithmetic.precision}
+            parts += [used, str(self.estimator.device)]
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
     def estimate(

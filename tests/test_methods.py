@@ -184,7 +184,7 @@ def test_results_are_kept_until_something_changes(tmp_path: Path, runs: Path, mo
     networks += [Runner(parse(text, find), find) for text in ("true+nenet", "lcnet+psfcn")]
     assert len({item.identity() for item in networks}) == 8
     resolved = Runner(parse("sdps", find), find, InferenceConfig(precision=arithmetic().precision))
-    assert resolved.estimator.arithmetic.precision == networks[0].estimator.arithmetic.precision
+    assert resolved.identity() == networks[0].identity()
 
 
 def test_rendered_scenes_are_seen_whole_and_photographs_cut(
