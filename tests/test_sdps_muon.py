@@ -1,5 +1,6 @@
 """Muon: orthogonal updates of the right size, exact resume, and what it takes of a network."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from torch import nn
 
 from sdps.checkpoint import load_weights
 from sdps.config import NormalTraining
-from sdps.muon import Muon, is_matrix, orthogonalised
+from sdps.muon import _COEFFICIENTS, Muon, is_matrix, orthogonalised
 from sdps.stages import NormalStage
 from sdps.training import train
 
@@ -21,6 +22,20 @@ def test_updates_are_nearly_orthogonal(shape: tuple[int, int]) -> None:
     values = torch.linalg.svdvals(orthogonalised(matrix))
     assert values.max() < 1.3 and values.quantile(0.05) > 0.6  # the smallest of a square one may be far from 1
     assert (orthogonalised(matrix) * matrix).sum() > 0  # the nearest, not any
+
+
+@pytest.mark.parametrize("smallest", [1.0, 1e-6])
+@pytest.mark.parametrize("shape", [(64, 576), (128, 128), (200, 40)])
+def test_gram_matrices_give_what_the_plain_iteration_does(shape: tuple[int, int], smallest: float) -> None:
+    matrix = torch.randn(shape, generator=torch.Generator().manual_seed(0))
+    left, values, right = torch.linalg.svd(matrix, full_matrices=False)
+    matrix = left @ torch.diag(values * torch.logspace(0, math.log10(smallest), len(values))) @ right
+    x = matrix.double() / matrix.double().norm()
+    for _ in range(5):
+        a, b, c = _COEFFICIENTS
+        gram = x @ x.T
+        x = a * x + (b * gram + c * gram @ gram) @ x
+    assert (orthogonalised(matrix) - x).norm() < 1e-3 * x.norm()
 
 
 def test_kernels_are_matrices_and_the_rest_is_not() -> None:
