@@ -158,11 +158,12 @@ def measure(config: BenchTrainConfig, model: str, folder: Path) -> dict[str, Any
     """Time a model's steps on one prepared batch, and its waiting for data."""
     with tempfile.TemporaryDirectory() as scratch:
         batch = first_batch(config, model, folder)
+        images = batch.images.shape[0] * batch.images.shape[1]
         clock = _Clock()
         ways, skipped = _ways(config, model, folder, Path(scratch), batch, clock)
         skipped |= _warm_up(ways)
-        clock.seconds = 0.0
-        wall, processor = _in_turn(ways, config, batch.images.shape[0] * batch.images.shape[1])
+        clock.seconds, clock.calls = 0.0, 0
+        wall, processor = _in_turn(ways, config, images)
         waiting = {
             f"{workers} loader processes": _waiting(config, model, folder, Path(scratch), workers) for workers in (0, 1)
         }
@@ -173,7 +174,7 @@ def measure(config: BenchTrainConfig, model: str, folder: Path) -> dict[str, Any
         "ways": rates,
         "per_processor_second": {name: _spread(values) for name, values in processor.items()},
         "ratio": _spread(ratios),
-        "muon_share": clock.seconds / config.seconds if MUON in ways else None,
+        "muon_share": clock.seconds / clock.calls * rates[MUON]["median"] / images if MUON in ways else None,
         "waiting": waiting,
         "skipped": skipped,
     }
@@ -183,12 +184,13 @@ class _Clock:
     """Adds up the time of the calls that it wraps."""
 
     def __init__(self) -> None:
-        self.seconds = 0.0
+        self.seconds, self.calls = 0.0, 0
 
     def timed(self, action: Callable[[], object]) -> Callable[[], object]:
         def call() -> object:
             seconds, value = _timed(action)
             self.seconds += seconds
+            self.calls += 1
             return value
 
         return call
