@@ -107,7 +107,8 @@ def test_help_lists_every_command(capsys):
 def test_train_and_evaluate_without_data_or_weights_say_what_to_run(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(weights, "shipped", list)  # as if none travelled with the package
     assert "sdps render-data" in fails(capsys, "train", "--preset", "smoke", "--out", str(tmp_path / "none"))
-    assert "sdps train" in fails(capsys, "eval-merltest", "--preset", "smoke", "--out", str(tmp_path / "none"))
+    asked = ("eval-merltest", "--preset", "smoke", "--out", str(tmp_path / "none"), "--set", "test.shipped=[all]")
+    assert "sdps train" in fails(capsys, *asked)
     assert not (tmp_path / "none" / "merltest").exists()
 
 
