@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.lists import split_list
 from pipelines.memory import apart, peak_gib
-from pipelines.regenerate import split_list
 from pipelines.tables import render_text
 from render import lights as light_sets
 from render.errors import InputError

@@ -17,9 +17,9 @@ import numpy as np
 
 from pipelines import using
 from pipelines.bench_classical import BenchClassicalConfig, scene
+from pipelines.lists import split_list
 from pipelines.machines import hold, kinds, processor
 from pipelines.memory import apart, peak_gib
-from pipelines.regenerate import split_list
 from pipelines.tables import render_text
 from render.errors import InputError
 from render.exchange.images import quantise, write_png

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.bench_classical import BenchClassicalConfig, scene
+from pipelines.lists import split_list
 from pipelines.memory import apart, peak_gib
-from pipelines.regenerate import split_list
 from pipelines.tables import render_text
 from render.errors import InputError, unknown
 from render.files import write_json

@@ -275,7 +275,7 @@ def make_trainer(settings: "TrainingConfig", model: str, folder: Path, scratch: 
     import torch
 
     from sdps.distributed import Team
-    from sdps.stages import create_stage
+    from sdps.stage_factory import create_stage
     from sdps.training import Trainer
 
     return Trainer(create_stage(model, model, settings, {}), folder, scratch, Team(0, 1, torch.device("cpu")))
@@ -289,7 +289,7 @@ def first_batch(config: BenchTrainConfig, model: str, folder: Path) -> "Batch":
     """
     from sdps.dataset import SceneDataset
     from sdps.sources import StoredScenes
-    from sdps.stages import create_stage
+    from sdps.stage_factory import create_stage
 
     options = create_stage(model, model, training(config, model), {}).sample_options()
     source = StoredScenes(SceneDataset(folder, "train", options, cache=False), batch=config.scenes)

@@ -56,7 +56,7 @@ def _about(surface: surfaces.Surface) -> str:
 def _chosen(category: str | None, wanted: list[str] | None) -> list[str]:
     """Return the built-in materials, of one category if given, or the `wanted` names, categories and files."""
     if wanted:
-        from pipelines.regenerate import split_list
+        from pipelines.lists import split_list
 
         if category is not None:
             raise InputError("--category and --materials: give one of them; --materials takes categories too")

@@ -196,7 +196,7 @@ def images_per_second(preset: Preset, name: str) -> float:
     from sdps.inference import default_device
     from sdps.models import registry
     from sdps.precision import arithmetic
-    from sdps.stages import create_stage
+    from sdps.stage_factory import create_stage
 
     run, device = preset.run(name), default_device()
     config = run.config

@@ -14,9 +14,9 @@ import numpy as np
 
 from pipelines import presets, scenes
 from pipelines.evaluation import Evaluation
+from pipelines.lists import split_list
 from pipelines.lit import lit_object
 from pipelines.presets import TestConfig
-from pipelines.regenerate import split_list
 from pipelines.render_data import render_planned
 from pipelines.sections import Section, SectionWriter, Table
 from pipelines.tables import number, render_text

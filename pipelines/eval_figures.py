@@ -14,8 +14,8 @@ from pipelines import presets
 from pipelines.evaluation import Evaluation
 from pipelines.figures import bins, images, lights, materials, pf14
 from pipelines.figures.workbench import Drawn, LeftOut, Workbench
+from pipelines.lists import split_list
 from pipelines.methods import finder
-from pipelines.regenerate import split_list
 from pipelines.sections import Section, SectionWriter, save_picture
 from pipelines.tables import render_text
 from render.config import to_plain

@@ -13,7 +13,7 @@ from pipelines import published_real as published
 from pipelines.benchmarks import choose, gourd_apple, light_stage, suite
 from pipelines.benchmarks.object_tables import object_table
 from pipelines.evaluation import TestObject
-from pipelines.regenerate import split_list
+from pipelines.lists import split_list
 from pipelines.sections import Section, Table
 from pipelines.using import describe
 from render.config import to_plain

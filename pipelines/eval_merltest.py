@@ -16,7 +16,7 @@ import numpy as np
 from pipelines import methods, presets, scenes, using
 from pipelines.evaluation import Evaluation
 from pipelines.lit import lit_object
-from pipelines.merltest_tables import SceneScores, lighting_table, normal_table
+from pipelines.merltest_tables import SceneScores, definition, lighting_table, normal_table
 from pipelines.presets import Preset, TestConfig
 from pipelines.render_data import render_planned
 from pipelines.sections import Table
@@ -78,18 +78,6 @@ def main(args: argparse.Namespace) -> int:
     sys.stdout.write("\n".join(listed))
     sys.stdout.write(f"\n{definition(preset.test)}{networks}\n{page}\n")
     return 0
-
-
-def definition(config: TestConfig) -> str:
-    """Return what the tables' numbers are and what the methods saw."""
-    margin = config.margin_of((config.size, config.size))
-    seen = "whole frame" if margin is None else f"object's box with {margin} pixels of margin"
-    return (
-        "Means over scenes (one per material). Normals: mean angular error in degrees over mask pixels. Directions: "
-        "mean angular error in degrees over images. Intensities: mean relative error after one least-squares scale. "
-        "Inputs: linear half-float radiance times random intensities, multiplied by the mask; networks see the "
-        f"{seen}. In brackets: the paper's figure, of its own rendering of the same materials."
-    )
 
 
 def rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[list[Method], list[Method]]:

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from pipelines.lists import split_list
 from pipelines.methods import finder
 from pipelines.pictures import auto_exposure, error_map, fitted, normal_map, tone_map
 from pipelines.psm_photos import Photos, list_objects, read_lights, read_photos, resolve_source
-from pipelines.regenerate import split_list
 from pipelines.sections import Section, SectionWriter, Table
 from pipelines.tables import render_text
 from render.errors import InputError

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines import eval_merltest
-from pipelines.benchmarks.suite import ERROR_LIMIT, tiles
 from pipelines.evaluation import Evaluation
 from pipelines.lit import lit_object
-from pipelines.merltest_tables import SceneScores
+from pipelines.merltest_tables import SceneScores, definition
+from pipelines.object_pictures import ERROR_LIMIT, tiles
 from pipelines.presets import Preset
 from pipelines.sections import Section, SectionWriter, Table
 from sdps.methods import Runner
@@ -43,7 +42,7 @@ def write(
     repeats = f"{config.repeats} draws of intensities" if config.repeats > 1 else "one draw of intensities"
     text = (
         f"{len(results)} scenes of {config.size}x{config.size} pixels, {len(results[0].scene.lights)} lights, "
-        f"{repeats}. {eval_merltest.definition(config)}{networks} "
+        f"{repeats}. {definition(config)}{networks} "
         f"Error maps run from 0 (black) to {ERROR_LIMIT:g} degrees (yellow)."
     )
     names = [runner.method.name for runner in runners]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines import published
+from pipelines.presets import TestConfig
 from pipelines.sections import Table
 from pipelines.tables import number
 from render.manifest import SceneSpec
@@ -26,6 +27,18 @@ class SceneScores:
 
     scene: SceneSpec
     scores: dict[str, dict[str, float]]
+
+
+def definition(config: TestConfig) -> str:
+    """Return what the tables' numbers are and what the methods saw."""
+    margin = config.margin_of((config.size, config.size))
+    seen = "whole frame" if margin is None else f"object's box with {margin} pixels of margin"
+    return (
+        "Means over scenes (one per material). Normals: mean angular error in degrees over mask pixels. Directions: "
+        "mean angular error in degrees over images. Intensities: mean relative error after one least-squares scale. "
+        "Inputs: linear half-float radiance times random intensities, multiplied by the mask; networks see the "
+        f"{seen}. In brackets: the paper's figure, of its own rendering of the same materials."
+    )
 
 
 def lighting_table(results: Sequence[SceneScores], methods: Sequence[Method], *, all_rows: bool) -> Table:

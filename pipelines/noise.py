@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.regenerate import split_list
+from pipelines.lists import split_list
 from render import lights as light_sets
 from render.chunks import GROUP_SIZE
 from render.errors import InputError

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from pipelines.stream import StreamConfig
+from pipelines.stream_config import StreamConfig
 from render import lights as light_sets
 from render.config import build, read_yaml, to_yaml
 from render.errors import InputError, unknown

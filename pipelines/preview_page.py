@@ -17,7 +17,7 @@ from render.files import read_jsonl, read_text
 from render.manifest import SceneSpec
 
 if TYPE_CHECKING:
-    from pipelines.data_preview import Sample
+    from pipelines.preview_sample import Sample
 
 FAILURES = 12  # shown
 QUALITIES = (85, 70, 50)  # JPEG, the first that fits the budget

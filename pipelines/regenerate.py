@@ -8,6 +8,7 @@ from itertools import groupby
 from pathlib import Path
 
 from pipelines import presets, scenes
+from pipelines.lists import split_list
 from pipelines.render_data import render_planned
 from render.errors import InputError
 from render.manifest import SceneSpec
@@ -64,8 +65,3 @@ def save_for_mitsuba(scenes: Sequence[SceneSpec], folder: Path) -> None:
             for scene in group:
                 mitsuba_scene.save(folder / scene.id, scene, mesh)
                 bar.update()
-
-
-def split_list(values: list[str] | None) -> list[str]:
-    """Flatten a flag that may be repeated and may hold commas."""
-    return [item.strip() for value in values or [] for item in value.split(",") if item.strip()]

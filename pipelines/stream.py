@@ -6,53 +6,21 @@ The trainer's process never loads mitsuba, and the renderer's never loads torch.
 import multiprocessing
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from pipelines.presets import Preset
+from pipelines.render_data import planned_scenes
+from pipelines.stream_config import StreamConfig
 from render import estimate
 from render.errors import InputError
 from render.manifest import MANIFEST, SceneSpec, read_manifest
 from render.stream import StreamOrders, serve
+from render.supervisor import render_supervised
 from sdps.dataset import SampleOptions
+from sdps.distributed import Team
 from sdps.scene_store import StoredScene
+from sdps.stages import Stage
 from sdps.stream import StreamedScenes
-
-if TYPE_CHECKING:
-    from pipelines.presets import Preset
-    from sdps.distributed import Team
-    from sdps.stages import Stage
-
-
-@dataclass(frozen=True, kw_only=True)
-class StreamConfig:
-    """How scenes are rendered while a network trains.
-
-    Attributes:
-        window: Scenes kept in memory, from which batches are drawn; no more than the plan has.
-        fresh: New scenes per batch, above 0; may be below 1.
-        depth: Finished scenes kept ready beside the window; changes nothing but waiting.
-        threads: Threads that render; 0 takes half of the cores and leaves the rest to the trainer.
-        recycle: Scenes after which the process is replaced, since Mitsuba keeps some memory of every scene.
-        timeout: Seconds to wait for a scene before giving up; 0 waits for ever.
-    """
-
-    window: int = 128
-    fresh: float = 1.0
-    depth: int = 4
-    threads: int = 0
-    recycle: int = 500
-    timeout: float = 600.0
-
-    def __post_init__(self) -> None:
-        for name in ("window", "fresh", "depth", "recycle"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"stream.{name} must be positive, got {getattr(self, name)}")
-        for name in ("threads", "timeout"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"stream.{name} must not be negative, got {getattr(self, name)}")
-        if self.fresh > self.window:
-            raise InputError(f"stream.fresh {self.fresh} must not exceed stream.window {self.window}")
 
 
 class RenderStream:
@@ -185,7 +153,7 @@ def open_streamed(
 
 
 def streamed(
-    preset: "Preset", data: Path, stage: "Stage", here: "Team", config: StreamConfig | None = None
+    preset: Preset, data: Path, stage: Stage, here: Team, config: StreamConfig | None = None
 ) -> StreamedScenes:
     """Return the source that renders a preset's training scenes while `stage` learns from them.
 
@@ -215,11 +183,8 @@ def streamed(
     )
 
 
-def _prepare(preset: "Preset", data: Path, *, validate: bool) -> None:
+def _prepare(preset: Preset, data: Path, *, validate: bool) -> None:
     """Write the plan, and render the scenes held out."""
-    from pipelines.render_data import planned_scenes
-    from render.supervisor import render_supervised
-
     scenes = read_manifest(data) if (data / MANIFEST).is_file() else planned_scenes(preset, data)
     held_out = [scene for scene in scenes if scene.split == "val"]
     if validate and held_out:

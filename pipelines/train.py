@@ -77,7 +77,7 @@ def train_run(
     preset: Preset, name: str, data: Path, out: Path, here: "Team", args: argparse.Namespace
 ) -> "TrainingResult":
     """Train one run into its folder, and describe it there with curves and a model card."""
-    from sdps.stages import create_stage
+    from sdps.stage_factory import create_stage
     from sdps.training import train
     from sdps.weights import MODELS_FOLDER
 

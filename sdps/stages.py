@@ -4,7 +4,6 @@ The trainer (`sdps.training`) knows nothing else about them.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -13,7 +12,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from render.errors import InputError
 from render.seeds import derived_seed, generator
 from sdps.checkpoint import TrainedModel
 from sdps.config import LightingTraining, NormalTraining, TrainingConfig
@@ -271,44 +269,3 @@ def crop(tensor: Tensor, corner: Tensor, side: int) -> Tensor:
         return tensor
     corners = corner.tolist()
     return torch.stack([item[..., r : r + side, c : c + side] for item, (r, c) in zip(tensor, corners, strict=True)])
-
-
-def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
-    """Return the stage that trains a run.
-
-    Args:
-        name: Name of the run.
-        model: Name in the registry, or `sdps-joint`.
-        config: The run's configuration, of the model's role.
-        trained: The models it needs, by what they are for: `lighting`, `normals`, and `start` for the weights that
-            training starts from.
-
-    Raises:
-        InputError: a start of another network.
-    """
-    stage = _stage(name, model, config, trained)
-    if "start" in trained:
-        first = trained["start"]
-        try:
-            stage.network.load_state_dict(first.network.state_dict())
-        except RuntimeError as error:
-            raise InputError(f"runs.{name}.start: {first.name!r} has another network; name one of its kind") from error
-    return stage
-
-
-def _stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
-    """Return the stage with random weights."""
-    from sdps.joint import JointStage, SecondStage
-    from sdps.pixel_stage import PixelStage
-    from sdps.recipes import JOINT
-
-    if model == JOINT:
-        return JointStage(config, trained["lighting"], trained["normals"], name=name)
-    role = registry.entry(model).role
-    if role == "lighting":
-        return LightingStage(config, model=model, name=name)
-    if role == "second":
-        return SecondStage(config, trained["lighting"], trained["normals"], model=model, name=name)
-    if role == "pixels":
-        return PixelStage(config, model=model, name=name)
-    return NormalStage(config, trained.get("lighting"), model=model, name=name)

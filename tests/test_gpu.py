@@ -19,7 +19,7 @@ from sdps.inference import Estimator
 from sdps.inference_config import InferenceConfig
 from sdps.methods import Runner, parse
 from sdps.precision import arithmetic
-from sdps.stages import create_stage
+from sdps.stage_factory import create_stage
 from sdps.training import train
 from sdps.weights import require
 

@@ -9,7 +9,7 @@ import yaml
 
 from pipelines import pictures, presets, scenes
 from pipelines.cli import main
-from pipelines.regenerate import split_list
+from pipelines.lists import split_list
 from render.errors import InputError
 from render.manifest import read_manifest
 from render.shards import file_hash, read_shard

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 from pretend_stream import busy, listed, pretend
 
-from pipelines.stream import RenderStream, StreamConfig, open_streamed, streamed
+from pipelines.stream import RenderStream, open_streamed, streamed
+from pipelines.stream_config import StreamConfig
 from render import worker
 from render.errors import InputError
 from render.manifest import SceneSpec, View, write_manifest

@@ -16,7 +16,8 @@ from sdps.estimate import Estimate
 from sdps.inference import Estimator
 from sdps.models.registry import MODELS, TRUE_LIGHTS, create
 from sdps.recipes import JOINT
-from sdps.stages import Stage, create_stage
+from sdps.stage_factory import create_stage
+from sdps.stages import Stage
 
 LIGHTING = [name for name, entry in MODELS.items() if entry.role in ("lighting", "second")]
 NORMALS = [name for name, entry in MODELS.items() if entry.role in ("normals", "pixels")]

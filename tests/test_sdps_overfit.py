@@ -15,7 +15,8 @@ from sdps.checkpoint import TrainedModel
 from sdps.config import JointTraining
 from sdps.dataset import SampleKey, SceneDataset, collate
 from sdps.models.registry import MODELS, create, entry
-from sdps.stages import Stage, create_stage, lighting_options
+from sdps.stage_factory import create_stage
+from sdps.stages import Stage, lighting_options
 from sdps.training import train
 
 COMMON = {

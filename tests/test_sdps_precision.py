@@ -20,7 +20,7 @@ from sdps import precision
 from sdps.checkpoint import load_weights
 from sdps.config import NormalTraining
 from sdps.precision import arithmetic
-from sdps.stages import create_stage
+from sdps.stage_factory import create_stage
 from sdps.training import train
 
 

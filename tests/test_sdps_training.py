@@ -22,7 +22,8 @@ from sdps.config import JointTraining, LightingTraining, NormalTraining
 from sdps.dataset import SampleKey, SceneDataset, collate
 from sdps.joint import JointStage
 from sdps.models.registry import MODELS, create
-from sdps.stages import LightingStage, NormalStage, Stage, create_stage
+from sdps.stage_factory import create_stage
+from sdps.stages import LightingStage, NormalStage, Stage
 from sdps.training import CHECKPOINT, METRICS, TrainingResult, train
 
 TIMES = {"seconds", "images_per_second", "waiting_share"}

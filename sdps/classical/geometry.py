@@ -3,6 +3,9 @@
 import numpy as np
 from scipy import ndimage
 
+MIN_CONDITION = 1e-3
+"""Smallest over largest singular value of the light matrix below which lights count as coplanar."""
+
 
 def unit_normals(vectors: np.ndarray) -> np.ndarray:  # (P, 3)
     """Return vectors (P, 3) at length 1; (0, 0, 1) where one is zero."""

@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 
 from render.errors import InputError
-from sdps.classical.geometry import unit_normals
+from sdps.classical.geometry import MIN_CONDITION, unit_normals
 from sdps.classical.observations import REC601, Observations, observe
+from sdps.classical.weighted import solve_weighted
 from sdps.estimate import Estimate
-
-_MIN_CONDITION = 1e-3
-"""Smallest over largest singular value of the light matrix below which lights count as coplanar."""
 
 _CHUNK_VALUES = 2_000_000
 """Observations solved at a time: 16 MB per float64 array of them, whatever the size of the object."""
@@ -131,7 +129,7 @@ def calibrate(
     if not directions.any(axis=1).all():
         raise InputError("a light direction is (0, 0, 0); give vectors from the surface to the light")
     singular = np.linalg.svd(directions, compute_uv=False)
-    if singular[2] < _MIN_CONDITION * singular[0]:
+    if singular[2] < MIN_CONDITION * singular[0]:
         raise InputError("the light directions are coplanar; three that are not are needed")
     shares = np.array(weights if channels == 3 else (1.0,)) / gains  # (L, C)
     profiles = np.einsum("lpc,lc->pl", observations.values, shares, optimize=True)
@@ -141,42 +139,3 @@ def calibrate(
 def solve_plain(directions: np.ndarray, profiles: np.ndarray) -> np.ndarray:  # (P, 3)
     """Return the least-squares vectors of profiles (P, L) with all observations."""
     return profiles @ np.linalg.pinv(directions).T
-
-
-def normal_equations(
-    basis: np.ndarray, values: np.ndarray, weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:  # (P, 3, 3), (P, 3)
-    """Return A and a of the systems A x = a whose solutions are argmin_x sum_k w_k (v_k - x . b_k)^2, row by row.
-
-    A batch of 3x3 systems instead of a loop over ragged ones; float64, but summed in the precision of the arguments.
-
-    Args:
-        basis: (L, 3), the b_k, the same for all rows.
-        values: (P, L).
-        weights: (P, L), not negative; floating point.
-    """
-    first, second = np.triu_indices(3)  # A is symmetric
-    moments = weights @ (basis[:, first] * basis[:, second])  # (P, 6)
-    matrices = np.empty((len(values), 3, 3))
-    matrices[:, first, second] = matrices[:, second, first] = moments
-    return matrices, ((weights * values) @ basis).astype(np.float64)
-
-
-def solve_weighted(
-    directions: np.ndarray, profiles: np.ndarray, weights: np.ndarray, fallback: np.ndarray
-) -> np.ndarray:  # (P, 3)
-    """Return argmin_b sum_k w_k (i_k - b . l_k)^2 for every pixel, from its normal equations.
-
-    Args:
-        directions: (L, 3).
-        profiles: (P, L).
-        weights: (P, L), not negative.
-        fallback: (P, 3), for pixels where fewer than three observations, or coplanar ones, have weight.
-    """
-    weights = weights.astype(np.float64)
-    matrices, targets = normal_equations(directions, profiles, weights)
-    eigenvalues = np.linalg.eigvalsh(matrices)
-    solvable = ((weights > 0.0).sum(1) >= 3) & (eigenvalues[:, 0] > _MIN_CONDITION**2 * eigenvalues[:, 2])
-    result = fallback.copy()
-    result[solvable] = np.linalg.solve(matrices[solvable], targets[solvable][..., None])[..., 0]
-    return result

@@ -20,9 +20,9 @@ from render.errors import InputError
 from render.progress import progress_bar
 from render.seeds import generator
 from sdps.classical.geometry import outward_gradient
-from sdps.classical.least_squares import normal_equations
 from sdps.classical.observations import observe
 from sdps.classical.profile_lights import CLIP, POWER, fibonacci, find_lights
+from sdps.classical.weighted import normal_equations
 from sdps.estimate import Estimate
 
 _log = logging.getLogger(__name__)

@@ -9,8 +9,9 @@ import logging
 import numpy as np
 
 from render.errors import InputError
-from sdps.classical.least_squares import Calibrated, calibrate, solve_plain, solve_weighted
+from sdps.classical.least_squares import Calibrated, calibrate, solve_plain
 from sdps.classical.rpca import robust_low_rank
+from sdps.classical.weighted import solve_weighted
 from sdps.estimate import Estimate
 
 _log = logging.getLogger(__name__)

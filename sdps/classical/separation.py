@@ -12,7 +12,7 @@ import numpy as np
 from render.progress import progress_bar
 from render.seeds import generator
 from sdps.classical.factorisation import Factors, balanced, column_scale, factorise
-from sdps.classical.least_squares import normal_equations
+from sdps.classical.weighted import normal_equations
 
 _COARSE, _FINE = 0.4, 0.02
 """Tolerance at the start and at the end, over the typical diffuse value of a pixel."""

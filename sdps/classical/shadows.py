@@ -10,7 +10,7 @@ import numpy as np
 
 from render.seeds import generator
 from sdps.classical.factorisation import Factors, balanced
-from sdps.classical.least_squares import solve_weighted
+from sdps.classical.weighted import solve_weighted
 
 _SHADOW = 0.05
 """Share of a pixel's typical lit observation, at the image's exposure, below which one is taken for a shadow."""
