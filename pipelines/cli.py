@@ -4,45 +4,77 @@ import argparse
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
-from render.errors import InputError, unknown
+from render.shared.errors import InputError, unknown
 
-# command: (module, function that adds flags, function that runs, one line of help)
-COMMANDS = {
-    "infer": ("infer", "add_arguments", "main", "find normals, lights and a surface in a folder of photographs"),
-    "doctor": ("doctor", "add_arguments", "main", "show what this machine has and what is missing"),
-    "demo": ("demo", "add_arguments", "main", "render, train, evaluate and regenerate, fitted to this machine"),
-    "render-data": ("render_data", "add_arguments", "main", "render the training scenes of a preset"),
-    "data": ("data", "add_arguments", "main", "plan, check, preview, describe, export and import data folders"),
-    "models": ("models", "add_arguments", "main", "list the learned models"),
-    "train": ("train", "add_arguments", "main", "train models, by default LCNet, then NENet"),
-    "eval-merltest": ("eval_merltest", "add_arguments", "main", "render and score MERL-Test scenes"),
-    "eval-diligent": ("eval_diligent", "add_arguments", "main", "score methods on DiLiGenT's objects, by folder"),
-    "eval-lights": ("eval_lights", "add_arguments", "main", "score lighting on Gourd&Apple or the Light Stage gallery"),
-    "eval-figures": ("eval_figures", "add_arguments", "main", "make the paper's figures on MERL-Test scenes"),
-    "eval-classical": ("eval_classical", "add_arguments", "main", "compare the classical methods on rendered scenes"),
-    "eval-photos": (
-        "eval_photos",
-        "add_arguments",
-        "main",
-        "score uncalibrated methods on real photographs",
+
+class Command(NamedTuple):
+    """A command, loaded only when it is the one that is run.
+
+    Attributes:
+        module: Module below `pipelines`.
+        about: One line of help.
+        declare: Function of the module that adds flags to a parser.
+        run: Function of the module that takes the parsed flags and returns the exit code.
+    """
+
+    module: str
+    about: str
+    declare: str = "add_arguments"
+    run: str = "main"
+
+
+class Group(NamedTuple):
+    """Commands under a common first word."""
+
+    about: str
+    commands: Mapping[str, Command]
+
+
+DATA = Group("plan, check, preview, describe, export and import data folders", {
+    "plan": Command("data.data_plan", "write the manifest of a preset and estimate disk and time"),
+    "status": Command("data.data_status", "tell what is done, failed and left, and at what rate"),
+    "validate": Command("data.data_validate", "check every shard of a folder"),
+    "preview": Command("data.data_preview",
+                       "write contact sheets and a page with light, material and shape statistics"),
+    "card": Command("data.data_card", "write the dataset card and Croissant JSON"),
+    "export": Command("data.data_export", "write the scenes in a layout that other loaders read"),
+    "import": Command("data.data_import", "turn PS-FCN trees and DiLiGenT folders into shards"),
+})  # fmt: skip
+
+COMMANDS: dict[str, Command | Group] = {
+    "infer": Command("infer", "find normals, lights and a surface in a folder of photographs"),
+    "doctor": Command("doctor", "show what this machine has and what is missing"),
+    "demo": Command("demo", "render, train, evaluate and regenerate, fitted to this machine"),
+    "render-data": Command("rendering.render_data", "render the training scenes of a preset"),
+    "data": DATA,
+    "models": Command("train.list_models", "list the learned models"),
+    "train": Command("train.train", "train models, by default LCNet, then NENet"),
+    "eval-merltest": Command("evaluate.eval_merltest", "render and score MERL-Test scenes"),
+    "eval-diligent": Command("benchmarks.eval_diligent", "score methods on DiLiGenT's objects, by folder"),
+    "eval-lights": Command("benchmarks.eval_lights", "score lighting on Gourd&Apple or the Light Stage gallery"),
+    "eval-figures": Command("evaluate.figures.eval_figures", "make the paper's figures on MERL-Test scenes"),
+    "eval-classical": Command("evaluate.eval_classical", "compare the classical methods on rendered scenes"),
+    "eval-photos": Command("benchmarks.eval_photos", "score uncalibrated methods on real photographs"),
+    "curves": Command("train.compare_curves", "draw learning curves of runs, and where they are heading"),
+    "ship": Command("train.ship", "copy trained weights to where commands find them without being told"),
+    "shipped-results": Command("evaluate.shipped_results", "write down how good the pretrained weights are"),
+    "report": Command("report.page", "collect everything evaluated into one page"),
+    "regenerate": Command("rendering.regenerate", "render test scenes of chosen shapes and materials"),
+    "fit-material": Command("rendering.fit_material", "fit the built-in model to a MERL .binary table"),
+    "materials": Command(
+        "rendering.catalogue", "list the built-in materials", "add_material_arguments", "materials_main"
     ),
-    "curves": ("curves", "add_arguments", "main", "draw learning curves of runs, and where they are heading"),
-    "ship": ("ship", "add_arguments", "main", "copy trained weights to where commands find them without being told"),
-    "shipped-results": ("shipped_results", "add_arguments", "main", "write down how good the shipped weights are"),
-    "report": ("report", "add_arguments", "main", "collect everything evaluated into one page"),
-    "regenerate": ("regenerate", "add_arguments", "main", "render test scenes of chosen shapes and materials"),
-    "fit-material": ("fit_material", "add_arguments", "main", "fit the built-in model to a MERL .binary table"),
-    "materials": ("catalogue", "add_material_arguments", "materials_main", "list the built-in materials"),
-    "shapes": ("catalogue", "add_shape_arguments", "shapes_main", "list the shape families"),
-    "noise": ("noise", "add_arguments", "main", "measure the renderer's noise against converged images"),
-    "bench-train": ("bench_train", "add_arguments", "main", "measure training against a plain float32 loop"),
-    "bench-classical": ("bench_classical", "add_arguments", "main", "time the classical methods on a large object"),
-    "bench-checks": ("bench_checks", "add_arguments", "main", "count false alarms and hits of the photograph checks"),
-    "bench-infer": ("bench_infer", "add_arguments", "main", "time sdps infer on photographs of a large object"),
-    "bench-surface": ("bench_surface", "add_arguments", "main", "score and time depth, meshes and relit pictures"),
-    "bench": ("bench", "add_arguments", "main", "measure the renderer against Mitsuba's path integrator"),
+    "shapes": Command("rendering.catalogue", "list the shape families", "add_shape_arguments", "shapes_main"),
+    "noise": Command("rendering.image_noise", "measure the renderer's noise against converged images"),
+    "bench-train": Command("bench.bench_train", "measure training against a plain float32 loop"),
+    "bench-classical": Command("bench.bench_classical", "time the classical methods on a large object"),
+    "bench-checks": Command("bench.bench_checks", "count false alarms and hits of the photograph checks"),
+    "bench-infer": Command("bench.bench_infer", "time sdps infer on photographs of a large object"),
+    "bench-surface": Command("bench.bench_surface", "score and time depth, meshes and relit pictures"),
+    "bench": Command("bench.bench", "measure the renderer against Mitsuba's path integrator"),
 }
 
 
@@ -53,30 +85,60 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message}; see `{self.prog} --help`")
 
 
-def build_parser(command: str | None) -> argparse.ArgumentParser:
-    """Return the parser; only the flags of `command` are declared, so that others' modules are not loaded."""
+def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser; only the flags of the command that `words` name are declared, so that one module is loaded.
+
+    Args:
+        words: What was typed, without the flags.
+
+    Raises:
+        InputError: an unknown command, with the nearest.
+    """
     parser = _Parser(prog="sdps", description="Photometric-stereo data and training (SDPS-Net) with Mitsuba 3.")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
-    for name, (module, declare, run, about) in COMMANDS.items():
-        child = commands.add_parser(name, help=about, description=about[0].upper() + about[1:] + ".")
-        if name == command:
-            loaded = importlib.import_module(f"pipelines.{module}")
-            getattr(loaded, declare)(child)
-            child.set_defaults(run=getattr(loaded, run))
+    parser.add_argument("--version", action="store_true", help="print the version and exit")
+    _add_commands(parser, COMMANDS, words, "command")
     return parser
+
+
+def _add_commands(
+    parser: argparse.ArgumentParser, commands: Mapping[str, Command | Group], words: Sequence[str], kind: str
+) -> None:
+    """Declare the commands of one level, and what follows the one that was typed."""
+    wanted = words[0] if words else None
+    if wanted is not None and wanted not in commands:
+        raise unknown(kind, wanted, commands)
+    parser.set_defaults(run=lambda args: parser.print_help() or 0)
+    children = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
+    for name, command in commands.items():
+        about = command.about
+        child = children.add_parser(name, help=about, description=about[0].upper() + about[1:] + ".")
+        if name != wanted:
+            continue
+        if isinstance(command, Group):
+            _add_commands(child, command.commands, words[1:], f"{name} command")
+        else:
+            module = importlib.import_module(f"pipelines.{command.module}")
+            getattr(module, command.declare)(child)
+            child.set_defaults(run=getattr(module, command.run))
+
+
+def version() -> str:
+    """Return the installed version, `unknown` where the package is not installed."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("sdps")
+    except metadata.PackageNotFoundError:
+        return "unknown"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0 done, 1 something is missing, 2 bad input, 130 stopped."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    command = next((word for word in argv if not word.startswith("-")), None)
     try:
-        if command is not None and command not in COMMANDS:
-            raise unknown("command", command, COMMANDS)
-        parser = build_parser(command)
-        args = parser.parse_args(argv)
-        if args.command is None:
-            parser.print_help()
+        args = build_parser([word for word in argv if not word.startswith("-")]).parse_args(argv)
+        if args.version:
+            sys.stdout.write(f"sdps {version()}\n")
             return 0
         return args.run(args)
     except InputError as error:

@@ -12,11 +12,11 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from pipelines import presets
-from pipelines.presets import Preset
-from render.config import build, to_plain
-from render.errors import InputError
-from render.files import read_text, write_json
+from pipelines.shared import presets
+from pipelines.shared.presets import Preset
+from render.shared.config import build, to_plain
+from render.shared.errors import InputError
+from render.shared.files import read_text, write_json
 
 PLAN = "plan.json"
 _TIMED_STEPS = 3
@@ -162,8 +162,8 @@ def planned(preset: Preset, out: Path) -> Plan:
 
 def make_plan(preset: Preset, rates: dict[str, float]) -> Plan:
     """Return the plan for a machine that trains so many images per second, by run."""
-    from sdps.inference import default_device
-    from sdps.precision import arithmetic
+    from sdps.core.precision import arithmetic
+    from sdps.inference.estimator import default_device
 
     minutes = {
         name: round(min(max(need.images / rates[name] / 60.0, need.least), need.most), 1)
@@ -191,12 +191,12 @@ def images_per_second(preset: Preset, name: str) -> float:
     import torch
     from torch.nn import functional
 
-    from sdps.checkpoint import TrainedModel
-    from sdps.dataset import Batch
-    from sdps.inference import default_device
+    from sdps.core.precision import arithmetic
+    from sdps.data.dataset import Batch
+    from sdps.inference.estimator import default_device
     from sdps.models import registry
-    from sdps.precision import arithmetic
-    from sdps.stage_factory import create_stage
+    from sdps.models.checkpoint import TrainedModel
+    from sdps.training.stage_factory import create_stage
 
     run, device = preset.run(name), default_device()
     config = run.config

@@ -9,9 +9,9 @@ import shutil
 import sys
 from pathlib import Path
 
-from render import llvm, variant
-from render.errors import InputError
+from render.backend import llvm, variant
 from render.shapes.primitives import bunny
+from render.shared.errors import InputError
 
 PACKAGES = ("mitsuba", "drjit", "torch", "numpy", "scipy", "trimesh", "OpenEXR", "scikit-image", "safetensors")
 LOW_DISK_GB = 5.0
@@ -102,8 +102,8 @@ def _variant_lines(problems: list[str]) -> list[tuple[str, str]]:
 
 def _arithmetic() -> str:
     """Say what networks compute in on this machine, and why."""
-    from sdps.inference import default_device
-    from sdps.precision import arithmetic
+    from sdps.core.precision import arithmetic
+    from sdps.inference.estimator import default_device
 
     return arithmetic("auto", default_device()).describe()
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines import pictures, report, using
-from pipelines.sections import Section, SectionWriter, Table
-from render.errors import InputError
+from pipelines.report import page as report
+from pipelines.report.sections import Section, SectionWriter, Table
+from pipelines.shared import pictures, using
+from render.shared.errors import InputError
 
 if TYPE_CHECKING:
     from sdps.api import Inference
@@ -44,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Check the photographs, run the method, write the results; with `--self-test` on photographs made for it."""
     if args.self_test:
-        from pipelines.self_test import photograph_bunny
+        from pipelines.evaluate.self_test import photograph_bunny
 
         args.folder = photograph_bunny(args.out / "photographs")
     if args.folder is None:
@@ -53,7 +54,7 @@ def main(args: argparse.Namespace) -> int:
     made = result.save(args.out)
     page = write_page(args.out / "report.html", result)
     if args.self_test:
-        from pipelines.self_test import compare
+        from pipelines.evaluate.self_test import compare
 
         sys.stdout.write(compare(args.folder, result, args.out))
     sys.stdout.write(f"{result.method}: {result.seconds:.1f} s; {', '.join(path.name for path in made)}\n{page}\n")
@@ -63,7 +64,7 @@ def main(args: argparse.Namespace) -> int:
 def infer_folder(args: argparse.Namespace) -> "Inference":
     """Read the photographs, say what was found about them, and run the method."""
     from sdps.api import check_out, infer, load
-    from sdps.inference_config import inference_config
+    from sdps.inference.inference_config import inference_config
     from sdps.photos import check
 
     config = inference_config(args)

@@ -1,4 +1,4 @@
 """Physically based rendering of photometric-stereo scenes with Mitsuba 3.
 
-Importing this package loads neither mitsuba nor torch; `render.variant.load` does when first needed.
+Importing this package loads neither mitsuba nor torch; `render.backend.variant.load` does when first needed.
 """

@@ -24,20 +24,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from render.errors import InputError
-from render.exchange.images import quantise, write_png
-from render.files import atomic_path, write_json
-from render.shards import write_exr
-from sdps import weights
+from render.records.shards import write_exr
+from render.shared.errors import InputError
+from render.shared.files import atomic_path, write_json
+from render.shared.images import quantise, write_png
 from sdps.classical import registry as classical
-from sdps.estimate import Estimate
-from sdps.inference_config import InferenceConfig
-from sdps.methods import Runner, parse
+from sdps.core.estimate import Estimate
+from sdps.inference.inference_config import InferenceConfig
+from sdps.methods import pretrained
+from sdps.methods.parse import parse
+from sdps.methods.runner import Runner
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load, write_lights
-from sdps.photos.curves import display
+from sdps.photos.response import display
 from sdps.surface.integration import Depth, integrate
-from sdps.surface.mesh import mesh, write_mesh
+from sdps.surface.meshing import mesh, write_mesh
 from sdps.surface.relight import Residuals, fit_albedo, relit, residuals
 
 __all__ = ["Inference", "infer", "load"]
@@ -240,7 +241,7 @@ def infer(
     grave = next((finding for finding in findings if finding.level == "error"), None)
     if grave is not None:
         raise InputError(f"{photos.folder}: {grave.text}")
-    find = partial(weights.require, out=None if models is None else Path(models))
+    find = partial(pretrained.require, out=None if models is None else Path(models))
     chosen = _automatic(photos, find) if method == AUTO else method
     runner = Runner(_told(chosen, photos, find), find, config)
     began = time.perf_counter()

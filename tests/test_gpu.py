@@ -11,17 +11,18 @@ import pytest
 import torch
 from sdps_scenes import hemisphere_lights, shade, sphere_normals, write_data
 
-from render.manifest import read_manifest
-from render.shards import read_shard
-from render.variant import has_cuda_driver, works
-from sdps.config import LightingTraining, NormalTraining
-from sdps.inference import Estimator
-from sdps.inference_config import InferenceConfig
-from sdps.methods import Runner, parse
-from sdps.precision import arithmetic
-from sdps.stage_factory import create_stage
-from sdps.training import train
-from sdps.weights import require
+from render.backend.variant import has_cuda_driver, works
+from render.records.manifest import read_manifest
+from render.records.shards import read_shard
+from sdps.core.precision import arithmetic
+from sdps.inference.estimator import Estimator
+from sdps.inference.inference_config import InferenceConfig
+from sdps.methods.parse import parse
+from sdps.methods.pretrained import require
+from sdps.methods.runner import Runner
+from sdps.training.stage_factory import create_stage
+from sdps.training.trainer import train
+from sdps.training.training_config import LightingTraining, NormalTraining
 
 pytestmark = pytest.mark.gpu
 needs_torch = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.benchmarks.stacks import MARGIN, Stack, files_digest
-from pipelines.evaluation import TestObject
-from render.errors import InputError
-from render.exchange.diligent import diligent_sources
-from render.exchange.images import bit_depth, read_image, to_unit
+from pipelines.evaluate.evaluation import TestObject
+from render.exchange.foreign_samples import Source
 from render.exchange.ingest import crop_box
-from render.exchange.sources import Source
+from render.exchange.read_diligent import diligent_sources
+from render.shared.errors import InputError
+from render.shared.images import bit_depth, read_image, to_unit
 
 OBJECTS = ("ball", "cat", "pot1", "bear", "pot2", "buddha", "goblet", "reading", "cow", "harvest")
 """In the order of the published tables."""

@@ -7,9 +7,9 @@ while they fitted the objects, are what published results compare with.
 from pathlib import Path
 
 from pipelines.benchmarks import lit_photographs as common
-from pipelines.evaluation import TestObject
-from render.errors import InputError
-from render.exchange.tables import read_names
+from pipelines.evaluate.evaluation import TestObject
+from render.shared.errors import InputError
+from render.shared.tables import read_names
 
 OBJECTS = ("apple", "gourd1", "gourd2")
 WANT = "give the folder of apple, gourd1 and gourd2, or one of them; see docs/benchmarks.md"

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.benchmarks import lit_photographs as common
-from pipelines.evaluation import TestObject
-from render.errors import InputError
-from render.exchange.images import read_image
+from pipelines.evaluate.evaluation import TestObject
+from render.shared.errors import InputError
+from render.shared.images import read_image
 
 _log = logging.getLogger(__name__)
 

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.benchmarks.stacks import MARGIN, Stack, files_digest
-from pipelines.evaluation import TestObject
-from render.errors import InputError
-from render.exchange.images import read_image, to_unit
+from pipelines.evaluate.evaluation import TestObject
 from render.exchange.ingest import crop_box
-from render.exchange.tables import natural_key, read_names, read_numbers
-from render.files import read_text
-from sdps.photos.pictures import decode
+from render.shared.errors import InputError
+from render.shared.files import read_text
+from render.shared.images import read_image, to_unit
+from render.shared.tables import natural_key, read_names, read_numbers
+from sdps.photos.picture_file import decode
 
 
 def object_folders(root: Path, pattern: str, want: str) -> list[Path]:

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipelines.evaluation import Result
-from pipelines.published_real import PublishedRow
-from pipelines.sections import Table
+from pipelines.benchmarks.published_real import PublishedRow
+from pipelines.evaluate.evaluation import Result
+from pipelines.report.sections import Table
 
 OURS = "ours"
 REFUSED = "refused"

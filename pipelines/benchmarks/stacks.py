@@ -9,9 +9,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from render.errors import InputError
 from render.exchange.ingest import Box
-from render.files import read_bytes
+from render.shared.errors import InputError
+from render.shared.files import read_bytes
 
 MARGIN = 15
 """Pixels kept around the mask's bounding box, as the published results do (SDPS-Net's preparation of DiLiGenT)."""
@@ -22,7 +22,7 @@ _KEPT_BYTES = 2**30
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Linear images, an `sdps.image_source.ImageSource`.
+    """Linear images, an `sdps.inference.image_source.ImageSource`.
 
     Attributes:
         read: Reads image number k whole, (H, W, 3) float32 linear radiance; raises InputError.

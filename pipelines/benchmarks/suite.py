@@ -6,18 +6,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pipelines import using
-from pipelines.benchmarks import choose
-from pipelines.evaluation import Evaluation, TestObject
-from pipelines.methods import finder
-from pipelines.object_pictures import Found, tiles
-from pipelines.sections import Section, SectionWriter, Table
-from pipelines.tables import render_text
-from render.errors import unknown
-from render.files import write_json
-from render.progress import progress_bar
-from sdps.inference_config import InferenceConfig
-from sdps.methods import Method, Runner
+from pipelines.evaluate.evaluation import Evaluation, TestObject
+from pipelines.evaluate.object_pictures import Found, tiles
+from pipelines.report.sections import Section, SectionWriter, Table
+from pipelines.shared import using
+from pipelines.shared.text_tables import render_text
+from render.shared.errors import unknown
+from render.shared.files import write_json
+from render.shared.progress import progress_bar
+from sdps.inference.inference_config import InferenceConfig
+from sdps.methods import select
+from sdps.methods.method import Method
+from sdps.methods.pretrained import finder
+from sdps.methods.runner import Runner
 
 
 def run(
@@ -141,6 +142,6 @@ def pick(items: list[TestObject], names: Sequence[str]) -> list[TestObject]:
 
 def pictured(chosen: Sequence[Method]) -> list[str]:
     """Return the names of the methods to show, and of the first lighting model."""
-    names = choose.shown(list(chosen))
+    names = select.shown(list(chosen))
     lights = [method.name for method in chosen if method.lights and not method.normals][:1]
     return names or lights

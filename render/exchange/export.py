@@ -10,15 +10,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from render.errors import InputError, unknown
 from render.exchange.folders import MARKER, RECORD, claim, read_record
 from render.exchange.layouts import LAYOUTS, Layout
 from render.exchange.names import Place
 from render.exchange.samples import ExportOptions, prepare
-from render.files import atomic_folder, write_json
-from render.manifest import MANIFEST, SceneSpec, read_manifest
-from render.progress import progress_bar
-from render.shards import file_hash, read_shard
+from render.records.manifest import MANIFEST, SceneSpec, read_manifest
+from render.records.shards import file_hash, read_shard
+from render.shared.errors import InputError, unknown
+from render.shared.files import atomic_folder, write_json
+from render.shared.progress import progress_bar
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from render.errors import InputError
-from render.files import read_text, write_json
+from render.shared.errors import InputError
+from render.shared.files import read_text, write_json
 
 RECORD = "export.json"
 MARKER = "scene.json"

@@ -12,18 +12,18 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from render.config import to_plain
-from render.errors import InputError, unknown
 from render.exchange import frame
-from render.exchange.diligent import diligent_sources
 from render.exchange.folders import read_record
+from render.exchange.foreign_samples import Source, Truth
 from render.exchange.names import legal_name, unique_names
-from render.exchange.psfcn import psfcn_sources
-from render.exchange.sources import Source, Truth
-from render.files import write_json
-from render.manifest import MANIFEST, SceneSpec, View, read_manifest, write_manifest
-from render.progress import progress_bar
-from render.shards import Shard, is_whole, to_half, write_shard
+from render.exchange.read_diligent import diligent_sources
+from render.exchange.read_psfcn import psfcn_sources
+from render.records.manifest import MANIFEST, SceneSpec, View, read_manifest, write_manifest
+from render.records.shards import Shard, is_whole, to_half, write_shard
+from render.shared.config import to_plain
+from render.shared.errors import InputError, unknown
+from render.shared.files import write_json
+from render.shared.progress import progress_bar
 
 RECORD = "import.json"
 READERS: Mapping[str, Callable[[Path], list[Source]]] = {"psfcn": psfcn_sources, "diligent": diligent_sources}

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from scipy.io import savemat
 
-from render.errors import InputError
-from render.exchange.images import encode_normals, read_image, write_png
 from render.exchange.names import Place, object_places, view_places
-from render.exchange.tables import format_rows, lines_text
-from render.files import atomic_path, write_text
-from render.manifest import SceneSpec
+from render.records.manifest import SceneSpec
+from render.shared.errors import InputError
+from render.shared.files import atomic_path, write_text
+from render.shared.images import encode_normals, read_image, write_png
+from render.shared.tables import format_rows, lines_text
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.errors import InputError
-from render.exchange.diligent import diligent_sources
 from render.exchange.folders import MARKER, read_record
-from render.exchange.images import MASK_THRESHOLD, bit_depth, decode_normals, read_image, to_unit
-from render.exchange.psfcn import psfcn_sources
-from render.exchange.sources import Source
-from render.exchange.tables import check_directions, natural_key, read_names, read_numbers
+from render.exchange.foreign_samples import Source
+from render.exchange.read_diligent import diligent_sources
+from render.exchange.read_psfcn import psfcn_sources
+from render.shared.errors import InputError
+from render.shared.images import MASK_THRESHOLD, bit_depth, decode_normals, read_image, to_unit
+from render.shared.tables import check_directions, natural_key, read_names, read_numbers
 
 _LENGTH_TOLERANCE = 0.03  # 8-bit normals deviate from unit length by at most sqrt(3) / 255 = 0.007
 

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from render.manifest import SceneSpec
+from render.records.manifest import SceneSpec
 
 _LONGEST = 80
 _MATERIAL_FILES = r"\.(ya?ml|binary|bsdf)(?=\+|$)"

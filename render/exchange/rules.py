@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from render.errors import InputError, unknown
 from render.exchange import frame
 from render.exchange.folders import MARKER, read_record
 from render.exchange.layouts import LAYOUTS
 from render.exchange.loaders import SAMPLES, Note, Pictures, Samples
-from render.manifest import SceneSpec, read_manifest
-from render.progress import progress_bar
-from render.shards import read_shard
+from render.records.manifest import SceneSpec, read_manifest
+from render.records.shards import read_shard
+from render.shared.errors import InputError, unknown
+from render.shared.progress import progress_bar
 
 _ANGLE_TOLERANCE = 0.6  # degrees; the greatest error of rounding to 8 bits is 0.39
 

@@ -5,12 +5,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from render.errors import InputError, unknown
-from render.exchange.images import quantise
 from render.exchange.layouts import LAYOUTS, Sample
-from render.manifest import SceneSpec
-from render.seeds import generator
-from render.shards import Shard
+from render.records.manifest import SceneSpec
+from render.records.shards import Shard
+from render.shared.errors import InputError, unknown
+from render.shared.images import quantise
+from render.shared.seeds import generator
 
 INTENSITY_RANGE = (0.2, 2.0)
 """Range of random intensities (SDPS-Net, section 5.1)."""

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import yaml
 
-from render import config
-from render.errors import InputError, unknown
 from render.materials import merl
 from render.materials.merl import MerlTable
 from render.materials.model import Material, directional_albedo, lambertian
+from render.shared import config
+from render.shared.errors import InputError, unknown
 
 if TYPE_CHECKING:
     from render.materials.rgl import RglMaterial

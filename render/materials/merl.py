@@ -10,7 +10,7 @@ endian, with an entry at `phi_d + 180 (theta_d + 90 theta_h)` in the half and di
 The reader of the database looks entries up by this truncation, so an entry stands for its whole cell, and here for the
 cell's centre: what `evaluate` interpolates equals the looked-up entry there. phi_d is periodic. It is undefined where
 theta_h or theta_d is zero, where a BRDF cannot depend on it: there the value is the mean over phi_d of the first cells.
-`render.materials.merl_bsdf` evaluates the same knots in a kernel.
+`render.materials.kernels.merl_bsdf` evaluates the same knots in a kernel.
 """
 
 import os
@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from render.errors import InputError
-from render.files import atomic_path
+from render.shared.errors import InputError
+from render.shared.files import atomic_path
 
 SHAPE = (90, 90, 180)  # cells of theta_h, theta_d, phi_d
 SCALES = np.array([1.0, 1.15, 1.66]) / 1500  # of the red, green and blue plane, into 1/sr

@@ -7,14 +7,14 @@ Every material, from Lambertian to chrome, has the same parametric form, per col
 with the half and difference angles of Rusinkiewicz (1998) and e = cos^2 phi_d, the only azimuthal dependence that a
 reciprocal, mirror-symmetric isotropic BRDF has to first order. T is the bivariate BRDF of Romeiro et al. (2008), S the
 shadowing-like factor of the non-parametric microfacet model of Bagher et al. (2016), A a coarse correction.
-This module is the slow, plain numpy form; `render.materials.bsdf` evaluates the same tables in a kernel.
+This module is the slow, plain numpy form; `render.materials.kernels.bsdf` evaluates the same tables in a kernel.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from render.errors import InputError
+from render.shared.errors import InputError
 
 VERSION = 1
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear RGB, ITU-R BT.709

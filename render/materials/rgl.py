@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from render.errors import InputError
-from render.files import atomic_path, read_bytes
 from render.materials import model
+from render.shared.errors import InputError
+from render.shared.files import atomic_path, read_bytes
 
 _MAGIC = b"tensor_file\0"
 _VERSION = (1, 0)

@@ -8,8 +8,8 @@ object, so the pattern turns with the object and takes part in interreflections.
 from dataclasses import dataclass
 from typing import Any
 
-from render.errors import InputError, unknown
 from render.materials import library
+from render.shared.errors import InputError, unknown
 
 PATTERNS = {
     "patches": "cells around random points, sharp edges",

@@ -11,12 +11,12 @@ from functools import cache
 import numpy as np
 import trimesh
 
-from render import seeds
-from render.shapes import sdf
-from render.shapes.mesh import TriangleMesh, unit
-from render.shapes.noise import scalar_waves, vector_waves
-from render.shapes.polygonise import polygonise
-from render.shapes.sdf import Field
+from render.shapes.geometry import sdf
+from render.shapes.geometry.mesh import TriangleMesh, unit
+from render.shapes.geometry.noise import scalar_waves, vector_waves
+from render.shapes.geometry.polygonise import polygonise
+from render.shapes.geometry.sdf import Field
+from render.shared import seeds
 
 SUBDIVISIONS = 6  # 81,920 triangles, their edges 2.4 px long where the blob fills 256 px
 FLOW_STEPS = 6

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from render.errors import InputError
-from render.files import atomic_path, cache_folder
-from render.shapes.mesh import TriangleMesh, load_mesh, unit
+from render.shapes.geometry.mesh import TriangleMesh, load_mesh, unit
+from render.shared.errors import InputError
+from render.shared.files import atomic_path, cache_folder
 
 BUNNY_WHEEL = "pymeshfix==0.18.1"
 BUNNY_MEMBER = "pymeshfix/examples/StanfordBunny.ply"

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import trimesh
 
-from render.errors import InputError, unknown
-from render.shapes import blobby, primitives, sculpture
-from render.shapes.mesh import TriangleMesh, load_mesh
+from render.shapes import blobby, primitives
+from render.shapes.geometry.mesh import TriangleMesh, load_mesh
+from render.shapes.sculpture import family as sculpture
+from render.shared.errors import InputError, unknown
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Methods without learning, one file each; all return a `sdps.estimate.Estimate`."""
+"""Methods without learning, one file each; all return a `sdps.core.estimate.Estimate`."""

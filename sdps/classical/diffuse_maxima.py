@@ -20,13 +20,13 @@ import numpy as np
 from scipy import ndimage
 from skimage.morphology import local_maxima
 
-from render.errors import InputError
-from render.progress import progress_bar
-from render.seeds import generator
-from sdps.classical.factorisation import Factors
-from sdps.classical.front_end import Front, conclude, prepare
-from sdps.classical.gbr import Gbr
-from sdps.estimate import Estimate
+from render.shared.errors import InputError
+from render.shared.progress import progress_bar
+from render.shared.seeds import generator
+from sdps.classical.common.factorisation import Factors
+from sdps.classical.common.front_end import Front, conclude, prepare
+from sdps.classical.common.gbr import Gbr
+from sdps.core.estimate import Estimate
 
 _log = logging.getLogger(__name__)
 

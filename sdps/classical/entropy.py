@@ -9,12 +9,12 @@ import logging
 import numpy as np
 from scipy import ndimage
 
-from render.errors import InputError
-from render.seeds import generator
-from sdps.classical.factorisation import Factors
-from sdps.classical.front_end import Front, conclude, prepare
-from sdps.classical.gbr import Gbr
-from sdps.estimate import Estimate
+from render.shared.errors import InputError
+from render.shared.seeds import generator
+from sdps.classical.common.factorisation import Factors
+from sdps.classical.common.front_end import Front, conclude, prepare
+from sdps.classical.common.gbr import Gbr
+from sdps.core.estimate import Estimate
 
 _log = logging.getLogger(__name__)
 

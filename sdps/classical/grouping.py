@@ -9,12 +9,12 @@ import logging
 import numpy as np
 from scipy.cluster.vq import kmeans2, vq
 
-from render.errors import InputError
-from render.seeds import generator
+from render.shared.errors import InputError
+from render.shared.seeds import generator
+from sdps.classical.common.front_end import Front, Prepared, conclude, prepare
+from sdps.classical.common.gbr import Gbr
 from sdps.classical.entropy import standard_form
-from sdps.classical.front_end import Front, Prepared, conclude, prepare
-from sdps.classical.gbr import Gbr
-from sdps.estimate import Estimate
+from sdps.core.estimate import Estimate
 
 _log = logging.getLogger(__name__)
 

@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 from scipy import spatial
 
-from render.errors import InputError
-from render.progress import progress_bar
-from render.seeds import generator
-from sdps.classical.bas_relief_search import minimise_over_bas_reliefs
-from sdps.classical.front_end import Prepared, conclude, prepare
-from sdps.classical.gbr import Gbr
-from sdps.classical.isotropy import asymmetries, asymmetry, azimuths, intensity_corrections, log_values
+from render.shared.errors import InputError
+from render.shared.progress import progress_bar
+from render.shared.seeds import generator
+from sdps.classical.common.bas_relief_search import minimise_over_bas_reliefs
+from sdps.classical.common.front_end import Prepared, conclude, prepare
+from sdps.classical.common.gbr import Gbr
+from sdps.classical.common.isotropy import asymmetries, asymmetry, azimuths, intensity_corrections, log_values
+from sdps.classical.common.observations import MEAN, Observations
+from sdps.classical.common.separation import diffuse_surface
 from sdps.classical.least_squares import calibrate
-from sdps.classical.observations import MEAN, Observations
 from sdps.classical.plain import equal_intensity
-from sdps.classical.separation import diffuse_surface
-from sdps.estimate import Estimate
+from sdps.core.estimate import Estimate
 
 _log = logging.getLogger(__name__)
 

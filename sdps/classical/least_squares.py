@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from render.errors import InputError
-from sdps.classical.geometry import MIN_CONDITION, unit_normals
-from sdps.classical.observations import REC601, Observations, observe
-from sdps.classical.weighted import solve_weighted
-from sdps.estimate import Estimate
+from render.shared.errors import InputError
+from sdps.classical.common.geometry import MIN_CONDITION, unit_normals
+from sdps.classical.common.observations import REC601, Observations, observe
+from sdps.classical.common.weighted import solve_weighted
+from sdps.core.estimate import Estimate
 
 _CHUNK_VALUES = 2_000_000
 """Observations solved at a time: 16 MB per float64 array of them, whatever the size of the object."""

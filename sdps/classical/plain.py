@@ -3,10 +3,10 @@
 import numpy as np
 from scipy import optimize
 
-from sdps.classical.factorisation import Factors
-from sdps.classical.front_end import Front, conclude, prepare
-from sdps.classical.gbr import Gbr
-from sdps.estimate import Estimate
+from sdps.classical.common.factorisation import Factors
+from sdps.classical.common.front_end import Front, conclude, prepare
+from sdps.classical.common.gbr import Gbr
+from sdps.core.estimate import Estimate
 
 
 def factorisation(images: np.ndarray, mask: np.ndarray, *, front: Front = "low-rank") -> Estimate:

@@ -16,14 +16,14 @@ import numpy as np
 from scipy import ndimage
 from scipy.sparse import csgraph, csr_matrix, linalg
 
-from render.errors import InputError
-from render.progress import progress_bar
-from render.seeds import generator
-from sdps.classical.geometry import outward_gradient
-from sdps.classical.observations import observe
+from render.shared.errors import InputError
+from render.shared.progress import progress_bar
+from render.shared.seeds import generator
+from sdps.classical.common.geometry import outward_gradient
+from sdps.classical.common.observations import observe
+from sdps.classical.common.weighted import normal_equations
 from sdps.classical.profile_lights import CLIP, POWER, fibonacci, find_lights
-from sdps.classical.weighted import normal_equations
-from sdps.estimate import Estimate
+from sdps.core.estimate import Estimate
 
 _log = logging.getLogger(__name__)
 

@@ -13,14 +13,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from render.errors import InputError
-from render.seeds import generator
-from sdps.classical.bas_relief_search import minimise_over_bas_reliefs
-from sdps.classical.front_end import Front, Prepared, conclude, prepare
-from sdps.classical.gbr import Gbr
-from sdps.classical.isotropy import half_vectors
+from render.shared.errors import InputError
+from render.shared.seeds import generator
+from sdps.classical.common.bas_relief_search import minimise_over_bas_reliefs
+from sdps.classical.common.front_end import Front, Prepared, conclude, prepare
+from sdps.classical.common.gbr import Gbr
+from sdps.classical.common.isotropy import half_vectors
 from sdps.classical.plain import equal_intensity
-from sdps.estimate import Estimate
+from sdps.core.estimate import Estimate
 
 _log = logging.getLogger(__name__)
 

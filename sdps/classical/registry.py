@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from render.errors import InputError, unknown
-from sdps.estimate import Estimate
+from render.shared.errors import InputError, unknown
+from sdps.core.estimate import Estimate
 
 
 @dataclass(frozen=True, kw_only=True)

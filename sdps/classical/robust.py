@@ -8,11 +8,11 @@ import logging
 
 import numpy as np
 
-from render.errors import InputError
+from render.shared.errors import InputError
+from sdps.classical.common.rpca import robust_low_rank
+from sdps.classical.common.weighted import solve_weighted
 from sdps.classical.least_squares import Calibrated, calibrate, solve_plain
-from sdps.classical.rpca import robust_low_rank
-from sdps.classical.weighted import solve_weighted
-from sdps.estimate import Estimate
+from sdps.core.estimate import Estimate
 
 _log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from sdps.lighting import LightClasses, ReadOut
+from sdps.core.lighting import LightClasses, ReadOut
 from sdps.models.blocks import max_over_images
 
 _TINY = 1e-8

@@ -14,7 +14,7 @@ _GROWTH = 16
 
 
 class CNNPS(nn.Module):
-    """Regresses the normal of every pixel from its observation map (`sdps.observation_maps`).
+    """Regresses the normal of every pixel from its observation map (`sdps.models.observation_maps`).
 
     Layers and widths are those of the authors' code: two dense blocks of two convolutions, a transition that halves
     the map between them, two fully connected layers; no batch normalisation. 2,654,051 parameters, of which 2,621,568

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sdps.lighting import LightClasses, ReadOut
-from sdps.losses import class_loss
+from sdps.core.lighting import LightClasses, ReadOut
+from sdps.core.losses import class_loss
 from sdps.models.base import LightingNetwork, Lights
 from sdps.models.blocks import conv, initialise
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from sdps.lighting import LightClasses, ReadOut
-from sdps.losses import soft_class_loss
+from sdps.core.lighting import LightClasses, ReadOut
+from sdps.core.losses import soft_class_loss
 from sdps.models.base import Lights
 from sdps.models.blocks import initialise
 from sdps.models.lcnet import LCNet, LightingLogits, LightingTrunk, head

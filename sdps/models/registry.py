@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from torch import nn
 
-from render.errors import InputError, unknown
+from render.shared.errors import InputError, unknown
 from sdps.models.cnnps import CNNPS
 from sdps.models.lcnet import LCNet
 from sdps.models.lighting_variants import LCNetReg, LCNetSecond, LCNetSoft

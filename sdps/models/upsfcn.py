@@ -5,8 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from sdps.lighting import LightClasses
-from sdps.losses import class_loss
+from sdps.core.lighting import LightClasses
+from sdps.core.losses import class_loss
 from sdps.models.base import Observations
 from sdps.models.blocks import conv, initialise, max_over_images
 from sdps.models.lcnet import LightingLogits, head

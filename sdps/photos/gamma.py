@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from render.errors import InputError
-from sdps.photos.curves import SRGB_EXPONENT
+from render.shared.errors import InputError
 from sdps.photos.listing import find_light_files
-from sdps.photos.pictures import Coding
+from sdps.photos.picture_file import Coding
+from sdps.photos.response import SRGB_EXPONENT
 
 _EXPONENTS = (0.3, 4.0)
 """Exponents that are believed to be a display curve."""

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
-from render.errors import InputError
-from render.exchange.tables import natural_key, read_names
-from sdps.photos.pictures import SUFFIXES
+from render.shared.errors import InputError
+from render.shared.tables import natural_key, read_names
+from sdps.photos.picture_file import SUFFIXES
 
 LISTS = ("names.txt", "filenames.txt")
 """Files that name the photographs in order; the first that is there decides."""

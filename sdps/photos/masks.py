@@ -10,9 +10,9 @@ import numpy as np
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
-from render.errors import InputError
-from sdps.photos.curves import full_scale
-from sdps.photos.pictures import decode, turned
+from render.shared.errors import InputError
+from sdps.photos.picture_file import decode, turned
+from sdps.photos.response import full_scale
 
 _LARGEST = 0.9
 """Share of the frame above which an automatic mask has found no background."""

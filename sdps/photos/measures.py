@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from render.errors import InputError
-from render.progress import progress_bar
+from render.shared.errors import InputError
+from render.shared.progress import progress_bar
 from sdps.photos.colours import colour_casts
-from sdps.photos.curves import brightness
 from sdps.photos.motion import Shift, Tracker, second_look
 from sdps.photos.reading import Photographs
+from sdps.photos.response import brightness
 
 _PIXELS = 2048
 _COLOUR_PIXELS = 512

@@ -10,21 +10,21 @@ from pathlib import Path
 
 import numpy as np
 
-from render.errors import InputError
-from render.progress import progress_bar
-from sdps.photos.curves import brightness, to_linear
+from render.shared.errors import InputError
+from render.shared.progress import progress_bar
 from sdps.photos.gamma import resolve_gamma
-from sdps.photos.lights import Lights, read_intensities, read_lights
+from sdps.photos.light_files import Lights, read_intensities, read_lights
 from sdps.photos.listing import find_mask, list_pictures
 from sdps.photos.masks import Variation, automatic_mask, read_mask
-from sdps.photos.pictures import Coding, Picture, decode, turned
+from sdps.photos.picture_file import Coding, Picture, decode, turned
+from sdps.photos.response import brightness, to_linear
 
 _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """A folder of photographs; an `ImageSource` (sdps/image_source.py) that holds no pixel in memory.
+    """A folder of photographs; an `ImageSource` (sdps/inference/image_source.py) that holds no pixel in memory.
 
     `len(photos)` is L; `photos[2:5]` reads three files anew and returns (3, H, W, 3) float32, linear radiance with 1
     for full scale (floating-point files: as they are), 0 for what is negative or not finite.

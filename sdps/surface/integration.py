@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from render.errors import InputError
+from render.shared.errors import InputError
 from sdps.surface.multigrid import Multigrid, laplacian, solve
 
 STEEPEST = 0.03

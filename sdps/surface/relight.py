@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from render.errors import InputError
+from render.shared.errors import InputError
 from sdps.surface.integration import Depth, checked_normals
 
 if TYPE_CHECKING:
-    from sdps.image_source import ImageSource
+    from sdps.inference.image_source import ImageSource
 
 _READ_PIXELS = 2**20  # read at once, whole images
 _LEAST = 0.02  # of a pixel's brightness: smaller residuals do not gain more weight

@@ -1,0 +1,1 @@
+"""Benchmarks of speed, as ratios inside one run."""

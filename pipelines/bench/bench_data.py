@@ -1,0 +1,177 @@
+"""The parts of `sdps bench` that concern whole runs: steady state, memory, processes and stages."""
+
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.shared import presets
+from render.planning import budget
+from render.planning.plan import plan
+from render.running.supervisor import RunOptions, RunSummary, render_supervised
+from render.shared.errors import InputError
+from render.shared.files import atomic_path
+
+_WARM_UP = 12  # views, after which every kernel a run needs has been met
+_VIEWS = 40
+
+
+def run(part: str, scenes: int, out: Path | None) -> tuple[dict, str]:
+    """Run one part.
+
+    Args:
+        part: A key of `PARTS`.
+        scenes: Scenes of the memory test.
+        out: Folder for pictures, or None.
+
+    Returns:
+        Plain values, and Markdown lines about them.
+    """
+    return PARTS[part](scenes, out)
+
+
+def steady_state(_: int, __: Path | None) -> tuple[dict, str]:
+    """Count the kernels compiled while shapes, views, materials and lights change."""
+    from render.backend import variant
+
+    variant.load()
+    import drjit as dr
+
+    from render import shapes
+    from render.kernel import many_lights, scene
+    from render.materials.kernels.packed import pack
+
+    config = presets.load("small").data
+    config = replace(config, families={"blobby": 8, "sculpture": 18}, views=2, spatially_varying=0.0, spp=16)
+    planned = plan(config)[: 2 * (_WARM_UP + _VIEWS)]
+
+    def render(first: int) -> None:
+        pair = planned[first : first + 2]
+        built = scene.build(shapes.load(pair[0].shape))
+        _, images = many_lights.render(
+            built, pair[0].view, pack([one.material for one in pair], built.mesh), pair[0].light_directions(),
+            size=config.size, spp=config.spp, bounces=config.bounces, seed=pair[0].seed,
+        )  # fmt: skip
+        for _ in images:
+            pass
+
+    for number in range(_WARM_UP):
+        render(2 * number)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for number in range(_WARM_UP, _WARM_UP + _VIEWS):
+            render(2 * number)
+        history = dr.kernel_history([dr.KernelType.JIT])
+    compiled = sum(not kernel["cache_hit"] or bool(kernel["cache_disk"]) for kernel in history)
+    values = {"views": _VIEWS, "launches": len(history), "kernels_compiled": compiled}
+    return values, (
+        f"Steady state: {_VIEWS} views of {len({s.shape for s in planned})} shapes with other poses, materials and "
+        f"lights, {len(history):,} kernel launches, {compiled} kernels compiled.\n"
+    )
+
+
+def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
+    """Render many small scenes in this process and follow its memory."""
+    from render.running import worker
+
+    config = presets.load("small").data
+    shapes = -(-scenes // 16)
+    config = replace(config, families={"blobby": shapes, "sculpture": shapes}, views=4, size=64, spp=16,
+                     light_count=32, spatially_varying=0.1)  # fmt: skip
+    sizes = []
+    with tempfile.TemporaryDirectory() as folder:
+        planned = plan(config)
+        half = len(planned) // 2  # blobs, then as many sculptures: interleaved by shape, or a trend would be theirs
+        pairs = zip(range(0, half, 8), range(half, len(planned), 8), strict=False)
+        planned = [scene for pair in pairs for first in pair for scene in planned[first : first + 8]][:scenes]
+
+        def record(scene: object) -> None:
+            sizes.append(_resident())
+            (Path(folder) / scene.file).unlink()
+
+        worker.render_scenes(planned, folder, on_shard=record)
+    megabytes = np.array(sizes) / 1e6
+    quarter = max(1, len(megabytes) // 4)
+    growth = 1000 * np.polyfit(np.arange(len(megabytes))[quarter:], megabytes[quarter:], 1)[0]
+    values = {"scenes": len(megabytes), "start_mb": float(megabytes[quarter]), "end_mb": float(megabytes[-1]),
+              "peak_mb": float(megabytes.max()), "growth_mb_per_1000": float(growth)}  # fmt: skip
+    if out:
+        _plot(megabytes, out / "memory.png")
+    return values, (
+        f"Memory over {len(megabytes):,} scenes in one process: {values['start_mb']:.0f} MB after a quarter of them, "
+        f"{values['end_mb']:.0f} MB at the end, peak {values['peak_mb']:.0f} MB; trend of the last three quarters "
+        f"{growth:+.0f} MB per 1,000 scenes.\n"
+    )
+
+
+def workers(_: int, __: Path | None) -> tuple[dict, str]:
+    """Render the same part of the `paper` preset on one core and on all; profile its stages."""
+    base = presets.load("paper").data
+    whole = sum(base.families.values()) * base.views * base.materials_per_view
+    planned = plan(replace(base, families={"blobby": 1, "sculpture": 2}, views=9, validation=0.0))
+    cores = budget.cores()
+    ways = {"1 process on 1 core": (1, 1), f"1 process on {cores} cores": (1, cores)}
+    ways[f"{cores} processes on {cores} cores"] = (cores, cores)
+    runs = {name: _run(planned, *way) for name, way in ways.items()}
+    rates = {name: len(summary.lines) / summary.seconds * 3600 for name, summary in runs.items()}
+    names, shares = list(rates), list(runs.values())[-1].stage_shares()
+    inside = sum(share for stage, share in shares.items() if stage != "other")
+    values = {"scenes": len(planned), "scenes_per_hour": rates, "stages": shares,
+              "scaling": rates[names[-1]] / rates[names[0]],
+              "render_share_of_work": shares.get("render", 0.0) / max(inside, 1e-9),
+              "paper_hours": whole / max(rates.values())}  # fmt: skip
+    lines = [f"`render-data` on {len(planned)} scenes of the `paper` preset (start of the processes included):", ""]
+    lines += [f"- {name}: {rate:,.0f} scenes/hour" for name, rate in rates.items()]
+    lines += [
+        f"- {names[-1]} against {names[0]}: {values['scaling']:.2f}",
+        "- stages: " + ", ".join(f"{stage} {share:.0%}" for stage, share in shares.items()),
+        f"- rendering is {values['render_share_of_work']:.0%} of the work (target: at least 70 %)",
+        f"- projected for all {whole:,} samples: {values['paper_hours']:.1f} h",
+    ]
+    return values, "\n".join(lines) + "\n"
+
+
+def _run(planned: list, processes: int, cores: int) -> RunSummary:
+    """Render a plan into a temporary folder on the first `cores` of this machine's cores."""
+    allowed = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, set(allowed[:cores]))
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            return render_supervised(planned, Path(folder), RunOptions(workers=processes))
+    finally:
+        os.sched_setaffinity(0, set(allowed))
+
+
+def _resident() -> int:
+    """Return the resident memory of this process in bytes.
+
+    Raises:
+        InputError: not on Linux.
+    """
+    try:
+        with open("/proc/self/statm", encoding="ascii") as handle:
+            return int(handle.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError as error:
+        raise InputError("bench: the memory part reads /proc, so it needs Linux; choose others by --only") from error
+
+
+def _plot(megabytes: np.ndarray, path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 2.6), dpi=110, layout="tight")
+    axes = figure.add_subplot()
+    axes.plot(np.arange(1, len(megabytes) + 1), megabytes, lw=0.8)
+    axes.set(xlabel="scenes rendered", ylabel="resident memory, MB", ylim=(0, None))
+    axes.grid(alpha=0.3)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary)
+
+
+PARTS: dict[str, Callable[[int, Path | None], tuple[dict, str]]] = {
+    "steady": steady_state,
+    "memory": memory,
+    "workers": workers,
+}

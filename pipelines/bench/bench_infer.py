@@ -1,0 +1,153 @@
+"""`sdps bench-infer`: seconds and memory from a folder of photographs to everything `sdps infer` writes.
+
+The photographs are 16-bit pictures of the object of `bench-classical`, which fills the frame but for a margin. Every
+run is a process of its own; both kinds of processor are measured (`pipelines.shared.machines`). With `--many`, a
+second folder repeats the pictures up to that number, to show that memory does not grow with them.
+"""
+
+import argparse
+import shutil
+import sys
+import tempfile
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.bench.bench_classical import BenchClassicalConfig, scene
+from pipelines.shared import using
+from pipelines.shared.lists import split_list
+from pipelines.shared.machines import hold, kinds, processor
+from pipelines.shared.memory import apart, peak_gib
+from pipelines.shared.text_tables import render_text
+from render.shared.errors import InputError
+from render.shared.files import write_json
+from render.shared.images import quantise, write_png
+from render.shared.progress import progress_bar
+from sdps.inference.inference_config import InferenceConfig, inference_config
+
+SECONDS, GIBIBYTES = 180.0, 3.0
+"""The limits of a folder of 96 pictures of 612x512 on two cores."""
+STEPS = ("load", "check", "method", "save")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps bench-infer`."""
+    parser.add_argument("--methods", action="append", help="commas or repeat (default: sdps)")
+    parser.add_argument("--models", type=Path, default=None, help="folder of trained runs (default: shipped weights)")
+    using.add_arguments(parser)
+    parser.add_argument("--height", type=int, default=BenchClassicalConfig.height)
+    parser.add_argument("--width", type=int, default=BenchClassicalConfig.width)
+    parser.add_argument("--images", type=int, default=BenchClassicalConfig.lights)
+    parser.add_argument("--many", type=int, default=0, help="also infer a folder of this many pictures")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/bench-infer"), help="output folder (default: %(default)s)"
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Write the photographs, infer them with every method, print the tables and write bench_infer.json."""
+    config, used = (
+        BenchClassicalConfig(height=args.height, width=args.width, lights=args.images),
+        inference_config(args),
+    )
+    folders = {args.images: photograph(args.out / "photographs", config)}
+    if args.many:
+        folders[args.many] = repeated(args.out / "many", folders[args.images], args.many)
+    found: dict[str, dict[str, dict]] = {}
+    for kind in kinds():
+        with hold(kind):
+            found[kind] = {
+                f"{name}, {count} pictures": measure(folder, name, args.models, used)
+                for name in split_list(args.methods) or ["sdps"]
+                for count, folder in folders.items()
+            }
+    write_json(args.out / "bench_infer.json", {"config": vars(config), "networks": used.options(), "kinds": found})
+    tables = (table(rows, config, f"{processor()}, {kind}") for kind, rows in found.items())
+    sys.stdout.write("\n".join(tables) + f"{args.out / 'bench_infer.json'}\n")
+    return 0
+
+
+def photograph(folder: Path, config: BenchClassicalConfig) -> Path:
+    """Write the pictures and the mask of the bench's object.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    images, mask, *_ = scene(config)
+    scale = 1.0 / float(np.percentile(images[:, mask], 99.5))
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
+        for number, image in enumerate(progress_bar(images, desc="photograph", unit="picture")):
+            write_png(folder / f"{number:04d}.png", quantise(image * scale, 16))
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another --out") from error
+    return folder
+
+
+def repeated(folder: Path, source: Path, count: int) -> Path:
+    """Fill a folder with links to the pictures of another one, again and again."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    pictures = sorted(path for path in source.glob("*.png") if path.name != "mask.png")
+    (folder / "mask.png").hardlink_to(source / "mask.png")
+    for number in range(count):
+        (folder / f"{number:04d}.png").hardlink_to(pictures[number % len(pictures)])
+    return folder
+
+
+def measure(folder: Path, method: str, models: Path | None, config: InferenceConfig) -> dict:
+    """Infer a folder in a fresh process: seconds per step and in all, peak_gib, pixels, precision, error."""
+    return apart(_work, folder, method, models, config)
+
+
+def _work(folder: Path, method: str, models: Path | None, config: InferenceConfig, results: Connection) -> None:
+    """Do what `sdps infer` does, and send what it took."""
+    from sdps.api import infer, load
+    from sdps.photos import check
+
+    marks = [time.perf_counter()]
+    try:
+        photos = load(folder)
+        marks.append(time.perf_counter())
+        findings = tuple(check(photos))
+        marks.append(time.perf_counter())
+        result = infer(photos, method, models=models, config=config, findings=findings)
+        marks.append(time.perf_counter())
+        with tempfile.TemporaryDirectory() as out:
+            result.save(out)
+        marks.append(time.perf_counter())
+    except InputError as error:
+        results.send({"error": str(error)})
+        return
+    steps = dict(zip(STEPS, np.diff(marks).round(2).tolist(), strict=True))
+    results.send(
+        {
+            **steps,
+            "seconds": marks[-1] - marks[0],
+            "peak_gib": peak_gib(),
+            "pixels": int(photos.mask.sum()),
+            "precision": result.estimate.diagnostics.get("precision", "-"),
+            "error": "",
+        }
+    )
+
+
+def table(found: dict[str, dict], config: BenchClassicalConfig, machine: str) -> str:
+    """Lay the figures of one kind of machine out as text, with the limits."""
+    rows = []
+    for name, item in found.items():
+        if item["error"]:
+            rows.append([name, *["-"] * (len(STEPS) + 3), item["error"]])
+            continue
+        size = "-" if item["peak_gib"] is None else f"{item['peak_gib']:.2f}"
+        kept = item["seconds"] <= SECONDS and (item["peak_gib"] or 0.0) <= GIBIBYTES
+        seconds = [f"{item[step]:.1f}" for step in STEPS]
+        rows.append([name, item["precision"], *seconds, f"{item['seconds']:.1f}", size, "yes" if kept else "no"])
+    pixels = next((item["pixels"] for item in found.values() if not item["error"]), 0)
+    title = f"{machine}: pictures of {config.width}x{config.height}, 16 bits, {pixels:,} pixels of object"
+    limit = f"within {SECONDS:.0f} s, {GIBIBYTES:.0f} GiB"
+    return render_text(title, ["method", "precision", *STEPS, "seconds", "peak GiB", limit], rows)

@@ -1,0 +1,1 @@
+"""`sdps data`: plan, check, preview, describe, export and import data folders."""

@@ -1,0 +1,82 @@
+"""`sdps data export`: scenes in a layout that other photometric-stereo code reads, and checks of such trees."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from render.exchange.layouts import LAYOUTS
+from render.exchange.rules import RuleReport, check_tree
+from render.exchange.samples import ExportOptions
+from render.records.manifest import read_manifest
+from render.shared.errors import InputError
+
+_SHOWN = 20
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps data export`."""
+    layouts = "; ".join(f"{name}: {layout.about}" for name, layout in LAYOUTS.items())
+    parser.add_argument("folder", help="data folder; with --check and no --out, the tree to check")
+    parser.add_argument("--layout", required=True, help=layouts)
+    parser.add_argument("--out", default=None, help="root of the tree; an interrupted export goes on there")
+    parser.add_argument("--bits", type=int, default=None, help="8 or 16 per channel (default: 8 for psfcn and custom, "
+                        "16 for diligent and unips)")  # fmt: skip
+    parser.add_argument("--exposure", default=None, help="factor on radiance (1: white facing its light is full scale) "
+                        "or 'auto', per scene (default: 1 for psfcn, auto for the others)")  # fmt: skip
+    parser.add_argument("--intensities", default="unit", help="'unit', or 'seed': one per image in [0.2, 2), seeded")
+    parser.add_argument("--ids", nargs="+", default=[], metavar="ID", help="only these scenes")
+    parser.add_argument("--split", default=None, choices=("train", "val", "test"), help="only this split")
+    parser.add_argument("--limit", type=int, default=None, help="only the first so many (of a check: spread evenly)")
+    parser.add_argument("--skip-missing", action="store_true", help="leave out planned scenes that have no shard yet")
+    parser.add_argument("--check", action="store_true", help="check the tree against the rules of its loaders; "
+                        "exit code 1 if it breaks one")  # fmt: skip
+
+
+def main(args: argparse.Namespace) -> int:
+    """Export, check, or both."""
+    options = ExportOptions(
+        layout=args.layout, bits=args.bits, exposure=_exposure(args.exposure), intensities=args.intensities
+    )
+    if args.out is None:
+        if not args.check:
+            raise InputError("--out is missing; give the folder to export to, or --check to check FOLDER itself")
+        return _report(check_tree(args.folder, args.layout, limit=args.limit), args.folder)
+    from render.exchange.export import export, select
+
+    planned = read_manifest(args.folder)
+    if args.skip_missing:
+        planned = [scene for scene in planned if (Path(args.folder) / scene.file).is_file()]
+        if not planned:
+            raise InputError(f"{args.folder}: no shard yet; render some with `sdps render-data`")
+    chosen = select(planned, ids=args.ids, split=args.split, limit=args.limit)
+    done = export(args.folder, args.out, options, chosen)
+    sys.stdout.write(
+        f"{args.out}: {len(done.scenes)} scenes as {args.layout}, {done.written} written now, {done.kept} kept\n"
+    )
+    for field, words in (("clipped", "clipped"), ("black", "lit but rounded to black")):
+        mean, most, worst = done.worst(field)
+        sys.stdout.write(f"{words}: {mean:.2%} of the object's values on average, at most {most:.2%} ({worst})\n")
+    if args.layout == "psfcn" and not any(scene["split"] == "val" for scene in done.scenes.values()):
+        sys.stdout.write(f"{args.out}: val_mtrl.txt is empty; export scenes of split 'val' too before training on it\n")
+    return _report(check_tree(args.out, args.layout, source=args.folder), args.out) if args.check else 0
+
+
+def _exposure(text: str | None) -> float | str | None:
+    """Read the flag: a number, `auto`, or nothing."""
+    try:
+        return text if text in (None, "auto") else float(text)
+    except ValueError as error:
+        raise InputError(f"--exposure {text}: expected a positive number or 'auto'") from error
+
+
+def _report(report: RuleReport, tree: str) -> int:
+    """Print what a check found; return 0 when nothing."""
+    for line in report.violations[:_SHOWN]:
+        sys.stdout.write(f"{line}\n")
+    if len(report.violations) > _SHOWN:
+        sys.stdout.write(f"... and {len(report.violations) - _SHOWN} more\n")
+    low, high = report.lights
+    lights = f"{low}" if low == high else f"{low} to {high}"
+    verdict = f"{len(report.violations)} violations" if report.violations else "every rule of its loaders holds"
+    sys.stdout.write(f"{tree}: {report.samples} samples of {lights} lights; {verdict}\n")
+    return 1 if report.violations else 0

@@ -1,0 +1,1 @@
+"""Commands that score methods on rendered scenes, and what they share."""

@@ -1,0 +1,178 @@
+"""`sdps eval-merltest`: render MERL-Test scenes and score every method on them in the layout of the paper's tables.
+
+Table A is lighting estimation, table B normal estimation (SDPS-Net, sec. 5.1); each number is the mean over the
+materials, with the paper's beside it. Every scene gets random light intensities. Every model that is trained in the
+output folder, and every shipped one, has its row, and the paper's rows without a model are marked so; least squares and
+a constant predictor, which shows what knowing nothing scores, stand below.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.evaluate.evaluation import Evaluation
+from pipelines.evaluate.lit import lit_object
+from pipelines.evaluate.merltest_tables import SceneScores, definition, lighting_table, normal_table
+from pipelines.rendering.render_data import render_planned
+from pipelines.report.sections import Table
+from pipelines.shared import presets, scenes, using
+from pipelines.shared.presets import Preset, TestConfig
+from pipelines.shared.text_tables import render_text
+from render.records.manifest import SceneSpec
+from render.shared.config import to_plain
+from render.shared.errors import InputError
+from render.shared.files import write_json
+from render.shared.progress import progress_bar
+from sdps.inference.inference_config import inference_config
+from sdps.methods import rows
+from sdps.methods.method import CONSTANT, Method
+from sdps.methods.pretrained import SHIPPED, finder
+from sdps.methods.runner import Runner
+from sdps.models.registry import MODELS, TRUE_LIGHTS
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps eval-merltest`."""
+    presets.add_common_arguments(parser)
+    parser.add_argument("--lights", default=None, metavar="NAME|FILE|true",
+                        help="lighting model of a combination (default: every trained model, a row each)")  # fmt: skip
+    parser.add_argument("--normals", default=None, metavar="NAME|FILE",
+                        help="normal model, combination such as sdps-plus, or classical method")  # fmt: skip
+    parser.add_argument("--second", default=None, metavar="NAME|FILE", help="second lighting pass")
+    parser.add_argument("--intensities", default=None, choices=("true",), help="give the true intensities only")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Render or reuse the scenes, score, print the tables, and write results.json, the section and report.html."""
+    from pipelines.evaluate import merltest_section
+    from pipelines.report import page as report
+
+    preset, out = presets.from_arguments(args)
+    lighting, normals = table_rows(args, out, preset)
+    config = inference_config(preset.test)
+    runners = [Runner(method, finder(out), config) for method in (*lighting, *normals)]
+    wanted = scenes.test_scenes(preset.test)
+    folder = out / "merltest"
+    render_planned(wanted, folder, preset)
+    evaluation = Evaluation(out / "eval")
+    pictured = shown(normals)
+    results = list(evaluate(wanted, folder, preset.test, runners, evaluation, pictured))
+    tables = build_tables(results, lighting, normals)
+    presets.save_resolved(preset, out / "eval")
+    weights = {name: str(file) for runner in runners for name, file in runner.files.items()}
+    networks = using.describe(runners, config)
+    write_json(out / "eval" / "results.json", results_json(results, tables, preset, weights, networks))
+    chosen = {runner.method.name: runner for runner in runners}
+    merltest_section.write(
+        out,
+        preset,
+        tables,
+        results,
+        folder,
+        evaluation,
+        [chosen[name] for name in pictured if name in chosen],
+        networks,
+    )
+    page = report.write(out, preset)
+    listed = (render_text(f"\n{table.title}", list(table.header), list(table.rows), left=(0, 1)) for table in tables)
+    sys.stdout.write("\n".join(listed))
+    sys.stdout.write(f"\n{definition(preset.test)}{networks}\n{page}\n")
+    return 0
+
+
+def table_rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[list[Method], list[Method]]:
+    """Return the methods of the lighting table and of the normal table.
+
+    Raises:
+        InputError: nothing is trained, or flags name what is not there.
+    """
+    constant = Method(name="constant predictor", normals=CONSTANT)
+    if any((args.lights, args.normals, args.second, args.intensities)):
+        method = rows.chosen(out, args.lights, args.normals, args.second, args.intensities)
+        reference = Method(name="least-squares, true lights", lights="true", normals="least-squares")
+        return [], [method, *([reference] if method.name != reference.name else []), constant]
+    normals = rows.normal_methods(out, preset.test.shipped, preset.test)
+    lighting = rows.lighting_methods(out, _own_lighting(preset), preset.test, normals, preset.test.shipped)
+    if not lighting and all(not method.models() for method in normals):
+        raise InputError(
+            f"{out / 'models'}: no trained models; train them with `sdps train --preset {preset.name} --out {out}`"
+        )
+    return [*lighting, constant], [*normals, constant]
+
+
+def _own_lighting(preset: Preset) -> list[str]:
+    """Return the runs of a preset that give lights, without those that others start from: they are no result."""
+    starts = {settings.get("start") for settings in preset.runs.values()}
+    models = {name: preset.run(name).model for name in preset.runs if name not in starts}
+    return [name for name, model in models.items() if model in MODELS and MODELS[model].role == "lighting"]
+
+
+def shown(normals: Sequence[Method]) -> list[str]:
+    """Return the names of the methods whose normal maps the page shows.
+
+    The paper's pair if it was trained here, the last of the shipped ways that find the lights (the rows have the best
+    last), and least squares; where there is neither, the first method.
+    """
+    finders = [method for method in normals if method.lights != TRUE_LIGHTS and method.normals in method.models()]
+    shipped = [method for method in finders if all(name.startswith(SHIPPED) for name in method.models())]
+    pairs = [method for method in finders if method.paper == "B1" and method not in shipped]
+    chosen = [*pairs[:1], *shipped[-1:]] or normals[:1]
+    return list(dict.fromkeys([*(method.name for method in chosen), "least-squares, true lights"]))
+
+
+def evaluate(
+    wanted: Sequence[SceneSpec],
+    folder: Path,
+    config: TestConfig,
+    runners: Sequence[Runner],
+    evaluation: Evaluation,
+    pictured: Sequence[str],
+) -> Iterator[SceneScores]:
+    """Score every scene, averaged over the draws of random intensities; normal maps of the first draw are kept."""
+    for scene in progress_bar(wanted, desc="evaluate", unit="scene"):
+        draws: dict[str, list[dict[str, float]]] = {}
+        for repeat in range(config.repeats):
+            keep = [repeat == 0 and runner.method.name in pictured for runner in runners]
+            item = lit_object(scene, folder, config, repeat)
+            scored: dict[str, dict[str, float]] = {}
+            for runner, result in zip(runners, evaluation.results(item, runners, keep), strict=True):
+                name = runner.method.name  # the constant predictor has a row in both tables
+                scored[name] = scored.get(name, {}) | result.scores
+            for name, scores in scored.items():
+                draws.setdefault(name, []).append(scores)
+        yield SceneScores(scene, {name: _mean_scores(values) for name, values in draws.items()})
+
+
+def _mean_scores(draws: list[dict[str, float]]) -> dict[str, float]:
+    """Average each metric over the draws; none of a method that failed in one of them."""
+    if not all(draws):
+        return {}
+    return {metric: float(np.mean([values[metric] for values in draws])) for metric in draws[0]}
+
+
+def build_tables(results: list[SceneScores], lighting: list[Method], normals: list[Method]) -> list[Table]:
+    """Return table A where every model has its row, and table B."""
+    whole = bool(lighting)
+    second = [method for method in normals if method.second]  # rows of both tables
+    first = [lighting_table(results, [*lighting, *second], all_rows=True)] if whole else []
+    return [*first, normal_table(results, normals, all_rows=whole)]
+
+
+def results_json(
+    results: list[SceneScores], tables: list[Table], preset: Preset, weights: dict[str, str], networks: str
+) -> dict:
+    """Collect everything a reader needs to judge the numbers."""
+    return {
+        "definition": definition(preset.test),
+        "networks": networks.strip(),
+        "weights": weights,
+        "config": to_plain(preset.test),
+        "tables": {table.title: {"header": table.header, "rows": table.rows} for table in tables},
+        "scenes": [
+            {"id": r.scene.id, "shape": r.scene.shape, "material": r.scene.material, "scores": r.scores}
+            for r in results
+        ],
+    }

@@ -1,0 +1,1 @@
+"""Commands that render: training data, test scenes, catalogues of shapes and materials."""

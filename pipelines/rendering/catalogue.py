@@ -1,0 +1,126 @@
+"""`sdps materials` and `sdps shapes`: what there is to render, as a list or as a contact sheet."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.shared import pictures
+from render.materials import library, surfaces
+from render.materials.model import Material
+from render.planning.plan import material_pool
+from render.records.manifest import View
+from render.shared.errors import InputError, unknown
+from render.shared.files import atomic_path
+
+_LIGHTS = np.array([[-0.45, 0.55, 0.70]])
+_SHAPES = ("sphere", "bunny", *(f"{family}:{seed}" for family in ("blobby", "sculpture") for seed in range(15)))
+_TURNED = View(rotation=(0.9063, 0.0, 0.4226, 0.0746, 0.9843, -0.1600, -0.4160, 0.1765, 0.8921), scale=0.98)
+
+
+def add_material_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps materials`."""
+    parser.add_argument("--category", default=None, help="only this category")
+    parser.add_argument("--materials", action="append", help="only these names and files; commas or repeat")
+    parser.add_argument("--out", default=None, help="also render a contact sheet of spheres, <out>/materials.png")
+
+
+def add_shape_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps shapes`."""
+    parser.add_argument("--out", default=None, help="also render a contact sheet, <out>/shapes.png")
+
+
+def materials_main(args: argparse.Namespace) -> int:
+    """List the chosen materials: category and error of the fit, or that they are measured or vary."""
+    chosen = _chosen(args.category, args.materials)
+    for name in chosen:
+        sys.stdout.write(f"{name:<28} {_about(surfaces.load(name))}\n")
+    sys.stdout.write(
+        f"{len(chosen)} materials; also lambertian:<albedo>, lambertian:<r>/<g>/<b>, and files: {library.FILES}\n"
+    )
+    if args.out:
+        _save(_material_sheet(chosen), Path(args.out) / "materials.png")
+    return 0
+
+
+def _about(surface: surfaces.Surface) -> str:
+    """Describe a material by its category and what it is, or a spatially varying surface by its pattern."""
+    if surface.pattern:
+        return f"{surface.pattern.kind:<16} {surface.pattern.count} materials"
+    (material,) = surface.components
+    error = f"fit error {100 * material.fit_error:5.1f} %" if isinstance(material, Material) else "table"
+    return f"{material.category:<16} {error}"
+
+
+def _chosen(category: str | None, wanted: list[str] | None) -> list[str]:
+    """Return the built-in materials, of one category if given, or the `wanted` names, categories and files."""
+    if wanted:
+        from pipelines.shared.lists import split_list
+
+        if category is not None:
+            raise InputError("--category and --materials: give one of them; --materials takes categories too")
+        return material_pool(tuple(split_list(wanted)))
+    categories = library.categories()
+    if category is None:
+        return library.names()
+    if category not in categories:
+        raise unknown("category", category, categories)
+    return list(categories[category])
+
+
+def shapes_main(args: argparse.Namespace) -> int:
+    """List the shape families."""
+    from render.shapes import families
+
+    for name, about in families().items():
+        sys.stdout.write(f"{name:<18} {about}\n")
+    sys.stdout.write(f"{'<file>':<18} any mesh trimesh reads: .obj .ply .stl .glb .off ...\n")
+    if args.out:
+        _save(_shape_sheet(), Path(args.out) / "shapes.png")
+    return 0
+
+
+def _material_sheet(names: list[str]) -> pictures.Image.Image:
+    """Render a sphere of each material under one light, exposed alike but for the nearly black."""
+    from render.kernel import many_lights, scene
+    from render.materials.kernels.packed import pack
+    from render.shapes import load
+
+    built = scene.build(load("sphere"))
+    tiles = []
+    for first in range(0, len(names), 16):
+        part = names[first : first + 16]
+        packed = pack(part, built.mesh)
+        _, images = many_lights.render(built, View(scale=0.95), packed, _LIGHTS, size=120, spp=64, bounces=0, seed=0)
+        shown = (pictures.tone_map(stack[0], 1.2) for _, stack in images)
+        tiles += zip(map(_label, part), shown, strict=True)
+    return pictures.contact_sheet(tiles, columns=min(10, len(tiles)))
+
+
+def _label(name: str) -> str:
+    """Name a material in at most 21 letters, a file without its folders."""
+    return "+".join(part.rsplit("/", 1)[-1] for part in name.split("+"))[:21]
+
+
+def _shape_sheet() -> pictures.Image.Image:
+    """Render one view of each shape in white under one light."""
+    from render.kernel import many_lights, scene
+    from render.materials.kernels.packed import pack
+    from render.shapes import load
+
+    packed = pack(["lambertian:0.8"])
+    tiles = []
+    for name in _SHAPES:
+        view = View(scale=0.98) if name == "bunny" else _TURNED
+        _, images = many_lights.render(
+            scene.build(load(name)), view, packed, _LIGHTS, size=160, spp=256, bounces=2, seed=0
+        )
+        tiles.append((name, pictures.tone_map(next(images)[1][0])))
+    return pictures.contact_sheet(tiles, columns=8)
+
+
+def _save(sheet: pictures.Image.Image, path: Path) -> None:
+    with atomic_path(path) as temporary:
+        sheet.save(temporary)
+    sys.stdout.write(f"wrote {path}\n")

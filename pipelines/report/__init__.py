@@ -1,0 +1,1 @@
+"""The page of everything evaluated, and the sections it is made of."""

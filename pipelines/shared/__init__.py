@@ -1,0 +1,1 @@
+"""What commands share: presets, flags, pictures, charts, text tables, test scenes."""

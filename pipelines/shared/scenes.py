@@ -1,0 +1,67 @@
+"""Test scenes: every chosen shape with every chosen material under one fixed set of lights."""
+
+import re
+from pathlib import Path
+
+from pipelines.shared.presets import TestConfig
+from render.materials import surfaces
+from render.planning import light_sets
+from render.planning.plan import material_pool
+from render.records.manifest import SceneSpec, View
+from render.shapes import load as load_shape
+from render.shared.errors import InputError
+from render.shared.seeds import derived_seed
+
+_MEASURED = (".binary", ".bsdf")
+
+
+def test_scenes(config: TestConfig) -> list[SceneSpec]:
+    """List one scene per shape and material, upright and centred, in an order that lets materials share rays.
+
+    Raises:
+        InputError: an unknown shape, material or light set, or two scenes of one name.
+    """
+    pool = material_pool(config.materials)
+    for name in pool:
+        surfaces.load(name)
+    for shape in config.shapes:
+        load_shape(shape)
+    directions = tuple(tuple(round(float(c), 6) for c in row) for row in light_sets.load(config.lights))
+    scenes = [
+        SceneSpec(
+            id=f"{slug(shape)}-{slug(material)}",
+            seed=derived_seed(config.seed, "test", shape),
+            split="test",
+            shape=shape,
+            material=material,
+            view=View(scale=config.scale),
+            lights=directions,
+            size=config.size,
+            spp=config.spp,
+            bounces=config.bounces,
+        )
+        for shape in config.shapes
+        for material in pool
+    ]
+    names = [scene.id for scene in scenes]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise InputError(f"two scenes would both be called {twice!r}; rename one of the files")
+    return scenes
+
+
+def slug(name: str) -> str:
+    """Turn a shape or material name, or a path, into part of a file name: letters, digits, dots and hyphens.
+
+    Folders are dropped; of a measured material the suffix stays, so that `chrome.binary` is not taken for `chrome`. The
+    materials of a spatially varying name are joined by two hyphens: `stripes-7-chrome--blue-fabric`.
+    """
+    pattern, materials = surfaces.split(name)
+    if pattern:
+        return f"{pattern.kind}-{pattern.seed}-" + "--".join(slug(part) for part in materials)
+    path = Path(name)
+    if path.suffix.lower() in _MEASURED:
+        name = path.name
+    elif path.suffix.lower() in (".yaml", ".yml") or "/" in name.split(":")[0]:
+        name = path.stem
+    return re.sub(r"[^A-Za-z0-9.]+", "-", name).strip("-")

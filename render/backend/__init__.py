@@ -1,0 +1,1 @@
+"""Mitsuba variant and LLVM, chosen before mitsuba is imported; helpers for Dr.Jit kernels."""

@@ -1,0 +1,149 @@
+"""Choosing the Mitsuba variant and its libLLVM before mitsuba is imported.
+
+Dr.Jit takes the first libLLVM it finds, and versions 14 to 16 abort the whole process on CPUs with
+AVX-512 ("Cannot select ... fminimum"), which no Python code can catch. So the library is chosen here:
+19 is known to work, other versions from 17 on are tried in a process of their own first.
+"""
+
+import ctypes
+import functools
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+from render.shared.errors import InputError
+from render.shared.files import cache_folder
+
+KNOWN_GOOD = 19
+OLDEST = 17
+REMEDY = "install libLLVM 19 (Debian/Ubuntu: apt-get install libllvm19) or set DRJIT_LIBLLVM_PATH to its .so file"
+_SEARCH = (
+    "/usr/lib/*-linux-gnu/libLLVM*.so*",
+    "/usr/lib/llvm-*/lib/libLLVM*.so*",
+    "/usr/lib64/libLLVM*.so*",
+    "/usr/lib/libLLVM*.so*",
+    "/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
+)
+_PROBE = """
+import mitsuba as mi, drjit as dr, sys
+mi.set_variant(sys.argv[1])
+scene = mi.load_dict({"type": "scene", "s": {"type": "sphere"}})
+x = dr.arange(mi.Float, 64) / 64
+ray = mi.Ray3f(mi.Point3f(x, dr.minimum(x, 0.5), 5), mi.Vector3f(0, 0, -1))
+assert dr.count(scene.ray_test(ray))[0] > 0
+"""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What `choose` decided: the Mitsuba variant, the libLLVM path (or None) and why, in words."""
+
+    variant: str
+    llvm: Path | None
+    reason: str
+
+
+def llvm_version(path: Path) -> int | None:
+    """Read the major version of a libLLVM from its file name (`libLLVM.so.19.1`, `libLLVM-17.so.1`)."""
+    for name in (path.name, path.resolve().name):
+        match = re.search(r"libLLVM(?:-|\.so\.|\.)(\d+)", name)
+        if match:
+            return int(match.group(1))
+    return None
+
+
+def find_llvm() -> list[tuple[int, Path]]:
+    """Return the (major version, path) of every libLLVM found, each library once, best candidate first."""
+    patterns = [*(str(cache_folder() / "llvm" / pattern.lstrip("/")) for pattern in _SEARCH), *_SEARCH]
+    found: dict[Path, tuple[int, Path]] = {}
+    for pattern in patterns:
+        for path in sorted(Path("/").glob(pattern.lstrip("/"))):
+            version = llvm_version(path)
+            if version and path.is_file():
+                found.setdefault(path.resolve(), (version, path))
+    return sorted(found.values(), key=lambda item: (item[0] != KNOWN_GOOD, -item[0]))
+
+
+def works(variant: str, llvm: Path | None = None) -> bool:
+    """Try a variant in a process of its own, since a bad libLLVM or OptiX aborts instead of raising."""
+    environment = dict(os.environ)
+    if llvm:
+        environment["DRJIT_LIBLLVM_PATH"] = str(llvm)
+    command = [sys.executable, "-c", _PROBE, variant]
+    try:
+        return subprocess.run(command, env=environment, capture_output=True, timeout=120, check=False).returncode == 0
+    except subprocess.TimeoutExpired:
+        return False
+
+
+def has_cuda_driver() -> bool:
+    """Tell whether the CUDA driver library can be loaded and sees at least one device."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    count = ctypes.c_int(0)
+    return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
+
+
+@functools.cache
+def choose() -> Choice:
+    """Decide which variant to use: `cuda_ad_rgb` where OptiX works, else `llvm_ad_rgb` with a working libLLVM.
+
+    `SDPS_VARIANT` forces the variant, `DRJIT_LIBLLVM_PATH` the library.
+
+    Raises:
+        InputError: no usable libLLVM; the message says what to install.
+    """
+    forced = os.environ.get("SDPS_VARIANT")
+    if forced not in (None, "", "cuda_ad_rgb", "llvm_ad_rgb"):
+        raise InputError(f"SDPS_VARIANT={forced}: use cuda_ad_rgb or llvm_ad_rgb")
+    if forced != "llvm_ad_rgb" and has_cuda_driver():
+        if works("cuda_ad_rgb"):
+            return Choice("cuda_ad_rgb", None, "a GPU is visible and OptiX traced a test ray")
+        if forced == "cuda_ad_rgb":
+            raise InputError("SDPS_VARIANT=cuda_ad_rgb: OptiX failed a test ray; unset SDPS_VARIANT to use the CPU")
+    elif forced == "cuda_ad_rgb":
+        raise InputError("SDPS_VARIANT=cuda_ad_rgb: no CUDA device is visible; unset SDPS_VARIANT to use the CPU")
+    return _choose_llvm("forced by SDPS_VARIANT" if forced else "no GPU with a working OptiX")
+
+
+def _choose_llvm(why: str) -> Choice:
+    """Pick the libLLVM for `llvm_ad_rgb`; `why` tells why the GPU is not used."""
+    given = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if given:
+        path = Path(given)
+        version = llvm_version(path)
+        if not path.is_file():
+            raise InputError(f"DRJIT_LIBLLVM_PATH={given}: no such file; {REMEDY}")
+        if version is not None and version < OLDEST:
+            raise InputError(f"DRJIT_LIBLLVM_PATH={given}: libLLVM {version} aborts the process; {REMEDY}")
+        return Choice("llvm_ad_rgb", path, f"{why}; libLLVM {version or '?'} given by DRJIT_LIBLLVM_PATH")
+    candidates = find_llvm()
+    for version, path in candidates:
+        if version == KNOWN_GOOD:
+            return Choice("llvm_ad_rgb", path, f"{why}; libLLVM {version} is known to work")
+        if version >= OLDEST and works("llvm_ad_rgb", path):
+            return Choice("llvm_ad_rgb", path, f"{why}; libLLVM {version} passed a test render")
+    seen = ", ".join(str(version) for version, _ in candidates) or "none"
+    raise InputError(f"no working libLLVM (found: {seen}; versions before {OLDEST} abort); {REMEDY}")
+
+
+@functools.cache
+def load() -> ModuleType:
+    """Choose the variant, import mitsuba under it and return the module; later calls return the same.
+
+    Raises:
+        InputError: no usable variant.
+    """
+    choice = choose()
+    if choice.llvm:
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(choice.llvm)
+    import mitsuba as mi
+
+    mi.set_variant(choice.variant)
+    return mi

@@ -1,0 +1,247 @@
+"""Camera paths and their shadow rays: all of a view's rays, whatever its lights and materials reflect."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from render.backend import variant
+from render.backend.arrays import opaque, upload
+from render.backend.sampling import bounce_variates, pixel_position, random_variates, stream
+from render.kernel import highlights
+from render.kernel.visibility import probe_count, probed_visibility, visibility
+from render.materials.kernels.packed import PackedSurfaces
+from render.records.manifest import View
+
+mi = variant.load()
+
+
+@dataclass(frozen=True)
+class Vertices:
+    """Path vertices of one depth, sorted by pixel; all arrays are Dr.Jit, in the object frame.
+
+    `words` holds the visibility bits: bit b of entry `w * N + i` tells whether vertex i sees light 32 w + b.
+    """
+
+    count: int
+    position: Any  # Point3f (N)
+    normal: Any  # Vector3f (N), shading normal
+    wi: Any  # Vector3f (N, or 1 at the camera hits), to the previous vertex
+    sample: Any  # UInt32 (N), number of the camera sample
+    words: Any  # UInt32 (ceil(L / 32) * N)
+    throughput: tuple  # K Color3f (N, or 1 at the camera hits): f cos / density along the path so far
+    weights: tuple  # K tuples of Float (N), weights of each surface's materials; None for a single material
+    spread: Any  # Float (N), d(solid angle of normals) / d(image area), or None where no highlight needs it
+    pixels: Any  # UInt32 (Q), pixels with at least one vertex
+    start: Any  # UInt32 (Q), first vertex of the pixel
+    length: Any  # UInt32 (Q), number of vertices of the pixel
+
+
+@dataclass(frozen=True)
+class Paths:
+    """What `trace` found: everything shading needs, and the ground truth of the view.
+
+    Attributes:
+        depths: Vertices per depth, camera hits first.
+        glints: Points found from the lights' mirror directions, or None.
+        directions: Light directions in the object frame (Dr.Jit, L).
+        lights, size, spp: Counts.
+        hits: (P,) uint32, samples per pixel that hit the object.
+        normal_sum: (P, 3) float64, sum of shading normals of the hits, camera frame.
+        depth_sum: (P,) float64, sum of z of the hits, in half image widths.
+        weight_sums: Per surface (M, P) float64, sum of the weights of its materials over the hits, or None.
+    """
+
+    depths: tuple[Vertices, ...]
+    glints: Any
+    directions: Any
+    lights: int
+    size: int
+    spp: int
+    hits: np.ndarray
+    normal_sum: np.ndarray
+    depth_sum: np.ndarray
+    weight_sums: tuple
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The orthographic camera in the object frame; the camera moves, so that the mesh's BVH serves every view."""
+
+    rotation: Any  # Matrix3f, object to camera
+    scale: Any  # Float
+    offset: Any  # Point2f
+    size: int
+
+    @classmethod
+    def of(cls, view: View, size: int) -> "Camera":
+        """Return the camera of a view."""
+        return cls(
+            opaque(mi.Matrix3f(view.matrix())), opaque(mi.Float(view.scale)), opaque(mi.Point2f(*view.offset)), size
+        )
+
+    def to_object(self, x: Any, y: Any, z: Any) -> "mi.Vector3f":
+        """Turn a camera-frame direction into the object frame."""
+        return mi.Vector3f(self.rotation.T @ mi.Vector3f(x, y, z))
+
+    def ray(self, x: Any, y: Any) -> "mi.Ray3f":
+        """Return the ray through image point (x, y) in [-1, 1]^2, x right, y up."""
+        origin = self.to_object((x - self.offset.x) / self.scale, (y - self.offset.y) / self.scale, 4)
+        return mi.Ray3f(mi.Point3f(origin), self.to_object(0, 0, -1))
+
+    def project(self, position: Any) -> tuple:
+        """Return the image coordinates (x, y) of points."""
+        moved = self.rotation @ mi.Vector3f(position)
+        return dr.fma(moved.x, self.scale, self.offset.x), dr.fma(moved.y, self.scale, self.offset.y)
+
+
+def trace(
+    scene: Any, view: View, surfaces: PackedSurfaces, lights: np.ndarray, *, size: int, spp: int, bounces: int,
+    seed: int, first: int = 0, probe: bool = True,
+) -> Paths:  # fmt: skip
+    """Follow the camera paths of samples `first` to `first + spp - 1` of every pixel; see `many_lights.render`."""
+    camera = Camera.of(view, size)
+    # Row by row, since a conversion of the whole would have the number of lights in its code.
+    rows = np.asarray(lights, np.float32).T
+    directions = opaque(camera.to_object(*(upload(mi.Float, row) for row in rows)))
+    ray, sample = _camera_rays(camera, spp, seed, first)
+    glossy, pixel_count = any(surfaces.glossy), size * size
+    depths: list[Vertices] = []
+    throughput = (mi.Color3f(1),) * len(surfaces)
+    for depth in range(bounces + 1):
+        found, uv = scene.ray_intersect(ray, depth == 0)
+        wi = -ray.d
+        # A one-sided BSDF is black from behind, so such paths end here, as they do in Mitsuba's `path`.
+        alive = found.is_valid() & ((depth == 0) | (dr.dot(found.sh_frame.n, wi) > 0))
+        prim = found.prim_index
+        # Together, or each gather below would trace the rays again.
+        dr.eval(alive, found.p, found.n, found.sh_frame.n, wi, prim, uv, sample, throughput)
+        kept = dr.compress(alive)
+        if len(kept) == 0:
+            break
+        if len(kept) == 1 and depth > 0:
+            # Dr.Jit treats an array of one entry as uniform, and would compile everything below once more for it.
+            kept = dr.concat([kept, kept])
+            throughput = tuple(value * 0.5 for value in throughput)
+        throughput = tuple(take(mi.Color3f, value, kept) for value in throughput)
+        position, normal = take(mi.Point3f, found.p, kept), take(mi.Vector3f, found.sh_frame.n, kept)
+        facet, wi = take(mi.Vector3f, found.n, kept), take(mi.Vector3f, wi, kept)
+        sample, prim, uv = take(mi.UInt32, sample, kept), take(mi.UInt32, prim, kept), take(mi.Point2f, uv, kept)
+        dr.eval(position, normal, facet, wi, sample, prim, uv, throughput)
+        segments = _segments(sample, spp, pixel_count)
+        rays = (scene, position, normal, facet, directions, len(lights))
+        if depth == 0 and probe:
+            probes = sample % opaque(mi.UInt32(spp)) < opaque(mi.UInt32(probe_count(spp)))
+            words = probed_visibility(*rays, probes, segments[1:])
+        else:
+            words = visibility(*rays, coherent=depth == 0)
+        spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and glossy else None
+        weights = surfaces.weights(position, prim)
+        depths.append(Vertices(len(kept), position, normal, wi, sample, words, throughput, weights, spread, *segments))
+        if depth < bounces:
+            ray, factors = _bounce(depths[-1], facet, surfaces, seed, depth + 1, first, spp)
+            throughput = tuple(value * factor for value, factor in zip(throughput, factors, strict=True))
+    glints = highlights.find(scene, camera, directions, surfaces, spp, seed, first) if glossy and depths else None
+    return Paths(tuple(depths), glints, directions, len(lights), size, spp, *_sums(depths, camera))
+
+
+def take(kind: type, source: Any, index: Any) -> Any:
+    """Gather the lanes `index` of an array; one that is uniform (width 1) stays so."""
+    source = kind(source)
+    return dr.gather(kind, source, index) if dr.width(source) > 1 else source
+
+
+def _camera_rays(camera: Camera, spp: int, seed: int, first: int) -> tuple["mi.Ray3f", "mi.UInt32"]:
+    """Cast orthographic rays through the samples of every pixel; return them and the samples' numbers."""
+    side, per_pixel = opaque(mi.UInt32(camera.size)), opaque(mi.UInt32(spp))
+    index = dr.arange(mi.UInt32, camera.size**2 * spp)
+    pixel = index // per_pixel
+    number = index - pixel * per_pixel + opaque(mi.UInt32(first))
+    place = pixel_position(pixel, number, stream(seed, 0))
+    half, row = 2 / mi.Float(side), pixel // side
+    x = (mi.Float(pixel - row * side) + place.x) * half - 1
+    y = 1 - (mi.Float(row) + place.y) * half
+    return camera.ray(x, y), index
+
+
+def _bounce(
+    vertices: Vertices, facet: Any, surfaces: PackedSurfaces, seed: int, depth: int, first: int, spp: int
+) -> tuple["mi.Ray3f", list]:
+    """Draw the next direction from the mixture of all materials' lobes.
+
+    Returns:
+        The rays, and per surface the weight f cos / density.
+    """
+    if depth == 1:
+        per_pixel = opaque(mi.UInt32(spp))
+        pixel = vertices.sample // per_pixel
+        number = vertices.sample - pixel * per_pixel + opaque(mi.UInt32(first))
+        chosen, u, v = bounce_variates(pixel, number, stream(seed, depth))
+    else:
+        chosen, u, v = random_variates(vertices.sample, stream(seed, (first << 8) + depth))
+    lobe, _, _ = random_variates(vertices.sample, stream(seed, (first << 8) + 128 + depth))
+    frame = mi.Frame3f(vertices.normal)
+    wi = frame.to_local(vertices.wi)
+    dr.eval(wi, chosen, u, v, lobe)
+    wo, density = surfaces.sample(vertices.weights, wi, chosen, lobe, mi.Point2f(u, v))
+    scale = dr.select(density > 0, dr.rcp(density), 0)
+    dr.eval(wi, wo, scale)
+    factors = [surfaces.eval(number, wi, wo, vertices.weights[number]) * scale for number in range(len(surfaces))]
+    start = dr.zeros(mi.SurfaceInteraction3f, vertices.count)
+    start.p, start.n = vertices.position, facet
+    ray = start.spawn_ray(frame.to_world(wo))
+    ray.maxt = dr.select(density > 0, ray.maxt, 0)
+    dr.eval(ray, factors)
+    return ray, factors
+
+
+def _segments(sample: Any, spp: int, pixel_count: int) -> tuple:
+    """Find the run of vertices of each pixel: samples are numbered pixel by pixel and kept in that order."""
+    counts = dr.zeros(mi.UInt32, pixel_count)
+    dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), sample // opaque(mi.UInt32(spp)))
+    starts = dr.prefix_sum(counts)
+    pixels = dr.compress(counts > 0)
+    if len(pixels) == 1:  # for the reason given in `trace`: beside it, another pixel without vertices
+        only = int(pixels[0])
+        return (
+            mi.UInt32([only, (only + 1) % pixel_count]), mi.UInt32([0, 0]), mi.UInt32([dr.width(sample), 0])
+        )  # fmt: skip
+    start, length = dr.gather(mi.UInt32, starts, pixels), dr.gather(mi.UInt32, counts, pixels)
+    dr.eval(start, length)
+    return pixels, start, length
+
+
+def _sums(depths: list[Vertices], camera: Camera) -> tuple:
+    """Sum hits, camera-frame normals, depths and material weights of the first vertices per pixel."""
+    pixel_count = camera.size**2
+    hits, normals, depth = np.zeros(pixel_count, np.uint32), np.zeros((pixel_count, 3)), np.zeros(pixel_count)
+    sums: list = []
+    if depths:
+        first = depths[0]
+        pixels = np.array(first.pixels)
+        hits[pixels] = np.array(first.length)
+        normal, place = camera.rotation @ first.normal, camera.rotation @ mi.Vector3f(first.position)
+        columns = _pixel_sums(first, [normal.x, normal.y, normal.z, place.z * camera.scale])
+        normals[pixels], depth[pixels] = np.stack(columns[:3], axis=1), columns[3]
+        for weights in first.weights:
+            sums.append(None if weights is None else np.zeros((len(weights), pixel_count)))
+            if weights is not None:
+                sums[-1][:, pixels] = _pixel_sums(first, weights)
+    return hits, normals, depth, tuple(sums)
+
+
+def _pixel_sums(vertices: Vertices, values: Sequence) -> list[np.ndarray]:
+    """Sum Float arrays over the vertices of each pixel that has any; return (Q,) float64 arrays."""
+    values = [value + dr.zeros(mi.Float, vertices.count) for value in values]
+    dr.eval(values)
+
+    def add(i: Any, *totals: Any) -> tuple:
+        at = vertices.start + i
+        return i + 1, *(total + dr.gather(mi.Float, value, at) for total, value in zip(totals, values, strict=True))
+
+    state = (mi.UInt32(0), *(mi.Float(0) for _ in values))
+    _, *totals = dr.while_loop(state, lambda i, *_: i < vertices.length, add)
+    dr.eval(totals)
+    return [np.array(total, dtype=np.float64) for total in totals]

@@ -1,0 +1,199 @@
+"""Radiance of traced paths, two surfaces at a time and without any ray.
+
+A kernel lane owns a (light, pixel) and adds up the pixel's vertices in their order: no atomics, one order, the same
+bytes on any number of threads.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import drjit as dr
+import numpy as np
+
+from render.backend import variant
+from render.backend.arrays import opaque
+from render.kernel import highlights
+from render.kernel.paths import Paths, Vertices, take
+from render.kernel.visibility import WORD
+from render.materials.kernels import bsdf
+from render.materials.kernels.bsdf import PackedMaterials
+from render.materials.kernels.packed import PackedSurfaces
+
+mi = variant.load()
+
+
+def shade(paths: Paths, surfaces: PackedSurfaces, wanted: Iterable[int]) -> Iterator[tuple[int, np.ndarray]]:
+    """Sum the radiance of surfaces over the paths.
+
+    Surfaces 2 k and 2 k + 1 are shaded in one kernel, which shares what does not depend on the material; always so,
+    whichever is wanted, since another kernel might round differently.
+
+    Yields:
+        (surface number, (L, size, size, 3) float32), summed (not averaged) over the samples of the pass.
+    """
+    wanted = list(wanted)
+    for first in range(0, len(surfaces), 2):
+        pair = [number for number in (first, first + 1) if number < len(surfaces)]
+        if set(pair) & set(wanted):
+            for number, stack in zip(pair, _shade_together(paths, surfaces, pair), strict=True):
+                if number in wanted:
+                    yield number, stack
+
+
+def _shade_together(paths: Paths, surfaces: PackedSurfaces, numbers: list[int]) -> list[np.ndarray]:
+    images = [dr.zeros(mi.Float, paths.lights * paths.size**2 * 3) for _ in numbers]
+    dr.eval(images)
+    fitted = [
+        all(isinstance(surfaces.families[part.family], PackedMaterials) for part in surfaces.parts[number])
+        for number in numbers
+    ]
+    for depth, vertices in enumerate(paths.depths):
+        fast = [k for k in range(len(numbers)) if depth == 0 and fitted[k]]
+        if fast:
+            chosen = [numbers[k] for k in fast]
+            _add_camera_hits([images[k] for k in fast], paths, vertices, surfaces, chosen)
+        for k in set(range(len(numbers))) - set(fast):
+            _add_vertices(images[k], paths, vertices, surfaces, numbers[k])
+    stacks = []
+    for number, image in zip(numbers, images, strict=True):
+        stack = np.array(image)
+        if surfaces.glossy[number] and paths.glints is not None:
+            _add_glints(stack, paths, surfaces, number)
+        stacks.append(stack.reshape(paths.lights, paths.size, paths.size, 3))
+    return stacks
+
+
+class _Lanes(NamedTuple):
+    """One lane per (light, pixel with vertices)."""
+
+    light: Any
+    start: Any
+    length: Any
+    direction: Any
+    words: Any  # first entry of the light's words
+    bit: Any
+    target: Any  # of the red channel
+
+
+def _lanes(paths: Paths, vertices: Vertices) -> _Lanes:
+    pixels, count = opaque(mi.UInt32(dr.width(vertices.pixels))), opaque(mi.UInt32(vertices.count))
+    lane = dr.arange(mi.UInt32, paths.lights * dr.width(vertices.pixels))
+    light = lane // pixels
+    pixel = lane - light * pixels
+    return _Lanes(
+        light=light,
+        start=dr.gather(mi.UInt32, vertices.start, pixel),
+        length=dr.gather(mi.UInt32, vertices.length, pixel),
+        direction=dr.gather(mi.Vector3f, paths.directions, light),
+        words=(light // WORD) * count,
+        bit=light % WORD,
+        target=3 * (light * opaque(mi.UInt32(paths.size**2)) + dr.gather(mi.UInt32, vertices.pixels, pixel)),
+    )
+
+
+def _accumulate(images: list, vertices: Vertices, lanes: _Lanes, reflect: Any) -> None:
+    """Add the radiances `reflect(vertex)`, one per image, over the vertices of each lane that see its light."""
+
+    def per_vertex(i: Any, *totals: Any) -> tuple:
+        at = lanes.start + i
+        lit = ((dr.gather(mi.UInt32, vertices.words, lanes.words + at) >> lanes.bit) & 1) != 0
+        values = dr.if_stmt((at,), lit, reflect, lambda at: tuple(mi.Color3f(0) for _ in images))
+        return i + 1, *(total + value for total, value in zip(totals, values, strict=True))
+
+    state = (mi.UInt32(0), *(mi.Color3f(0) for _ in images))
+    _, *totals = dr.while_loop(state, lambda i, *_: i < lanes.length, per_vertex)
+    for image, total in zip(images, totals, strict=True):
+        for channel in range(3):
+            dr.scatter_reduce(
+                dr.ReduceOp.Add, image, math.pi * total[channel], lanes.target + channel, mode=dr.ReduceMode.NoConflicts
+            )
+    dr.eval(images)
+
+
+def _add_vertices(image: Any, paths: Paths, vertices: Vertices, surfaces: PackedSurfaces, number: int) -> None:
+    """Add the light reflected at one depth, by any kind of material."""
+    lanes, throughput, weights = _lanes(paths, vertices), vertices.throughput[number], vertices.weights[number]
+    weigh = _partition(paths, vertices, lanes, surfaces, number)
+
+    def reflect(at: Any) -> Any:
+        normal = dr.gather(mi.Vector3f, vertices.normal, at)
+        frame = mi.Frame3f(normal)
+        wi = frame.to_local(take(mi.Vector3f, vertices.wi, at))
+        here = None if weights is None else tuple(take(mi.Float, weight, at) for weight in weights)
+        value = surfaces.eval(number, wi, frame.to_local(lanes.direction), here)
+        return (take(mi.Color3f, throughput, at) * value * weigh(at, normal),)
+
+    _accumulate([image], vertices, lanes, reflect)
+
+
+def _add_camera_hits(
+    images: list, paths: Paths, vertices: Vertices, surfaces: PackedSurfaces, numbers: list[int]
+) -> None:
+    """Add the light that surfaces of fitted materials reflect straight to the camera.
+
+    All hits share the direction to the camera, so per light the half vector and theta_d are constant: the tables
+    shrink to a row over theta_h per light (`PackedMaterials.rows`), and the factor of theta_i to one per hit.
+    """
+    lanes, wi = _lanes(paths, vertices), mi.Vector3f(vertices.wi)
+    half = dr.normalize(wi + lanes.direction)
+    cos_d = dr.minimum(dr.dot(wi, half), 1)
+    weighs = [_partition(paths, vertices, lanes, surfaces, number) for number in numbers]
+    materials = [_camera_rows(paths, vertices, surfaces, number, wi) for number in numbers]
+
+    def reflect(at: Any) -> Any:
+        normal = dr.gather(mi.Vector3f, vertices.normal, at)
+        cos_i, cos_o = dr.dot(normal, wi), dr.dot(normal, lanes.direction)
+        sin2_h = dr.squared_norm(dr.cross(normal, half))
+        entry = bsdf.half_cell(sin2_h, dr.dot(normal, half))
+        azimuth = bsdf.azimuth(cos_i, cos_o, sin2_h, cos_d)
+        shadow = bsdf.shadow_cell(cos_o)
+        lit = dr.select((cos_i > 0) & (cos_o > 0), cos_o, 0)
+        values = []
+        for parts, weigh in zip(materials, weighs, strict=True):
+            total = mi.Color3f(0)
+            for family, rows, shadow_row, scale in parts:
+                value = family.eval_row(rows, lanes.light, entry, azimuth) * family.eval_shadow(shadow_row, shadow)
+                total += value * dr.gather(mi.Color3f, scale, at)
+            values.append(total * lit * weigh(at, normal))
+        return tuple(values)
+
+    _accumulate(images, vertices, lanes, reflect)
+
+
+def _camera_rows(paths: Paths, vertices: Vertices, surfaces: PackedSurfaces, number: int, wi: Any) -> list[tuple]:
+    """Return per material of a surface its family, rows, factor S, and S(theta_i) times its weight at the hits."""
+    parts, weights = [], vertices.weights[number]
+    for k, part in enumerate(surfaces.parts[number]):
+        family, index = surfaces.families[part.family], opaque(mi.UInt32(part.index))
+        scale = family.shadow(index, bsdf.shadow_cell(dr.dot(vertices.normal, wi)))
+        if weights is not None:
+            scale *= weights[k]
+        dr.eval(scale)
+        parts.append((family, family.rows(index, wi, paths.directions), family.shadow_row(index), scale))
+    return parts
+
+
+def _partition(paths: Paths, vertices: Vertices, lanes: _Lanes, surfaces: PackedSurfaces, number: int) -> Any:
+    """Return the function that weighs a camera hit against the normals drawn around the half vector."""
+    if vertices.spread is None or not surfaces.glossy[number]:
+        return lambda at, normal: mi.Float(1)
+    half = dr.normalize(mi.Vector3f(vertices.wi) + lanes.direction)
+
+    def weigh(at: Any, normal: Any) -> Any:
+        spread = dr.gather(mi.Float, vertices.spread, at)
+        return highlights.partition(spread, highlights.one_minus_cos(normal, half), paths.size, paths.spp)
+
+    return weigh
+
+
+def _add_glints(stack: np.ndarray, paths: Paths, surfaces: PackedSurfaces, number: int) -> None:
+    """Add the points found from the lights' mirror directions, in their order."""
+    glints = paths.glints
+    frame = mi.Frame3f(glints.normal)
+    wo = frame.to_local(dr.gather(mi.Vector3f, paths.directions, glints.light))
+    value = surfaces.eval(number, frame.to_local(glints.wi), wo, glints.weights[number]) * glints.factor * math.pi
+    dr.eval(value)
+    pixels = stack.reshape(-1, 3)
+    for channel in range(3):
+        pixels[:, channel] += np.bincount(glints.target, np.array(value[channel], np.float64), len(pixels))

@@ -1,0 +1,170 @@
+"""Shadow rays of all lights, one bit each, as few as the picture needs.
+
+At the camera's hits neighbouring samples of a pixel mostly see the same lights. So the first samples of a pixel, spread
+evenly over it, probe every light. Where all of them agree that a light is seen, or that it is not, the others follow;
+where they differ, or none of them faces the light, every sample asks for itself.
+"""
+
+from typing import Any
+
+import drjit as dr
+
+from render.backend import variant
+from render.backend.arrays import opaque
+
+mi = variant.load()
+
+WORD = 32  # lights per word
+_LEAST_PROBES = 8
+_PROBED = 4  # one sample in so many probes, where there are more than the least
+
+
+def probe_count(spp: int) -> int:
+    """Return how many of a pixel's `spp` samples probe every light: all up to 8, then 8, then a quarter."""
+    if spp <= _LEAST_PROBES:
+        return spp
+    wanted = max(_LEAST_PROBES, spp // _PROBED)
+    return 1 << (wanted - 1).bit_length()  # a power of two, so that the probes are stratified
+
+
+def visibility(scene: Any, position: Any, normal: Any, facet: Any, directions: Any, lights: int, coherent: bool) -> Any:
+    """Cast one shadow ray per vertex and light it faces.
+
+    Args:
+        scene: What casts shadows.
+        position: (N) Point3f.
+        normal: (N) shading normals; a light below their horizon needs no ray.
+        facet: (N) geometric normals, along which rays start off the surface.
+        directions: (L) Vector3f to the lights.
+        lights: L.
+        coherent: Whether neighbouring vertices are close to each other.
+
+    Returns:
+        UInt32 (ceil(L / 32) * N): bit b of entry `w * N + i` tells whether vertex i sees light 32 w + b.
+    """
+    return _cast(scene, position, normal, facet, directions, lights, coherent)[0]
+
+
+def probed_visibility(
+    scene: Any, position: Any, normal: Any, facet: Any, directions: Any, lights: int, probes: Any, segments: tuple
+) -> Any:
+    """Do the same at the camera's hits, sorted by pixel, asking every light only where the probes disagree.
+
+    Args:
+        scene, position, normal, facet, directions, lights: As in `visibility`.
+        probes: (N) Bool, the samples that probe.
+        segments: (start, length) UInt32 (Q) of the pixels' runs of vertices.
+    """
+    count = dr.width(position)
+    tested = dr.compress(probes)
+    if len(tested) == 0 or len(tested) == count:
+        return visibility(scene, position, normal, facet, directions, lights, True)
+    at = [dr.gather(type(value), value, tested) for value in (position, normal, facet)]
+    lit, facing = _cast(scene, *at, directions, lights, True)
+    groups, total = -(-lights // WORD), opaque(mi.UInt32(count))
+    words = dr.zeros(mi.UInt32, count * groups)
+    lane = dr.arange(mi.UInt32, len(tested) * groups)
+    width = opaque(mi.UInt32(len(tested)))
+    group = lane // width
+    target = dr.fma(group, total, dr.gather(mi.UInt32, tested, lane - group * width))
+    known = dr.zeros(mi.UInt32, count * groups)  # facing bits of the probes
+    dr.scatter(words, lit, target)
+    dr.scatter(known, facing, target)
+    dr.eval(words, known)
+    agreed = _agreement(words, known, segments, total, groups)
+    return _complete(scene, (position, normal, facet), directions, words, probes, agreed, segments, lights)
+
+
+def _cast(scene: Any, position: Any, normal: Any, facet: Any, directions: Any, lights: int, coherent: bool) -> tuple:
+    """Return the words of lights seen, and of lights faced."""
+    count, groups = dr.width(position), -(-lights // WORD)
+    width, total = opaque(mi.UInt32(count)), opaque(mi.UInt32(lights))
+    lane = dr.arange(mi.UInt32, count * groups)
+    first = lane // width * WORD
+    start, shading = _start(position, normal, facet, lane - first // WORD * width)
+
+    def per_light(b: Any, seen: Any, faced: Any) -> tuple:
+        direction = dr.gather(mi.Vector3f, directions, first + b)
+        facing = dr.dot(shading, direction) > 0
+        lit = facing & ~scene.ray_test(start.spawn_ray(direction), coherent, facing)
+        return b + 1, seen | (mi.UInt32(lit) << b), faced | (mi.UInt32(facing) << b)
+
+    state = (mi.UInt32(0), mi.UInt32(0), mi.UInt32(0))
+    _, seen, faced = dr.while_loop(state, lambda b, *_: (b < WORD) & (first + b < total), per_light)
+    dr.eval(seen, faced)
+    return seen, faced
+
+
+def _agreement(words: Any, faced: Any, segments: tuple, count: Any, groups: int) -> tuple:
+    """Return, per pixel, the words of lights that all facing probes see, and that none of them sees (groups * Q)."""
+    start, length = segments
+    width = opaque(mi.UInt32(dr.width(start)))
+    lane = dr.arange(mi.UInt32, dr.width(start) * groups)
+    group = lane // width
+    pixel = lane - group * width
+    first, number = dr.gather(mi.UInt32, start, pixel), dr.gather(mi.UInt32, length, pixel)
+
+    def per_vertex(i: Any, some: Any, missing: Any) -> tuple:
+        at = dr.fma(group, count, first + i)
+        lit, facing = dr.gather(mi.UInt32, words, at), dr.gather(mi.UInt32, faced, at)
+        return i + 1, some | lit, missing | (facing & ~lit)
+
+    state = (mi.UInt32(0), mi.UInt32(0), mi.UInt32(0))
+    _, some, missing = dr.while_loop(state, lambda i, *_: i < number, per_vertex)
+    seen, hidden = some & ~missing, missing & ~some
+    dr.eval(seen, hidden)
+    return seen, hidden
+
+
+def _complete(
+    scene: Any, at: tuple, directions: Any, words: Any, probes: Any, agreed: tuple, segments: tuple, lights: int
+) -> Any:
+    """Fill in the words of the other vertices: what their pixel agrees on, and rays for the rest."""
+    count, groups = dr.width(probes), -(-lights // WORD)
+    others = dr.compress(~probes)
+    pixel = _pixel_of_vertex(segments, count)
+    width, total = opaque(mi.UInt32(len(others))), opaque(mi.UInt32(lights))
+    pixels = opaque(mi.UInt32(dr.width(segments[0])))
+    lane = dr.arange(mi.UInt32, len(others) * groups)
+    group = lane // width
+    vertex = dr.gather(mi.UInt32, others, lane - group * width)
+    entry = dr.fma(group, pixels, dr.gather(mi.UInt32, pixel, vertex))
+    seen, hidden = (dr.gather(mi.UInt32, word, entry) for word in agreed)
+    remaining = dr.minimum(total - group * WORD, WORD)
+    used = dr.select(remaining == WORD, mi.UInt32(0xFFFFFFFF), (mi.UInt32(1) << remaining) - 1)
+    asked, target = ~(seen | hidden) & used, dr.fma(group, opaque(mi.UInt32(count)), vertex)
+    dr.scatter(words, seen, target)
+    dr.eval(words, asked, target, group, vertex)
+    kept = dr.compress(asked != 0)
+    if len(kept) == 0:
+        return words
+    asked, target, first, vertex = (dr.gather(mi.UInt32, value, kept) for value in (asked, target, group, vertex))
+    first *= WORD
+    start, shading = _start(*at, vertex)
+
+    def per_bit(left: Any, bits: Any) -> tuple:
+        b = dr.tzcnt(left)
+        direction = dr.gather(mi.Vector3f, directions, first + b)
+        facing = dr.dot(shading, direction) > 0
+        lit = facing & ~scene.ray_test(start.spawn_ray(direction), True, facing)
+        return left & (left - 1), bits | (mi.UInt32(lit) << b)
+
+    _, bits = dr.while_loop((asked, dr.gather(mi.UInt32, words, target)), lambda left, _: left != 0, per_bit)
+    dr.scatter(words, bits, target)
+    dr.eval(words)
+    return words
+
+
+def _start(position: Any, normal: Any, facet: Any, index: Any) -> tuple:
+    """Return the interactions that shadow rays start from, and their shading normals."""
+    start = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+    start.p = dr.gather(mi.Point3f, mi.Point3f(position), index)
+    start.n = dr.gather(mi.Normal3f, mi.Normal3f(facet), index)
+    return start, dr.gather(mi.Vector3f, mi.Vector3f(normal), index)
+
+
+def _pixel_of_vertex(segments: tuple, count: int) -> "mi.UInt32":
+    """Return for every vertex the number of its run."""
+    flags = dr.zeros(mi.UInt32, count)
+    dr.scatter(flags, mi.UInt32(1), segments[0])
+    return dr.cumsum(flags) - 1

@@ -1,0 +1,1 @@
+"""Fitting the library: measured reflectance in, material files out."""

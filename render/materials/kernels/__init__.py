@@ -1,0 +1,1 @@
+"""Reflectance inside Dr.Jit kernels, and as Mitsuba BSDF plugins."""

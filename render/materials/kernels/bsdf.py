@@ -1,0 +1,197 @@
+"""The reflectance model inside Dr.Jit kernels: packed materials, and the Mitsuba plugin `ps_material`.
+
+Importing this module loads mitsuba. The numpy form, slow and plain, is `render.materials.model.evaluate`.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import drjit as dr
+import numpy as np
+
+from render.backend import variant
+from render.backend.arrays import table
+from render.materials import model
+from render.materials.kernels import plugin
+from render.materials.kernels.lobes import HalfVectorLobes, cell, half_cell
+from render.materials.kernels.plugin import FamilyBSDF
+from render.materials.library import load
+from render.materials.model import Material
+from render.shared.errors import InputError
+
+mi = variant.load()
+
+_ROWS, _COLUMNS, _SHADOW = model.HALF_KNOTS, model.DIFFERENCE_KNOTS, model.SHADOWING_KNOTS
+
+
+class Coordinates(NamedTuple):
+    """What evaluation needs of a pair of directions, whatever the material; from `PackedMaterials.prepare`."""
+
+    corner: Any  # UInt32, first of the four table entries around (theta_h, theta_d)
+    weights: tuple  # 4 Float, bilinear weights of the four entries
+    azimuth: Any  # Float, cos^2(phi_d)
+    shadow_i: tuple  # (UInt32, Float), cell and fraction of theta_i
+    shadow_o: tuple  # (UInt32, Float), cell and fraction of theta_o
+    cos_o: Any  # Float, zero where either direction is below the horizon
+    active: Any  # Bool
+
+
+class PackedMaterials(HalfVectorLobes):
+    """K materials as flat float32 arrays, for kernels that index them by number.
+
+    Number and values are opaque: exchanging materials, or their number, compiles nothing again. All methods work inside
+    symbolic loops and calls, in the local shading frame (z is the normal), with `index` in [0, K).
+
+    Args:
+        materials: At least one material.
+
+    Raises:
+        InputError: no material given.
+    """
+
+    def __init__(self, materials: Sequence[Material]) -> None:
+        if not materials:
+            raise InputError("materials: at least one is needed")
+        super().__init__(tuple(material.name for material in materials), list(materials))
+        self.tables = table(np.stack([_packed_tables(material) for material in materials]))
+        self.shadowing = table(np.stack([_packed_shadowing(material) for material in materials]))
+
+    @staticmethod
+    def prepare(wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True) -> Coordinates:
+        """Compute the part of an evaluation that all materials share: cells and weights of the tables."""
+        active = mi.Bool(active) & (wi.z > 0) & (wo.z > 0)
+        half = dr.normalize(wi + wo)
+        sin2_h = dr.fma(half.x, half.x, half.y * half.y)
+        cos_d = dr.minimum(dr.dot(wi, half), 1)
+        row, a = half_cell(sin2_h, half.z)
+        column, b = _difference_cell(cos_d)
+        return Coordinates(
+            corner=dr.fma(row, _COLUMNS, column),
+            weights=((1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b),
+            azimuth=azimuth(wi.z, wo.z, sin2_h, cos_d),
+            shadow_i=shadow_cell(wi.z),
+            shadow_o=shadow_cell(wo.z),
+            cos_o=dr.select(active, wo.z, 0),
+            active=active,
+        )
+
+    def eval_at(self, index: "mi.UInt32", at: Coordinates) -> "mi.Color3f":
+        """Evaluate f cos(theta_o) of the materials `index` at prepared coordinates."""
+        base = 2 * dr.fma(index, _ROWS * _COLUMNS, at.corner)
+        value = mi.Color3f(0)
+        for offset, weight in zip((0, 1, _COLUMNS, _COLUMNS + 1), at.weights, strict=True):
+            zero = load_rgb(self.tables, base + 2 * offset, at.active)
+            one = load_rgb(self.tables, base + 2 * offset + 1, at.active)
+            value += weight * dr.fma(at.azimuth, one - zero, zero)
+        for place in (at.shadow_i, at.shadow_o):
+            value *= self.shadow(index, place, at.active)
+        return value * at.cos_o
+
+    def shadow(self, index: "mi.UInt32", cell: tuple, active: "mi.Bool | bool" = True) -> "mi.Color3f":
+        """Return the factor S of the materials `index` at a `shadow_cell`."""
+        entry = 2 * dr.fma(index, _SHADOW - 1, cell[0])
+        lower = load_rgb(self.shadowing, entry, mi.Bool(active))
+        slope = load_rgb(self.shadowing, entry + 1, mi.Bool(active))
+        return dr.fma(cell[1], slope, lower)
+
+    def rows(self, index: "mi.UInt32", wi: "mi.Vector3f", directions: "mi.Vector3f") -> list:
+        """Reduce the table of one material to a row over theta_h for each of L light directions seen from one side.
+
+        Args:
+            index: The material.
+            wi: (1) unit vector to the viewer.
+            directions: (L) unit vectors to the lights, any common frame.
+
+        Returns:
+            Six Float arrays (L * 32): RGB at e = 0, then RGB at e = 1.
+        """
+        lane = dr.arange(mi.UInt32, dr.width(directions) * _ROWS)
+        light = lane // _ROWS
+        direction = dr.gather(mi.Vector3f, directions, light)
+        column, b = _difference_cell(dr.minimum(dr.dot(wi, dr.normalize(wi + direction)), 1))
+        corner = 2 * (dr.fma(index, _ROWS, lane - light * _ROWS) * _COLUMNS + column)
+        values = []
+        for azimuth_end in range(2):
+            left = load_rgb(self.tables, corner + azimuth_end, mi.Bool(True))
+            right = load_rgb(self.tables, corner + azimuth_end + 2, mi.Bool(True))
+            values += [left[c] + b * (right[c] - left[c]) for c in range(3)]
+        dr.eval(values)
+        return values
+
+    @staticmethod
+    def eval_row(rows: list, light: "mi.UInt32", cell: tuple, azimuth: "mi.Float") -> "mi.Color3f":
+        """Evaluate T in the rows of `rows` at a `half_cell`, without the factors S and the cosine."""
+        entry = light * _ROWS + cell[0]
+        lower = [dr.gather(mi.Float, row, entry) for row in rows]
+        upper = [dr.gather(mi.Float, row, entry + 1) for row in rows]
+        ends = [low + cell[1] * (high - low) for low, high in zip(lower, upper, strict=True)]
+        return mi.Color3f(*(dr.fma(azimuth, ends[c + 3] - ends[c], ends[c]) for c in range(3)))
+
+    def shadow_row(self, index: "mi.UInt32") -> list:
+        """Return the factor S of one material as six short Float arrays (8): RGB at the cells, and its change."""
+        entry = 2 * dr.fma(index, _SHADOW - 1, dr.arange(mi.UInt32, _SHADOW - 1))
+        values = [*load_rgb(self.shadowing, entry, mi.Bool(True)), *load_rgb(self.shadowing, entry + 1, mi.Bool(True))]
+        dr.eval(values)
+        return values
+
+    @staticmethod
+    def eval_shadow(row: list, cell: tuple) -> "mi.Color3f":
+        """Evaluate S in a `shadow_row` at a `shadow_cell`."""
+        values = [dr.gather(mi.Float, entry, cell[0]) for entry in row]
+        return mi.Color3f(*(dr.fma(cell[1], values[c + 3], values[c]) for c in range(3)))
+
+
+def shadow_cell(cosine: "mi.Float") -> tuple:
+    """Return the cell and fraction of an elevation for the factor S."""
+    return cell(1 - cosine, _SHADOW)
+
+
+def azimuth(cos_i: "mi.Float", cos_o: "mi.Float", sin2_h: "mi.Float", cos_d: "mi.Float") -> "mi.Float":
+    """Return e = cos^2(phi_d) (see `model.coordinates`)."""
+    product = sin2_h * (1 - cos_d) * (1 + cos_d)
+    return dr.minimum(dr.square(cos_i - cos_o) / (4 * dr.maximum(product, 1e-9)), 1)
+
+
+def _difference_cell(cos_d: "mi.Float") -> tuple:
+    return cell(dr.sqrt(dr.maximum(1 - cos_d, 0)), _COLUMNS)
+
+
+def load_rgb(source: "mi.Float", entry: "mi.UInt32", active: "mi.Bool") -> "mi.Color3f":
+    """Load one RGB entry of four floats.
+
+    One packet load on the GPU. On the CPU three plain loads, which are as fast: Dr.Jit compiles a packet load into
+    different code by the alignment of the array, so kernels would be compiled again for other materials.
+    """
+    if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
+        packet = dr.gather(mi.Vector4f, source, entry, active)
+        return mi.Color3f(packet.x, packet.y, packet.z)
+    return mi.Color3f(*(dr.gather(mi.Float, source, 4 * entry + channel, active) for channel in range(3)))
+
+
+def register() -> None:
+    """Register the Mitsuba BSDF plugin `ps_material` (property `material`: a library name or a YAML path), once."""
+    plugin.register("ps_material", MERLFitBSDF)
+
+
+class MERLFitBSDF(FamilyBSDF):
+    """One-sided Mitsuba BSDF of one `Material`, e.g. `{'type': 'ps_material', 'material': 'chrome'}`."""
+
+    def __init__(self, props: "mi.Properties") -> None:
+        self.material = load(props["material"])
+        super().__init__(props, [PackedMaterials([self.material])])
+
+    def to_string(self) -> str:
+        """Name the material."""
+        return f"MERLFitBSDF[material={self.material.name}]"
+
+
+def _packed_tables(material: Material) -> np.ndarray:
+    """Return (32, 6, 2, 4): per knot the RGB table at e = 0 and e = 1, padded to four floats each."""
+    both = np.stack(model.azimuth_tables(material))  # (2, 3, 32, 6)
+    return np.pad(both.transpose(2, 3, 0, 1), ((0, 0), (0, 0), (0, 0), (0, 1)))
+
+
+def _packed_shadowing(material: Material) -> np.ndarray:
+    """Return (8, 2, 4): per cell RGB at its start and the change over it, padded to four floats each."""
+    knots = material.shadowing.T  # (9, 3)
+    return np.pad(np.stack([knots[:-1], np.diff(knots, axis=0)], 1), ((0, 0), (0, 0), (0, 1)))

@@ -1,0 +1,45 @@
+"""The Mitsuba plugin `ps_surface`: any surface of this project under Mitsuba's own integrators.
+
+The slow counterpart of `PackedSurfaces`, for `render.kernel.reference`; properties `material` (a surface name),
+`to_object` (world to the object's unit sphere) and, for patterns that follow a mesh's pieces, `shape` (its name).
+"""
+
+import numpy as np
+
+from render import shapes
+from render.backend import variant
+from render.materials import surfaces
+from render.materials.kernels import plugin
+from render.materials.kernels.packed import PackedSurfaces
+from render.materials.kernels.patterns import Evaluator
+from render.materials.kernels.plugin import FamilyBSDF
+
+mi = variant.load()
+
+
+def register() -> None:
+    """Register the plugin, once."""
+    plugin.register("ps_surface", SurfaceBSDF)
+
+
+class SurfaceBSDF(FamilyBSDF):
+    """One-sided BSDF sum_k w_k(x) f_k of one surface."""
+
+    def __init__(self, props: "mi.Properties") -> None:
+        surface = surfaces.load(props["material"])
+        self.packed = PackedSurfaces([surfaces.Surface(surface.name, surface.components)])
+        mesh = shapes.load(props["shape"]) if "shape" in props else None
+        self.pattern = surface.pattern and Evaluator(surface.pattern, mesh)
+        to_object = props.get("to_object", mi.ScalarTransform4f())
+        self.to_object = mi.Transform4f(mi.Matrix4f(np.array(to_object.matrix, np.float32)))
+        super().__init__(props, self.packed.families)
+
+    def parts(self, si: "mi.SurfaceInteraction3f") -> list[tuple]:
+        """Return (family, index, weight) of each material where the pattern is evaluated."""
+        weights = self.pattern.at(self.to_object @ si.p, si.prim_index) if self.pattern else [mi.Float(1)]
+        places = self.packed.parts[0]
+        return [(self.families[p.family], mi.UInt32(p.index), w) for p, w in zip(places, weights, strict=True)]
+
+    def to_string(self) -> str:
+        """Name the surface."""
+        return f"SurfaceBSDF[material={self.packed.names[0]}]"

@@ -1,0 +1,129 @@
+"""Which scenes a data folder is to hold."""
+
+from dataclasses import dataclass, field
+
+from render.materials.surfaces import MOST_COMPONENTS, PATTERNS
+from render.planning import light_sets
+from render.shared.errors import InputError, unknown
+
+UPRIGHT = ("sculpture", "bunny")  # families that stand; others have no up
+LARGEST_SCALE = 10.0  # of a view
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataConfig:
+    """Which scenes to render.
+
+    Attributes:
+        seed: Root seed; 0 is a seed like any other.
+        families: Seeded shape families and how many shapes of each.
+        views: Random views per shape.
+        materials_per_view: Different random materials per view (each is a sample of its own; they share rays).
+        materials: Names, categories, or `all`; `lambertian:<albedo>` and material files are allowed.
+        material_weights: How often a material is drawn relative to the others, which count 1, by name or category; of
+            a material that both name, the name counts.
+        validation_materials: Materials, as in `materials`, that every second validation scene has in place of its own,
+            on all of its surface; `held-out` are those the package keeps for this. Empty: none.
+        spatially_varying: Share of the scenes whose surface mixes materials in a pattern, in [0, 1]. Such a scene
+            keeps the material it would have had alone as its first one.
+        patterns: Patterns to draw from: patches, stripes, noise, gradient, parts.
+        mixture: Fewest and most materials of a mixed surface.
+        validation: Share of the shapes of each family kept for validation, in [0, 0.5], at least one when above 0.
+            Raising a count moves no shape from one split to the other.
+        lights: Distribution of the light directions, drawn anew for each view.
+        light_count: Lights per view.
+        size: Image side in pixels, a multiple of 4.
+        spp: Camera samples per pixel.
+        bounces: Interreflection bounces.
+        scale: Range of the radius of the bounding sphere of blobs, in half image widths.
+        upright_scale: The same for standing shapes, which fill less of their bounding sphere.
+        offset: Largest image-plane offset of the object, in half image widths, per unit of scale above 0.5.
+        tiles: Standing shapes are framed in an image of tiles x tiles frames (whose half width `upright_scale` counts
+            in), and one of these tiles, drawn at random, is the view. The published recipe has 4.
+        min_foreground: Least share of the frame the shape must cover, by family; other views are drawn anew.
+        min_normal_spread: Least degrees between the normals of a view and their mean (`render.planning.framing`), by
+        family;
+            views of flat facets are drawn anew.
+    """
+
+    seed: int = 0
+    families: dict[str, int] = field(default_factory=lambda: {"blobby": 8, "sculpture": 8})
+    views: int = 2
+    materials_per_view: int = 2
+    materials: tuple[str, ...] = ("all",)
+    material_weights: dict[str, float] = field(default_factory=dict)
+    validation_materials: tuple[str, ...] = ()
+    spatially_varying: float = 0.0
+    patterns: tuple[str, ...] = tuple(PATTERNS)
+    mixture: tuple[int, int] = (2, 3)
+    validation: float = 0.05
+    lights: str = "azimuth-elevation"
+    light_count: int = 64
+    size: int = 128
+    spp: int = 128
+    bounces: int = 2
+    scale: tuple[float, float] = (0.75, 1.25)
+    upright_scale: tuple[float, float] = (0.95, 2.0)
+    offset: float = 0.25
+    tiles: int = 1
+    min_foreground: dict[str, float] = field(default_factory=dict)
+    min_normal_spread: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("views", "materials_per_view", "light_count", "spp", "tiles"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.seed < 0:
+            raise InputError(f"seed must not be negative, got {self.seed}")
+        if self.size < 16 or self.size % 4:
+            raise InputError(f"size must be a multiple of 4 from 16 up, got {self.size}")
+        if not 0 <= self.bounces <= 16:
+            raise InputError(f"bounces must be in 0..16, got {self.bounces}")
+        if not 0 <= self.validation <= 0.5:
+            raise InputError(f"validation must be in [0, 0.5], got {self.validation}")
+        if self.lights not in light_sets.DISTRIBUTIONS:
+            raise unknown("value for lights:", self.lights, light_sets.DISTRIBUTIONS)
+        for name in ("scale", "upright_scale"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise InputError(f"{name} must be two rising positive numbers, got {low}, {high}")
+        if not self.families or min(self.families.values()) < 0:
+            raise InputError("families must name at least one shape family with a count of 0 or more")
+        self._check_surfaces()
+        self._check_framing()
+
+    def _check_surfaces(self) -> None:
+        if not 0 <= self.spatially_varying <= 1:
+            raise InputError(f"spatially_varying must be in [0, 1], got {self.spatially_varying}")
+        low, high = self.mixture
+        if not 2 <= low <= high <= MOST_COMPONENTS:
+            raise InputError(f"mixture must be two rising numbers in 2..{MOST_COMPONENTS}, got {low}, {high}")
+        for name, weight in self.material_weights.items():
+            if not 0 <= weight <= 100:
+                raise InputError(f"material_weights.{name} must be in [0, 100], got {weight}")
+        if not self.patterns:
+            raise InputError(f"patterns must name at least one of {', '.join(PATTERNS)}")
+        for name in self.patterns:
+            if name not in PATTERNS:
+                raise unknown("value for patterns:", name, PATTERNS)
+
+    def _check_framing(self) -> None:
+        if self.tiles * self.upright_scale[1] > LARGEST_SCALE:
+            raise InputError(
+                f"tiles x upright_scale must not exceed {LARGEST_SCALE:g}, got {self.tiles} x {self.upright_scale[1]}"
+            )
+        for name, limit in (("min_foreground", 0.9), ("min_normal_spread", 30.0)):
+            for family, value in getattr(self, name).items():
+                if family not in self.families:
+                    raise unknown(f"family in {name}:", family, self.families)
+                if not 0 <= value <= limit:
+                    raise InputError(f"{name}.{family} must be in [0, {limit:g}], got {value}")
+
+    def tiles_of(self, family: str) -> int:
+        """Return the tiles along each side of the image of a family."""
+        return self.tiles if family in UPRIGHT else 1
+
+    def is_framed(self, family: str) -> bool:
+        """Tell whether the views of a family depend on how the mesh fills them."""
+        limits = (self.min_foreground.get(family, 0), self.min_normal_spread.get(family, 0))
+        return self.tiles_of(family) > 1 or max(limits) > 0

@@ -1,0 +1,259 @@
+"""From a data configuration to the list of scenes, before the first pixel."""
+
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from render.materials import library, surfaces
+from render.planning import light_sets
+from render.planning.data_config import UPRIGHT, DataConfig
+from render.records.manifest import SceneSpec, View
+from render.shared.errors import InputError, unknown
+from render.shared.progress import progress_bar
+from render.shared.seeds import derived_seed, generator
+
+__all__ = ["DataConfig", "is_validation", "material_pool", "plan", "random_view"]
+
+POSES_TRIED = 24  # per view, before the shape is given up
+SHAPES_TRIED = 8
+HELD_OUT = "held-out"  # the materials that training never sees
+EMPTY = 0.02  # share of the frame below which a tile shows nothing worth rendering
+
+
+def plan(config: DataConfig, processes: int = 1) -> list[SceneSpec]:
+    """List every scene of `config`; the same configuration gives the same list.
+
+    Scenes of one view differ only in material and stand together, so that the renderer can share their rays.
+
+    Args:
+        config: What to render.
+        processes: Processes that share the work where views depend on the mesh; they change nothing in the list.
+
+    Raises:
+        InputError: an unknown family or material, more materials per view than there are, or a shape that cannot be
+            framed as the configuration asks.
+    """
+    from render.shapes.registry import FAMILIES
+
+    pool = material_pool(config.materials)
+    most = max(config.materials_per_view, config.mixture[1] if config.spatially_varying else 1)
+    if most > len(pool):
+        name = "materials_per_view" if most == config.materials_per_view else "mixture"
+        raise InputError(f"{name} is {most}, but there are {len(pool)} materials")
+    weights = material_weights(config, pool)
+    if weights is not None and np.count_nonzero(weights) < most:
+        raise InputError(f"material_weights leave {np.count_nonzero(weights)} materials, {most} are drawn at once")
+    unseen = material_pool(config.validation_materials)
+    joined = next((name for name in pool if "+" in name), None)
+    if config.spatially_varying and joined:
+        raise InputError(f"materials: {joined!r} has a '+' and cannot be mixed with others; leave it out or rename it")
+    for family in config.families:
+        if family not in FAMILIES or not FAMILIES[family].seeded:
+            raise unknown("shape family", family, [name for name, entry in FAMILIES.items() if entry.seeded])
+    shapes = [(family, number) for family, count in config.families.items() for number in range(count)]
+    if not shapes:
+        raise InputError("families: no scene to render; raise a count above 0")
+    framed = any(config.is_framed(family) for family, _ in shapes)
+    with _mapping(processes if framed else 1) as mapping:
+        planned = mapping(partial(_plan_shape, config, _Materials(pool, weights, unseen)), shapes)
+        bar = progress_bar(planned, total=len(shapes), desc="plan", unit="shape", disable=not framed)
+        return [scene for scenes in bar for scene in scenes]
+
+
+class _Materials(NamedTuple):
+    """What scenes are made of.
+
+    Attributes:
+        pool: Names.
+        weights: (M,) probability of each, or None for equal ones.
+        unseen: Names for validation scenes alone.
+    """
+
+    pool: list[str]
+    weights: np.ndarray | None
+    unseen: list[str]
+
+    def order(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Draw the numbers of `count` different materials of the pool."""
+        if self.weights is None:
+            return rng.permutation(len(self.pool))[:count]
+        return rng.choice(len(self.pool), size=count, replace=False, p=self.weights)
+
+
+def material_weights(config: DataConfig, pool: list[str]) -> np.ndarray | None:  # (M,)
+    """Return the probability of each material of a pool, or None where all are equal.
+
+    Raises:
+        InputError: a weight for what is neither a material of the pool nor a category of one.
+    """
+    if not config.material_weights:
+        return None
+    kinds = [next(iter(surfaces.load(name).components)).category for name in pool]
+    for name in config.material_weights:
+        if name not in pool and name not in kinds:
+            raise unknown("material or category in material_weights:", name, {*pool, *kinds})
+    given = config.material_weights
+    weights = np.array([given.get(name, given.get(kind, 1.0)) for name, kind in zip(pool, kinds, strict=True)])
+    return weights / max(weights.sum(), 1e-12)
+
+
+@contextmanager
+def _mapping(processes: int) -> Iterator[Any]:
+    """Yield `map`, or one that spreads the work over processes and keeps its order."""
+    if processes <= 1:
+        yield map
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=context) as executor:
+        try:
+            yield partial(executor.map, chunksize=4)
+        except BaseException:
+            executor.shutdown(cancel_futures=True)
+            raise
+
+
+def is_validation(number: int, share: float) -> bool:
+    """Tell whether shape `number` of a family is held out for validation.
+
+    Every 1/share-th shape is, the first one included, so of the first N shapes exactly ceil(share N), and whether a
+    shape is does not depend on how many there are.
+    """
+    return share > 0 and (number == 0 or int(round(number * share, 9)) > int(round((number - 1) * share, 9)))
+
+
+def material_pool(chosen: tuple[str, ...]) -> list[str]:
+    """Expand `all`, `held-out` and category names into material names, keeping everything else that can be loaded.
+
+    Raises:
+        InputError: a name that is neither.
+    """
+    categories, pool = library.categories(), []
+    for name in chosen:
+        if name == "all":
+            pool += library.names()
+        elif name == HELD_OUT:
+            pool += library.held_out()
+        elif name in categories:
+            pool += categories[name]
+        else:
+            surfaces.load(name)
+            pool.append(name)
+    return list(dict.fromkeys(pool))
+
+
+def _plan_shape(config: DataConfig, materials: _Materials, key: tuple[str, int]) -> list[SceneSpec]:
+    """Plan all views of one shape; a shape that cannot be framed as asked is replaced by another one."""
+    family, number = key
+    for attempt in range(SHAPES_TRIED):
+        replaced = ("instead", attempt) if attempt else ()
+        shape = f"{family}:{derived_seed(config.seed, family, number, *replaced)}"
+        views = _views(config, family, number, shape)
+        if views is not None:
+            return [
+                scene
+                for view, pose in enumerate(views)
+                for scene in _plan_view(config, (family, number, view), shape, pose, materials)
+            ]
+    raise InputError(
+        f"{family} {number}: {SHAPES_TRIED} shapes in turn have a view without a fitting pose in {POSES_TRIED}; lower "
+        f"min_foreground.{family} or min_normal_spread.{family}, or raise the scale"
+    )
+
+
+def _views(config: DataConfig, family: str, number: int, shape: str) -> list[View] | None:
+    """Draw the poses of a shape, or None when one of them cannot be framed as asked."""
+    if not config.is_framed(family):
+        return [
+            random_view(config, family, generator(config.seed, family, number, view, "view"))
+            for view in range(config.views)
+        ]
+    from render.shapes import load
+
+    mesh, views = load(shape), []
+    for view in range(config.views):
+        pose = _framed_view(config, family, (family, number, view), mesh)
+        if pose is None:
+            return None
+        views.append(pose)
+    return views
+
+
+def _framed_view(config: DataConfig, family: str, keys: tuple, mesh: Any) -> View | None:
+    """Draw poses until one, or one of its tiles, shows enough of the shape."""
+    from render.planning.framing import measure, tile_view
+
+    tiles = config.tiles_of(family)
+    least = max(config.min_foreground.get(family, 0.0), EMPTY)
+    for attempt in range(POSES_TRIED):
+        again = (attempt,) if attempt else ()
+        pose = random_view(config, family, generator(config.seed, *keys, "view", *again))
+        framing = measure(mesh, pose, tiles)
+        fits = (framing.foreground >= least) & (framing.spread >= config.min_normal_spread.get(family, 0.0))
+        if fits.any():
+            choice = generator(config.seed, *keys, "tile", *again).choice(np.flatnonzero(fits))
+            return tile_view(pose, *divmod(int(choice), tiles), tiles)
+    return None
+
+
+def _plan_view(config: DataConfig, keys: tuple, shape: str, pose: View, materials: _Materials) -> list[SceneSpec]:
+    """Draw lights and materials of one view; each from a stream of its own."""
+    family, number, view = keys
+    directions = light_sets.draw(config.lights, config.light_count, generator(config.seed, *keys, "lights"))
+    order = materials.order(generator(config.seed, *keys, "materials"), config.materials_per_view)
+    surface = [_surface(config, (*keys, "surface", slot), materials, index) for slot, index in enumerate(order)]
+    held_out = is_validation(number, config.validation)
+    if held_out and materials.unseen:
+        drawn = generator(config.seed, *keys, "unseen").permutation(len(materials.unseen))
+        surface[1::2] = [materials.unseen[index] for index in np.resize(drawn, len(surface[1::2]))]
+    common = {
+        "seed": derived_seed(config.seed, *keys, "sampler"),
+        "split": "val" if held_out else "train",
+        "shape": shape,
+        "view": pose,
+        "lights": tuple(tuple(round(float(c), 6) for c in row) for row in directions),
+        "size": config.size,
+        "spp": config.spp,
+        "bounces": config.bounces,
+    }
+    name = f"{family}-{number:05d}-v{view}"
+    return [SceneSpec(id=f"{name}-m{slot}", material=material, **common) for slot, material in enumerate(surface)]
+
+
+def _surface(config: DataConfig, keys: tuple, materials: _Materials, first: int) -> str:
+    """Name the surface of a scene: material `first` alone, or mixed with others by a seeded pattern."""
+    rng, pool = generator(config.seed, *keys), materials.pool
+    if rng.random() >= config.spatially_varying:
+        return pool[first]
+    count = int(rng.integers(config.mixture[0], config.mixture[1] + 1))
+    drawn = rng.permutation(len(pool)) if materials.weights is None else materials.order(rng, count)
+    others = [index for index in drawn if index != first][: count - 1]
+    names = "+".join(pool[index] for index in (first, *others))
+    pattern = config.patterns[int(rng.integers(len(config.patterns)))]
+    return f"{pattern}:{int(rng.integers(2**31))}:{names}"
+
+
+def random_view(config: DataConfig, family: str, rng: np.random.Generator) -> View:
+    """Draw a pose: any rotation for blobs; any yaw, but limited pitch and roll, for shapes that stand."""
+    if family in UPRIGHT:
+        # Turned about its own axis first, then tipped towards the camera (positive: seen from above), then rolled.
+        yaw, pitch, roll = rng.uniform(-180, 180), rng.uniform(-30, 55), rng.uniform(-15, 15)
+        rotation = Rotation.from_euler("yxz", [yaw, pitch, roll], degrees=True)
+        scale = float(np.exp(rng.uniform(*np.log(config.upright_scale))))
+    else:
+        rotation = Rotation.random(rng=rng)
+        scale = float(rng.uniform(*config.scale))
+    reach = config.offset * max(scale - 0.5, 0.0)
+    # Standing shapes are tall and thin: move along their height, or most of the frame is empty.
+    spread = np.array([0.4, 1.6]) if family in UPRIGHT else np.ones(2)
+    offset = rng.uniform(-reach, reach, 2) * spread
+    return View(
+        rotation=tuple(round(float(value), 9) for value in rotation.as_matrix().ravel()),
+        scale=round(scale, 6),
+        offset=(round(float(offset[0]), 6), round(float(offset[1]), 6)),
+    )

@@ -1,0 +1,1 @@
+"""What goes with data to other people: dataset card, Croissant metadata, Mitsuba scene files."""

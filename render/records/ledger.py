@@ -1,0 +1,148 @@
+"""What a data folder remembers of its runs: finished shards in `log/done-*.jsonl`, failures in `failed.jsonl`.
+
+Both are only appended to, one line per event, so that a run that is stopped leaves at most a torn last line, which
+readers skip. Every run writes a ledger of its own; several machines may fill one folder.
+"""
+
+import json
+import os
+import socket
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+
+from render.records.manifest import FAILED, SceneSpec, read_events, read_failed
+from render.records.shards import is_whole
+from render.shared.errors import InputError
+
+LOG = "log"
+SHARDS = "shards"
+
+
+def now() -> str:
+    """Return the time in UTC as ISO 8601 text."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+class Ledger:
+    """The ledger of one run, open for appending; the file appears with its first line.
+
+    Args:
+        folder: The data folder.
+
+    Raises:
+        InputError: from `add` and `fail`: the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        start = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")
+        host = socket.gethostname().split(".")[0] or "host"
+        self.folder = folder
+        self.path = folder / LOG / f"done-{host}-{os.getpid()}-{start}.jsonl"
+        self._handle = None
+
+    def __enter__(self) -> "Ledger":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._handle is not None:
+            self._handle.close()
+
+    def add(self, line: dict) -> None:
+        """Append the line of a finished shard: id, spec, bytes, seconds, stages, time, worker."""
+        try:
+            if self._handle is None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._handle = open(self.path, "a", encoding="utf-8")  # noqa: SIM115 - open for the whole run
+            self._handle.write(json.dumps(line) + "\n")
+            self._handle.flush()
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be written ({error.strerror or error}); free space") from error
+
+    def fail(self, line: dict) -> None:
+        """Append the line of a failure: id, seed, shape, material, reason, traceback, seconds, attempt, time."""
+        path = self.folder / FAILED
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(path, "a", encoding="utf-8") as handle:  # one write each: several machines append to this file
+                handle.write(json.dumps(line) + "\n")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror or error}); free space") from error
+
+
+def read_runs(folder: Path) -> list[list[dict]]:
+    """Return the ledger lines of every run that finished a shard."""
+    runs = (list(read_events(path)) for path in sorted((folder / LOG).glob("done-*.jsonl")))
+    return [lines for lines in runs if lines]
+
+
+def latest(runs: Sequence[list[dict]]) -> dict[str, dict]:
+    """Return the last line of every finished shard by id, in order of time."""
+    lines = sorted((line for lines in runs for line in lines), key=lambda line: line["time"])
+    return {line["id"]: line for line in lines}
+
+
+def shard_sizes(folder: Path) -> dict[str, int]:
+    """Return the bytes of every shard file by scene id, from one look at the folder."""
+    try:
+        with os.scandir(folder / SHARDS) as entries:
+            return {
+                entry.name[:-4]: entry.stat().st_size
+                for entry in entries
+                if entry.name.endswith(".exr") and not entry.name.startswith(".")
+            }
+    except FileNotFoundError:
+        return {}
+    except NotADirectoryError as error:
+        raise InputError(f"{folder / SHARDS}: cannot be written (not a folder); choose another --out") from error
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Which scenes of a plan are finished.
+
+    Attributes:
+        done: Ids with a whole shard.
+        failed: Ids that failed before and are not done, with all their failure lines.
+        lines: Ledger line per finished shard that has one.
+        size: Bytes of the finished shards.
+    """
+
+    done: frozenset[str]
+    failed: dict[str, list[dict]]
+    lines: dict[str, dict]
+    size: int
+
+
+def survey(folder: Path, scenes: Sequence[SceneSpec], *, verify: bool = False) -> Survey:
+    """Find out which scenes need no rendering.
+
+    A shard of the size and manifest line its ledger says is taken as whole; others are hashed, or all with `verify`.
+    """
+    sizes, lines = shard_sizes(folder), latest(read_runs(folder))
+    done, listed = set(), {}
+    for scene in scenes:
+        size = sizes.get(scene.id)
+        if size is None:
+            continue
+        line = lines.get(scene.id, {})
+        known = line.get("bytes") == size and line.get("spec") == scene.digest()
+        if (known and not verify) or is_whole(folder / scene.file, scene):
+            done.add(scene.id)
+            if known:
+                listed[scene.id] = line
+    failed = {id: rows for id, rows in read_failed(folder).items() if id not in done}
+    return Survey(frozenset(done), failed, listed, sum(sizes[id] for id in done))
+
+
+def sweep(folder: Path, pids: Collection[int] = (), older_than: float = 3600.0) -> None:
+    """Remove half-written shards: those of the given processes, and those that are older than any write takes."""
+    limit = datetime.now().timestamp() - older_than
+    for path in (folder / SHARDS).glob(".*.tmp.exr"):
+        try:
+            if int(path.name.split(".")[-3]) in pids or path.stat().st_mtime < limit:
+                path.unlink()
+        except (OSError, ValueError):
+            continue  # finished or removed meanwhile

@@ -1,0 +1,176 @@
+"""The plan of a data folder: one line per scene, written before the first pixel is rendered."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from render.shared.config import build, to_plain
+from render.shared.errors import InputError
+from render.shared.files import read_jsonl, read_whole_lines, write_jsonl
+
+MANIFEST = "manifest.jsonl"
+FAILED = "failed.jsonl"
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Pose of the object before the fixed orthographic camera.
+
+    Attributes:
+        rotation: Row-major 3x3 rotation, object to camera frame (x right, y up, z to the camera).
+        scale: Radius of the object's unit sphere, in half image widths (1 touches the frame).
+        offset: Image-plane translation (x right, y up), in half image widths.
+    """
+
+    rotation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    scale: float = 0.9
+    offset: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        matrix = self.matrix()
+        if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-4):
+            raise InputError("view.rotation must be the nine numbers of a rotation matrix")
+        if not 0.0 < self.scale <= 10.0:
+            raise InputError(f"view.scale must be in (0, 10], got {self.scale}")
+
+    def matrix(self) -> np.ndarray:  # (3, 3)
+        """Return the rotation as a float64 matrix."""
+        values = np.asarray(self.rotation, dtype=np.float64)
+        return values.reshape(3, 3) if values.size == 9 else values
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSpec:
+    """Everything that determines one rendered scene, and so one shard.
+
+    Attributes:
+        id: Unique name; the shard is `shards/<id>.exr`.
+        seed: Seed of the sampler.
+        split: `train`, `val` or `test`.
+        shape: A name `render.shapes.load` understands.
+        material: A name `render.materials.library.load` understands.
+        view: Pose.
+        lights: Unit directions (x, y, z) from the surface to each light, camera frame, z > 0.
+        size: Image side in pixels; (height, width) where they differ, which only imported scenes may.
+        spp: Camera samples per pixel.
+        bounces: Interreflection bounces (0 = direct light only).
+    """
+
+    id: str
+    seed: int
+    split: str
+    shape: str
+    material: str
+    view: View
+    lights: tuple[tuple[float, float, float], ...]
+    size: int | tuple[int, int]
+    spp: int
+    bounces: int
+
+    @property
+    def file(self) -> str:
+        """Path of the shard relative to the data folder."""
+        return f"shards/{self.id}.exr"
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """Height and width of the images in pixels."""
+        return (self.size, self.size) if isinstance(self.size, int) else self.size
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the whole line, which its shard carries."""
+        # Not `to_plain` as a whole: it would copy every light, and JSON writes tuples as lists anyway.
+        row = {field.name: getattr(self, field.name) for field in fields(self)} | {"view": to_plain(self.view)}
+        return hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()
+
+    def light_directions(self) -> np.ndarray:  # (L, 3) float32
+        """Return the light directions as an array."""
+        return np.asarray(self.lights, dtype=np.float32).reshape(-1, 3)
+
+
+def write_manifest(folder: str | Path, scenes: Sequence[SceneSpec]) -> None:
+    """Write `manifest.jsonl` in `folder`, atomically."""
+    write_jsonl(Path(folder) / MANIFEST, [to_plain(scene) for scene in scenes])
+
+
+def read_manifest(folder: str | Path, split: str | None = None) -> list[SceneSpec]:
+    """Read the scenes planned in `folder`, optionally only those of one split.
+
+    Raises:
+        InputError: no manifest (not a data folder), a malformed line, or no scene of the split.
+    """
+    path = Path(folder) / MANIFEST
+    if not path.is_file():
+        raise no_manifest(Path(folder))
+    chosen = [scene for scene in _scenes(path) if split in (None, scene.split)]
+    if not chosen:
+        raise InputError(f"{path}: no scene{f' of split {split!r}' if split else ''}; plan more scenes")
+    return chosen
+
+
+def no_manifest(folder: Path) -> InputError:
+    """Build the error for a folder that is not a data folder, naming the one inside it where there is one."""
+    inner = folder / "data"
+    if (inner / MANIFEST).is_file():
+        return InputError(f"{folder}: no {MANIFEST} there; name its data folder, {inner}")
+    return InputError(
+        f"{folder}: no {MANIFEST} there; name a data folder such as out/small/data, or make one with `sdps data plan` "
+        "or `sdps render-data`"
+    )
+
+
+def read_events(path: Path) -> Iterator[dict]:
+    """Yield the whole lines of a ledger, which may be missing, and may be appended to at this moment.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    # Of a line torn by a crash, the shard is found by its hash, the failure happens again.
+    for row in read_whole_lines(path):
+        if isinstance(row, dict) and {"id", "time"} <= row.keys():
+            yield row
+
+
+def read_failed(folder: Path) -> dict[str, list[dict]]:
+    """Return all recorded failures by scene id, oldest first; some of these scenes may be done by now."""
+    failures: dict[str, list[dict]] = {}
+    for line in read_events(folder / FAILED):
+        failures.setdefault(line["id"], []).append(line)
+    return failures
+
+
+def _scenes(path: Path) -> Iterator[SceneSpec]:
+    """Yield the scenes of a manifest; those of one view, which differ in id and material only, share its values."""
+    last, scene = None, None
+    for number, row in enumerate(read_jsonl(path), start=1):
+        own = {key: row.get(key) for key in ("id", "material")} if isinstance(row, dict) else {}
+        if scene is not None and {type(value) for value in own.values()} == {str} and row == last | own:
+            scene = replace(scene, **own)
+        else:
+            scene = _scene(row, f"{path}: line {number}")
+        last = row
+        yield scene
+
+
+def _scene(row: Any, where: str) -> SceneSpec:
+    """Build a scene from a line; its lights, which are most of it, are not read number by number if all are sound."""
+    lights = row.get("lights") if isinstance(row, dict) else None
+    if not _is_vectors(lights):
+        return build(SceneSpec, row, where)
+    return replace(build(SceneSpec, row | {"lights": ()}, where), lights=tuple(map(tuple, lights)))
+
+
+def _is_vectors(value: Any) -> bool:
+    """Tell whether a JSON value is a list of lists of three floats, which needs no conversion but to tuples."""
+    return (
+        isinstance(value, list)
+        and {type(row) for row in value} == {list}
+        and {len(row) for row in value} == {3}
+        and {type(number) for number in chain.from_iterable(value)} == {float}
+    )

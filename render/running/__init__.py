@@ -1,0 +1,1 @@
+"""Processes that render a plan into shards, or into a stream."""

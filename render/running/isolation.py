@@ -1,0 +1,163 @@
+"""A renderer in a process of its own, which may fail, hang or die without taking the run along.
+
+The parent (`render.running.supervisor`) never imports mitsuba. It sends chunks through a pipe and receives tuples:
+`ready`;
+`begin` with the ids at work; `done` with a ledger line; `failed` with ids, reason, traceback and seconds; `end` of the
+chunk, with whether the process is still sound; `fatal` with a message that concerns the whole run.
+"""
+
+import faulthandler
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from render.planning.chunks import Chunk
+from render.records.ledger import now
+from render.shared.errors import InputError
+
+TAIL = 12  # lines of a traceback that are kept
+
+
+@dataclass(frozen=True)
+class Orders:
+    """What a rendering process is told at its start.
+
+    Attributes:
+        folder: The data folder.
+        number: Number of the worker, for the ledger.
+        threads: Threads it may use.
+        variant: Mitsuba variant, chosen by the parent.
+        llvm: Path of libLLVM, chosen by the parent.
+        errors: File that takes its standard error.
+    """
+
+    folder: Path
+    number: int
+    threads: int
+    variant: str
+    llvm: str | None
+    errors: Path
+
+
+def serve(connection: Connection, orders: Orders) -> None:
+    """Render chunks until told to stop (None) or the parent is gone."""
+    settle(orders)
+    with suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        try:
+            import drjit as dr
+
+            from render.running import worker
+        except InputError as error:
+            connection.send(("fatal", str(error)))
+            return
+        dr.set_thread_count(orders.threads)
+        connection.send(("ready",))
+        while (chunk := connection.recv()) is not None:
+            try:
+                sound = Work(connection.send, chunk, orders).run()
+            except worker.Unwritable as error:
+                connection.send(("fatal", str(error)))
+                return
+            dr.flush_malloc_cache()
+            connection.send(("end", sound))
+
+
+def settle(orders: Orders) -> None:
+    """Prepare the process: signals, standard error, core dumps, and the parent's choice of variant."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # unwinds, so that a half-written shard is removed
+    with suppress(ImportError, ValueError, OSError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    descriptor = os.open(orders.errors, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    os.dup2(descriptor, 2)
+    os.close(descriptor)
+    faulthandler.enable(file=2)
+    os.environ["SDPS_VARIANT"] = orders.variant
+    if orders.llvm:
+        os.environ["DRJIT_LIBLLVM_PATH"] = orders.llvm
+
+
+class Work:
+    """Rendering one chunk, scene by scene, telling the parent what happens."""
+
+    def __init__(self, send: Callable[[tuple], Any], chunk: Chunk, orders: Orders) -> None:
+        from render.running import worker
+
+        self.send, self.chunk, self.orders = send, chunk, orders
+        self.worker, self.stages = worker, worker.Stages()
+        self.sound = True
+        self.start = time.perf_counter()
+
+    def run(self) -> bool:
+        """Render the chunk; return whether the process can go on, which a defect inside the renderer leaves open."""
+        scenes = self.chunk.scenes()
+        self._begin([scene.id for scene in scenes])
+        try:
+            with self.stages.time("shape"):
+                mesh = self.worker.load_shape(self.chunk.shape)
+            with self.stages.time("build"):
+                built = self.worker.build(mesh)
+        except Exception as error:
+            self._failed([scene.id for scene in scenes], error)
+            return self.sound
+        self.stages.spread("shape", len(scenes))
+        for group in self.chunk.groups:
+            self._view(built, group)
+            if not self.sound:
+                break
+        return self.sound
+
+    def _view(self, built: Any, group: Collection) -> None:
+        """Render one view; a material that fails is left out, anything else fails the view."""
+        left = [scene.id for scene in group if scene.id in self.chunk.wanted]
+        while left and self.sound:
+            self._begin(left)
+            try:
+                for scene in self.worker.render_group(built, list(group), self.orders.folder, set(left), self.stages):
+                    self._done(scene)
+                    left.remove(scene.id)
+                left = []
+            except self.worker.Unwritable:
+                raise
+            except Exception as error:
+                culprits = left[:1] if self.stages.view_traced else left
+                self._failed(culprits, error)
+                left = left[len(culprits) :]
+
+    def _begin(self, ids: Collection[str]) -> None:
+        self.start = time.perf_counter()
+        self.send(("begin", list(ids)))
+
+    def _done(self, scene: Any) -> None:
+        stages = self.stages.lap()
+        line = {
+            "id": scene.id,
+            "spec": scene.digest(),
+            "bytes": (self.orders.folder / scene.file).stat().st_size,
+            "seconds": round(sum(stages.values()), 4),
+            "stages": {name: round(seconds, 4) for name, seconds in stages.items()},
+            "time": now(),
+            "worker": self.orders.number,
+        }
+        self.send(("done", line))
+        self.start = time.perf_counter()
+
+    def _failed(self, ids: Collection[str], error: Exception) -> None:
+        # A mistake in the data is told in one line; anything else is a defect that may leave Dr.Jit half-way.
+        mistake = isinstance(error, InputError)
+        self.sound = self.sound and mistake
+        reason = str(error) if mistake else f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+        trace = "" if mistake else "".join(traceback.format_exception(error))
+        tail = "\n".join(trace.splitlines()[-TAIL:])
+        self.stages.lap()
+        self.send(("failed", list(ids), reason, tail, round(time.perf_counter() - self.start, 3)))

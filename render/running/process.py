@@ -1,0 +1,72 @@
+"""A rendering process as its parent sees it: what it was given, since when, and how it ended."""
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from render.planning.chunks import Chunk
+from render.running.isolation import TAIL, Orders
+
+
+class Worker:
+    """A rendering process and what it is working on."""
+
+    def __init__(self, serve: Callable, orders: Orders) -> None:
+        context = multiprocessing.get_context("spawn")  # forking would copy the state of a started backend
+        self.connection, theirs = context.Pipe()
+        self.errors = orders.errors
+        self.process = context.Process(target=serve, args=(theirs, orders), daemon=True)
+        self.process.start()
+        theirs.close()
+        self.ready, self.busy, self.rendered = False, False, 0
+        self.left: Chunk | None = None  # of the chunk it works on
+        self.current: list[str] = []
+        self.since = self.view_start = time.monotonic()
+
+    def take(self, chunk: Chunk) -> None:
+        """Give it a chunk to render."""
+        self.left, self.busy, self.since = chunk, True, time.monotonic()
+        with suppress(OSError):  # if it is dead, reading tells
+            self.connection.send(chunk)
+
+    def finished(self, id: str) -> None:
+        """Note that a scene is done or failed."""
+        self.left = self.left.without([id]) if self.left else None
+        self.current = [other for other in self.current if other != id]
+
+    def dismiss(self) -> None:
+        """Let an idle process end."""
+        with suppress(OSError):
+            self.connection.send(None)
+        self.process.join(5)
+
+    def abort(self) -> None:
+        """Stop a process that hangs; its fault handler first writes where it hung."""
+        with suppress(OSError):
+            os.kill(self.process.pid, signal.SIGABRT)
+        self.process.join(2)
+        if self.process.is_alive():
+            self.process.kill()
+
+    def close(self) -> None:
+        """Wait for a process that was told to end, but not for long."""
+        self.process.join(5)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+        self.connection.close()
+
+    def obituary(self) -> str:
+        """Tell how the process ended."""
+        self.process.join()
+        code = self.process.exitcode or 0
+        return f"worker died, signal {-code}" if code < 0 else f"worker died, exit code {code}"
+
+    def last_words(self) -> str:
+        """Return the tail of its standard error."""
+        with suppress(OSError):
+            return "\n".join(self.errors.read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL:])
+        return ""

@@ -1,0 +1,1 @@
+"""Triangle meshes, signed distance fields, and the way from one to the other."""

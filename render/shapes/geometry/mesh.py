@@ -1,0 +1,191 @@
+"""The one mesh type of the renderer, and reading it from files."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from render.records.manifest import View
+from render.shared.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class TriangleMesh:
+    """A triangle mesh with one smooth normal per vertex; x right, y up, z to the camera.
+
+    Attributes:
+        vertices: Positions, (V, 3) float32.
+        faces: Vertex indices, counter-clockwise seen from outside, (F, 3) uint32.
+        normals: Unit outward normals, (V, 3) float32.
+
+    Raises:
+        InputError: at construction: wrong shapes, no faces, non-finite values, an index out of range,
+            or normals that are not of unit length.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("vertices", np.float32), ("normals", np.float32)):
+            array = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            if array.ndim != 2 or array.shape[1] != 3:
+                raise InputError(f"mesh {name}: expected shape (V, 3), got {array.shape}")
+            if not np.isfinite(array).all():
+                raise InputError(f"mesh {name}: {int((~np.isfinite(array)).any(axis=1).sum())} rows are not finite")
+            object.__setattr__(self, name, array)
+        faces = np.asarray(self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+            raise InputError(f"mesh faces: expected at least one triangle as (F, 3), got {faces.shape}")
+        if not np.issubdtype(faces.dtype, np.integer):
+            raise InputError(f"mesh faces: expected integer indices, got {faces.dtype}")
+        if faces.min() < 0 or faces.max() >= len(self.vertices):
+            raise InputError(
+                f"mesh faces: index {faces.min() if faces.min() < 0 else faces.max()} is out of range "
+                f"for {len(self.vertices)} vertices"
+            )
+        object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.uint32))
+        if len(self.normals) != len(self.vertices):
+            raise InputError(f"mesh normals: {len(self.normals)} for {len(self.vertices)} vertices")
+        if np.abs(np.linalg.norm(self.normals, axis=1) - 1).max() > 1e-3:
+            raise InputError("mesh normals: not of unit length")
+
+    def normalised(self) -> "TriangleMesh":
+        """Centre the mesh on its bounding sphere and scale it so that the farthest vertex is at radius 1."""
+        centred = self.vertices - bounding_centre(self.vertices)
+        radius = np.linalg.norm(centred, axis=1).max()
+        if not radius > 0:
+            raise InputError("mesh vertices: all at one point")
+        return replace(self, vertices=centred / radius)
+
+    def rotated(self, rotation: np.ndarray) -> "TriangleMesh":
+        """Apply the rotation matrix `rotation` (3, 3), acting on column vectors, to positions and normals."""
+        rotation = np.asarray(rotation, dtype=np.float64)
+        if rotation.shape != (3, 3) or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
+            raise InputError("rotation: expected an orthonormal (3, 3) matrix")
+        if np.linalg.det(rotation) < 0:
+            raise InputError("rotation: it mirrors (determinant -1), which turns the surface inside out")
+        turn = rotation.T.astype(np.float32)
+        return replace(self, vertices=self.vertices @ turn, normals=unit(self.normals @ turn))
+
+    def posed(self, view: View) -> "TriangleMesh":
+        """Rotate, scale and move the mesh into the camera frame (units: half image widths)."""
+        turned = self.rotated(view.matrix())
+        return replace(turned, vertices=turned.vertices * view.scale + np.array([*view.offset, 0.0]))
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Scale row vectors (N, 3) to unit length; a zero vector stays zero."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1)
+
+
+def bounding_centre(points: np.ndarray) -> np.ndarray:
+    """Approximate the centre of the smallest sphere around `points` (N, 3).
+
+    Badoiu and Clarkson (2003): step towards the farthest point by 1/(i + 1) of its distance, and keep the best
+    centre met. Run on the extreme points along a fixed spiral of directions, which decide the sphere.
+    """
+    count = 128
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)  # (128, 3)
+    heights = directions.astype(np.float32) @ points.astype(np.float32).T  # (128, N)
+    extremes = points[np.unique(heights.argmax(axis=1))].astype(np.float64)
+    centre = (extremes.min(axis=0) + extremes.max(axis=0)) / 2
+    best, least = centre, np.inf
+    for step in range(1, 200):
+        offsets = extremes - centre
+        squared = (offsets**2).sum(axis=1)
+        farthest = squared.argmax()
+        if squared[farthest] < least:
+            best, least = centre, squared[farthest]
+        centre = centre + offsets[farthest] / (step + 1)
+    return best.astype(np.float32)
+
+
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return cross products of the triangles' edges, (F, 3): the normal times twice the area."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return area-weighted unit vertex normals, (V, 3) float32.
+
+    Where the weighted sum cancels (a fin of two opposite faces), the normal of one adjacent face stands in.
+    """
+    vertices = np.asarray(vertices, dtype=np.float64)
+    crosses = face_normals(vertices, faces)
+    normals = np.stack(
+        [
+            sum(np.bincount(faces[:, corner], crosses[:, axis], len(vertices)) for corner in range(3))
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    scale = np.zeros(len(vertices))
+    np.maximum.at(scale, faces.ravel(), np.repeat(np.linalg.norm(crosses, axis=1), 3))
+    lost = np.flatnonzero(np.linalg.norm(normals, axis=1) <= 1e-9 * scale)
+    if len(lost):
+        fallback = np.zeros_like(normals)
+        fallback[faces.ravel()] = np.repeat(crosses, 3, axis=0)
+        normals[lost] = fallback[lost]
+    return unit(normals).astype(np.float32)
+
+
+def without_degenerate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Drop triangles without area and vertices that no triangle uses; returns (vertices, faces)."""
+    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    area = np.linalg.norm(face_normals(vertices.astype(np.float64), faces), axis=1)
+    return without_unused(vertices, faces[distinct & (area > 0)])
+
+
+def without_unused(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Drop vertices that no triangle uses; returns (vertices, faces)."""
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    return vertices[used], (np.cumsum(used) - 1)[faces]
+
+
+def load_mesh(path: str | Path) -> TriangleMesh:
+    """Read any mesh or scene file that trimesh reads, smoothly shaded and as placed in the file.
+
+    The parts of a scene are concatenated and equal positions merged, so that texture seams and the flat
+    facets of STL do not show; normals are area-weighted. A watertight surface is turned outside out.
+
+    Raises:
+        InputError: missing file, unreadable format, no triangles, or non-finite positions.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such mesh file")
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        geometry = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+    # Every format has its own parser, and each fails in its own way on a damaged file.
+    except Exception as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: cannot be read as a mesh ({reason})") from error
+    if not sum(len(part.faces) for part in geometry):
+        raise InputError(f"{path}: contains no triangles; export it as a surface mesh")
+    mesh = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in geometry])
+    if not np.isfinite(mesh.vertices).all():
+        raise InputError(f"{path}: contains vertices that are not finite; repair the file")
+    mesh.merge_vertices()
+    vertices, faces = without_degenerate(np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64))
+    if not len(faces):
+        raise InputError(f"{path}: all of its triangles are degenerate")
+    faces = _outward(vertices, faces)
+    return TriangleMesh(vertices=vertices, faces=faces, normals=vertex_normals(vertices, faces))
+
+
+def _outward(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Wind the faces of a watertight surface consistently, outside out; others are returned as they are."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if not mesh.is_watertight:
+        return faces
+    mesh.fix_normals(multibody=True)
+    return np.asarray(mesh.faces, dtype=np.int64)

@@ -1,0 +1,1 @@
+"""Sculpture: one shape family, a file per kind of figure."""

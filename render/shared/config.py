@@ -1,0 +1,151 @@
+"""Strict configuration: plain mappings (from YAML) into frozen dataclasses, and back.
+
+An unknown key or a value of the wrong type is an `InputError` naming the dotted field.
+"""
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from render.shared.errors import InputError, unknown
+from render.shared.files import read_text
+
+T = TypeVar("T")
+
+
+def read_yaml(path: str | Path) -> dict:
+    """Read a YAML file whose top level is a mapping.
+
+    Raises:
+        InputError: missing file, YAML syntax (with its line), or another top level.
+    """
+    try:
+        value = yaml.safe_load(read_text(path))
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}" if mark else ""
+        raise InputError(f"{path}:{where} is not valid YAML ({getattr(error, 'problem', error)})") from error
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: expected a mapping of fields at the top level, got {type(value).__name__}")
+    return value
+
+
+def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:
+    """Construct the dataclass `cls` from `values`, recursing into dataclass fields.
+
+    Args:
+        cls: A dataclass type.
+        values: Field names to values; lists become tuples, and numbers given as text (`1e-3` is text
+            in YAML 1.1) are read as numbers.
+        where: Dotted name of this section, used in messages.
+
+    Raises:
+        InputError: unknown key (with the nearest), missing key, wrong type, or the class's own check.
+    """
+    if not isinstance(values, Mapping):
+        raise InputError(f"{where or cls.__name__}: expected a section with fields, got {values!r}")
+    hints = typing.get_type_hints(cls)
+    fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
+    arguments = {}
+    for key, value in values.items():
+        name = f"{where}.{key}" if where else str(key)
+        if key not in fields:
+            raise unknown("key", name, [f"{where}.{known}" if where else known for known in fields])
+        arguments[key] = _convert(hints[key], value, name)
+    missing = [
+        name
+        for name, field in fields.items()
+        if name not in arguments
+        and field.default is dataclasses.MISSING
+        and field.default_factory is dataclasses.MISSING
+    ]
+    if missing:
+        raise InputError(f"{where or cls.__name__}: missing key {missing[0]!r}")
+    try:
+        return cls(**arguments)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{where + '.' if where else ''}{error}") from error
+
+
+def to_plain(value: Any) -> Any:
+    """Turn a dataclass (nested) into plain dicts, lists and scalars, ready for YAML or JSON."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {key: to_plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [to_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def to_yaml(value: Any) -> str:
+    """Render a dataclass or mapping as YAML text in field order."""
+    return yaml.safe_dump(to_plain(value), sort_keys=False, width=120)
+
+
+def _convert(hint: Any, value: Any, name: str) -> Any:
+    """Convert one value to the annotated type `hint`, or raise an InputError naming the field."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return build(hint, value, name)
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(inner, value, name)
+    if origin is typing.Literal:
+        if value not in inner:
+            raise unknown(f"value for {name}:", str(value), [str(choice) for choice in inner])
+        return value
+    if origin is tuple:
+        items = value if isinstance(value, list | tuple) else [value]
+        kinds = inner if Ellipsis not in inner else (inner[0],) * len(items)
+        if len(kinds) != len(items):
+            raise InputError(f"{name}: expected {len(kinds)} values, got {value!r}")
+        return tuple(_convert(kind, item, name) for kind, item in zip(kinds, items, strict=True))
+    if origin is dict:
+        if not isinstance(value, Mapping):
+            raise InputError(f"{name}: expected a mapping, got {value!r}")
+        return {str(key): _convert(inner[1], item, f"{name}.{key}") for key, item in value.items()}
+    return _scalar(hint, value, name)
+
+
+def _convert_union(kinds: tuple, value: Any, name: str) -> Any:
+    """Take the first member type of a union that accepts `value`."""
+    if value is None and type(None) in kinds:
+        return None
+    errors = []
+    for kind in kinds:
+        if kind is type(None):
+            continue
+        try:
+            return _convert(kind, value, name)
+        except InputError as error:
+            errors.append(error)
+    raise errors[0]
+
+
+def _scalar(hint: Any, value: Any, name: str) -> Any:
+    """Check and convert bool, int, float and str; other annotations pass unchanged."""
+    if hint is float and isinstance(value, int | float | str) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except ValueError:
+            pass
+    elif hint is int and isinstance(value, int | float | str) and not isinstance(value, bool):
+        try:
+            if float(value) == int(float(value)):
+                return int(float(value))
+        except (ValueError, OverflowError):
+            pass
+    elif hint is bool and isinstance(value, bool):
+        return value
+    elif hint is str and isinstance(value, str | int | float) and not isinstance(value, bool):
+        return str(value)
+    elif hint not in (float, int, bool, str):
+        return value
+    raise InputError(f"{name}: expected {hint.__name__}, got {value!r}")

@@ -1,0 +1,269 @@
+"""From scenes to training samples, the same ones however many workers make them.
+
+The position in an endless stream of samples determines everything about a sample: scene, images,
+augmentation, crop. So a run is resumed exactly by one integer, and no two workers share a random stream.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+from torch.utils.data import Dataset
+
+from render.records.manifest import SceneSpec
+from render.shared.errors import InputError
+from render.shared.seeds import generator
+from sdps.data.augment import Augmentation, apply_symmetry, augment
+from sdps.data.scene_store import SceneStore, StoredScene, finished_scenes, require_equal_counts
+
+_CROP_DRAWS = 8
+
+
+class Batch(NamedTuple):
+    """Tensors of B scenes with Q images each; a single sample has the same fields without B."""
+
+    images: Tensor  # (B, Q, 3, S, S) float32, augmented
+    mask: Tensor  # (B, 1, S, S) float32, 0 or 1
+    normals: Tensor  # (B, 3, S, S) float32, unit, zero outside the mask
+    directions: Tensor  # (B, Q, 3) float32, unit
+    intensities: Tensor  # (B, Q) float32
+    corner: Tensor  # (B, 2) int64, row and column of the crop's upper left corner
+    seed: Tensor  # (B,) int64, non-negative, of the sample alone: for randomness a stage adds
+
+    def to(self, device: torch.device) -> "Batch":
+        """Copy every tensor to `device`."""
+        return Batch(*(tensor.to(device, non_blocking=True) for tensor in self))
+
+
+class SampleKey(NamedTuple):
+    """Which sample: the index of its scene, and its place in the stream."""
+
+    scene: int
+    epoch: int
+    position: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleOptions:
+    """How a sample is made from a scene.
+
+    Attributes:
+        seed: Root seed.
+        images: Images drawn per scene (all, in random order, where a scene has fewer).
+        size: Side in pixels.
+        crop: Side of the random crop, 0 for none.
+        min_object: Least share of object pixels wanted in a crop.
+        augmentation: How images are altered.
+        rescale: Scenes larger than `size` are shrunk by a random factor and cropped to `size` at random, instead of
+            shrunk to it (`_rescale`); off in the paper, whose scenes are 128 pixels wide.
+    """
+
+    seed: int
+    images: int
+    size: int = 128
+    crop: int = 0
+    min_object: float = 0.3
+    augmentation: Augmentation
+    rescale: bool = False
+
+
+class SceneDataset(Dataset):
+    """Samples of the scenes of one split of a data folder, indexed by `SampleKey`.
+
+    Args:
+        folder: Data folder with a manifest and shards.
+        split: `train`, `val` or `test`; the split also names the random stream.
+        options: How samples are made.
+        cache: Keep decoded scenes in `<folder>/cache`.
+        skip_missing: Leave out planned scenes that have no shard instead of refusing. Scenes that could not be
+            rendered (`failed.jsonl`) are left out in any case, with a warning.
+
+    Raises:
+        InputError: no manifest, no scene of the split, or missing shards.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        split: str,
+        options: SampleOptions,
+        *,
+        cache: bool = True,
+        skip_missing: bool = False,
+    ) -> None:
+        self.split = split
+        self.options = options
+        self.store = SceneStore(Path(folder), cache=cache)
+        self.scenes = finished_scenes(Path(folder), split, skip_missing=skip_missing)
+        require_equal_counts(folder, self.scenes, options.images)
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, key: SampleKey) -> Batch | InputError:
+        # An InputError is returned, not raised: torch would wrap one raised in a worker into a multi-line text.
+        try:
+            return self.sample(key)
+        except InputError as error:
+            return error
+
+    def sample(self, key: SampleKey) -> Batch:
+        """Make the sample `key` names.
+
+        Raises:
+            InputError: the shard is damaged or differs from the manifest.
+        """
+        rng = generator(self.options.seed, "sample", self.split, key.epoch, key.position)
+        scene = self.scenes[key.scene]
+        return make_sample(scene, self.store.load(scene), self.options, rng)
+
+
+def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, rng: np.random.Generator) -> Batch:
+    """Make a training sample of a scene, stored or just rendered.
+
+    The order is that of the authors' loader: a random subset of the images, in random order; rescaling and cropping;
+    exposure, intensities and noise (`sdps.data.augment`).
+
+    Args:
+        scene: Manifest line, for the light directions.
+        stored: Its images and ground truth.
+        options: How the sample is made.
+        rng: Draws everything random, and has drawn nothing yet.
+
+    Returns:
+        The fields of a `Batch` without B.
+    """
+    # A child of the stream, so that the number does not depend on how much the sample draws.
+    seed = int(rng.spawn(1)[0].integers(2**63))
+    directions = scene.light_directions()[: len(stored.images)]
+    chosen = choose_images(directions, options, rng)
+    images = stored.images[chosen].astype(np.float32)  # (Q, H, W, 3)
+    normals, mask = stored.normals, stored.mask
+    directions = directions[chosen]
+    if options.augmentation.symmetries:
+        turns, mirror = int(rng.integers(4)), bool(rng.integers(2))
+        images, normals, mask, directions = apply_symmetry(images, normals, mask, directions, turns, mirror)
+    if options.rescale and min(mask.shape) > options.size:
+        images, normals, mask = _rescale(images, normals, mask, options, rng)
+    images, normals, mask = _resize(images, normals, mask, options.size)
+    images, intensities = augment(images, mask, options.augmentation, rng)
+    corner = _crop_corner(mask, options.crop, options.min_object, rng) if options.crop else (0, 0)
+    return Batch(
+        images=torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))),
+        mask=torch.from_numpy(mask[None].astype(np.float32)),
+        normals=torch.from_numpy(np.ascontiguousarray(normals.transpose(2, 0, 1), dtype=np.float32)),
+        directions=torch.from_numpy(np.ascontiguousarray(directions, dtype=np.float32)),
+        intensities=torch.from_numpy(intensities),
+        corner=torch.tensor(corner),
+        seed=torch.tensor(seed),
+    )
+
+
+def choose_images(directions: np.ndarray, options: SampleOptions, rng: np.random.Generator) -> np.ndarray:  # (Q,)
+    """Draw which of a scene's images a sample has, in random order.
+
+    A biased sample has those around one direction, a frontal one those around the camera's.
+    """
+    biased, shares = options.augmentation.biased, options.augmentation.biased + options.augmentation.frontal
+    count, kind = len(directions), rng.random() if shares else 1.0
+    if kind >= shares:
+        return rng.permutation(count)[: options.images]
+    if kind < biased:
+        radius, angle = np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * np.pi)  # uniform over the unit disc
+        centre = np.array([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius**2)])
+    else:
+        centre = np.array([0.0, 0.0, 1.0])
+    nearest = np.argsort(-(directions @ centre), kind="stable")
+    kept = rng.integers(options.images, max(options.images, count // 2), endpoint=True)
+    return rng.permutation(nearest[:kept])[: options.images]
+
+
+def collate(samples: list[Batch | InputError]) -> Batch | InputError:
+    """Stack samples into a batch, or pass on the first error a worker met."""
+    for sample in samples:
+        if isinstance(sample, InputError):
+            return sample
+    return Batch(*(torch.stack(tensors) for tensors in zip(*samples, strict=True)))
+
+
+class SampleStream:
+    """Batches of sample keys, endlessly: every epoch a new permutation of the scenes, joined end to end.
+
+    Batches run across epoch borders, so the state of the stream is the number of samples already taken.
+
+    Args:
+        scenes: Number of scenes.
+        batch: Samples per batch.
+        seed: Root seed.
+        taken: Samples taken before this run.
+        part: Which samples of every batch to yield; all by default.
+    """
+
+    def __init__(self, scenes: int, batch: int, seed: int, taken: int = 0, part: slice = slice(None)) -> None:
+        self.scenes, self.batch, self.seed, self.taken, self.part = scenes, batch, seed, taken, part
+
+    def __iter__(self) -> Iterator[list[SampleKey]]:
+        epoch, position = divmod(self.taken, self.scenes)
+        keys = []
+        while True:
+            order = generator(self.seed, "order", epoch).permutation(self.scenes)
+            for place in range(position, self.scenes):
+                keys.append(SampleKey(int(order[place]), epoch, place))
+                if len(keys) == self.batch:
+                    yield keys[self.part]
+                    keys = []
+            epoch, position = epoch + 1, 0
+
+
+def _rescale(
+    images: np.ndarray, normals: np.ndarray, mask: np.ndarray, options: SampleOptions, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut the square window that, brought to `size`, is the scene shrunk at random and then cropped at random.
+
+    Two deviations from the authors' loader. It draws the new height and width apart from each other, in [128, H) and
+    [128, W), and leaves the normals as they were, though unequal scaling alters those of the surface shown; here both
+    axes share one factor, with which the normals stay right, the shorter side's new length being uniform in
+    [size, its own]. And the window lies about a random pixel of the object, since background alone teaches nothing.
+    """
+    shorter = min(mask.shape)
+    side = round(options.size * shorter / rng.integers(options.size, shorter, endpoint=True))
+    row, column = _crop_corner(mask, side, options.min_object, rng)
+    window = np.s_[row : row + side, column : column + side]
+    return images[:, *window], normals[window], mask[window]
+
+
+def _resize(
+    images: np.ndarray, normals: np.ndarray, mask: np.ndarray, size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bring a scene of another size to (size, size), normals to unit length, the mask to its majority."""
+    if images.shape[1:3] == (size, size):
+        return images, normals, mask
+    stack = np.concatenate([images, normals[None], np.repeat(mask[None, ..., None], 3, -1)]).astype(np.float32)
+    tensor = torch.from_numpy(np.ascontiguousarray(stack.transpose(0, 3, 1, 2)))
+    resized = functional.interpolate(tensor, (size, size), mode="bilinear", antialias=True)
+    resized = resized.numpy().transpose(0, 2, 3, 1)
+    images, normals, mask = resized[:-2], resized[-2], resized[-1, ..., 0] > 0.5
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    return images, np.where(mask[..., None], normals / np.maximum(length, 1e-6), 0.0), mask
+
+
+def _crop_corner(mask: np.ndarray, side: int, min_object: float, rng: np.random.Generator) -> tuple[int, int]:
+    """Draw a crop's corner around a random object pixel; the first with enough object, else the best."""
+    rows, columns = np.nonzero(mask)
+    last = mask.shape[0] - side, mask.shape[1] - side
+    best, best_share = (last[0] // 2, last[1] // 2), -1.0
+    for _ in range(_CROP_DRAWS if len(rows) else 0):
+        pixel = rng.integers(len(rows))
+        places = zip((rows[pixel], columns[pixel]), last, strict=True)
+        row, column = (int(np.clip(place - side // 2, 0, limit)) for place, limit in places)
+        share = float(mask[row : row + side, column : column + side].mean())
+        if share >= min_object:
+            return row, column
+        if share > best_share:
+            best, best_share = (row, column), share
+    return best

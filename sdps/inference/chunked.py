@@ -1,0 +1,125 @@
+"""Networks applied to a scene's images chunk by chunk, with the result of seeing them all at once.
+
+Maximum and mean over the images are all that networks share between them, so running ones suffice. Of every image only
+a lighting network's local feature is kept: 64 kB, half of that in bfloat16.
+
+Legend: L images, P pixels of the object, (h, w) the sides of what the network sees.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from sdps.inference.image_source import View
+from sdps.models.base import LightingNetwork, Lights, NormalNetwork, divide
+from sdps.models.observation_maps import predict_normals
+
+Autocast = Callable[[], AbstractContextManager]
+_GREY_VALUES = 2**26
+"""Grey values kept at once for pixel networks (256 MiB); of more, the images are read again for further pixels."""
+_PIXELS = {"cpu": 64, "cuda": 2048}
+"""Pixels a pixel network sees at once: what fits the caches of a CPU is twice as fast there as more."""
+
+
+def lighting_prediction(
+    network: LightingNetwork, view: View, autocast: Autocast, context: Callable[[slice], Tensor] | None = None
+) -> Any:
+    """Return a lighting network's prediction for all images, as its `forward` would.
+
+    Args:
+        network: In evaluation mode.
+        view: Images of 128x128.
+        autocast: Makes the context in which the network runs.
+        context: Further channels (1, n, C, 128, 128) for the images of a slice.
+    """
+    mask, local, shared = view.mask, [], None
+    for part, images in view:
+        extra = None if context is None else context(part)
+        with autocast():
+            feature = network.encode(images, mask, extra)  # (1, n, F, 8, 8)
+        local.append(feature)
+        shared = _maximum(shared, feature.amax(dim=1, keepdim=True))
+    with autocast():
+        predictions = [network.predict(feature, shared) for feature in local]
+    return type(predictions[0])(*(torch.cat(parts, dim=1) for parts in zip(*predictions, strict=True)))
+
+
+def normal_map(network: NormalNetwork, view: View, lights: Lights | None, autocast: Autocast) -> Tensor:
+    """Return a normal network's unit normals (1, 3, h, w), float32.
+
+    Args:
+        network: In evaluation mode.
+        view: Images whose sides are multiples of `network.size_multiple`.
+        lights: Of all images, (1, L, ...); None for networks that are not told the lights.
+        autocast: Makes the context in which the network runs.
+    """
+    mean_square = _mean_square(network, view, lights) if network.per_pixel else None
+    mask, feature = view.mask, None
+    for part, images in view:
+        seen = network.observe(images, mask, some_lights(lights, part), mean_square)
+        with autocast():
+            feature = _maximum(feature, network.encode(seen))
+    with autocast():
+        return network.regress(feature).float()
+
+
+def _mean_square(network: NormalNetwork, view: View, lights: Lights | None) -> Tensor:
+    """Return the mean over all images and channels of the squares of what the network sees, (1, 1, 1, h, w)."""
+    total = 0.0
+    for part, images in view:
+        if network.needs_lights:
+            images = divide(images, some_lights(lights, part).intensities)
+        total = total + network.mean_square(images) * images.shape[1]
+    return total / len(view)
+
+
+def pixel_normal_map(network: nn.Module, view: View, lights: Lights, autocast: Autocast, *, rotations: int) -> Tensor:
+    """Return CNN-PS's unit normals (1, 3, h, w), float32, zero outside the mask.
+
+    Args:
+        network: In evaluation mode.
+        view: Images.
+        lights: Of all images, (1, L, ...).
+        autocast: Makes the context in which the network runs.
+        rotations: Rotations about the view axis that are averaged.
+    """
+    inside = view.mask[0, 0] > 0.5  # (h, w)
+    places = inside.flatten().nonzero()[:, 0]  # (P,)
+    normals = torch.zeros(inside.numel(), 3, device=places.device)
+    for some in places.split(max(1, _GREY_VALUES // len(view))):
+        grey = torch.empty(len(some), len(view), device=places.device)
+        for part, images in view:
+            pixels = divide(images, lights.intensities[:, part])[0].flatten(2)[..., some]  # (n, 3, p)
+            grey[:, part] = pixels.mean(dim=1).T
+        count = _PIXELS.get(places.device.type, 512)
+        for start in range(0, len(some), count):
+            values = grey[start : start + count]
+            valid = torch.ones_like(values, dtype=torch.bool)
+            with autocast():
+                found = predict_normals(network, values, lights.directions[0], valid, rotations=rotations)
+            normals[some[start : start + count]] = found
+    return normals.T.unflatten(1, inside.shape)[None]
+
+
+def pad_to(multiple: int) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Return what pads images and mask, below and right, with black to sides that are multiples of a number."""
+
+    def fit(images: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        height, width = mask.shape[-2:]
+        border = (0, -width % multiple, 0, -height % multiple)
+        return functional.pad(images, border), functional.pad(mask, border)
+
+    return fit
+
+
+def some_lights(lights: Lights | None, part: slice) -> Lights | None:
+    """Return the lights of some of the images."""
+    return None if lights is None else Lights(lights.directions[:, part], lights.intensities[:, part])
+
+
+def _maximum(first: Tensor | None, second: Tensor) -> Tensor:
+    return second if first is None else torch.maximum(first, second)

@@ -1,0 +1,341 @@
+"""Using trained networks: images and a mask in, lights and normals out, in memory that many images do not fill."""
+
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from render.shared.errors import InputError
+from sdps.core.estimate import Estimate
+from sdps.core.lighting import ReadOut
+from sdps.core.precision import Arithmetic, arithmetic
+from sdps.data.augment import measure_exposure
+from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map
+from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
+from sdps.inference.inference_config import InferenceConfig
+from sdps.inference.symmetry import SYMMETRIES, KeptView, TurnedView, mean_lights, turned_context
+from sdps.models.base import Lights
+from sdps.models.checkpoint import TrainedModel, load_weights
+from sdps.models.lcnet import INPUT_SIZE, resize_input
+from sdps.models.lighting_variants import LCNetSecond
+
+_ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels"), "second": ("second",)}
+_CHUNK_PIXELS = {"cpu": 2**17}
+"""On CPUs fewer images at once: their feature maps fit the caches, a quarter to a half faster with the same result."""
+
+
+class _Known(NamedTuple):
+    """Lights the caller gave."""
+
+    directions: np.ndarray | None  # (L, 3), unit
+    intensities: np.ndarray | None  # (L,), with the mean of the range of training
+    balance: np.ndarray | None  # (L, 3), colours with mean 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Estimator(InferenceConfig):
+    """Trained networks that work together: any lighting model with any normal model; its options are those of its base.
+
+    A first lighting pass that a second follows is read out as expectation, as in the second's training.
+
+    Attributes:
+        lighting: Trained lighting model, or None when lights are always given or `normals` is told none.
+        normals: Trained model that gives normals, by convolution or pixel by pixel; None for lights alone.
+        second: Trained second lighting pass. It sees the normals that `normals` finds at 128x128 under the first
+            lights; `normals` then works again, under the second lights.
+        device: Where all networks are.
+        antialias: Average when the lighting networks' input is shrunk to 128x128 (the authors' code only interpolates).
+        chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images. None: what
+            suits the device.
+
+    Raises:
+        InputError: a model of another role than its place, or an option out of range.
+    """
+
+    lighting: TrainedModel | None
+    normals: TrainedModel | None
+    second: TrainedModel | None = None
+    device: torch.device
+    antialias: bool = True
+    chunk_pixels: int | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for place, roles in _ROLES.items():
+            model = getattr(self, place)
+            if model is not None and model.role not in roles:
+                raise InputError(f"{place}: {model.name!r} is a model for {model.role!r}, not for {' or '.join(roles)}")
+        if self.second is not None and self.normals is None:
+            raise InputError(f"second: {self.second.name!r} sees estimated normals; give a normal model too")
+        if self.second is not None and self.lighting is None:
+            raise InputError(f"second: {self.second.name!r} starts from estimated lights; give a lighting model too")
+        if self.chunk_pixels is not None and self.chunk_pixels < 1:
+            raise InputError(f"chunk_pixels must be at least 1, got {self.chunk_pixels}")
+
+    @property
+    def arithmetic(self) -> Arithmetic:
+        """What the networks compute in, resolved."""
+        return arithmetic(self.precision, self.device)
+
+    @property
+    def needs_lights(self) -> bool:
+        """Whether the normal model is told the lights; otherwise it works without a lighting model."""
+        return self.normals.role == "pixels" or self.normals.network.needs_lights
+
+    @torch.inference_mode()
+    def estimate(
+        self,
+        images: ImageSource,
+        mask: np.ndarray,
+        lights: np.ndarray | None = None,
+        intensities: np.ndarray | None = None,
+        *,
+        found: Estimate | None = None,
+    ) -> Estimate:
+        """Estimate normals, and whichever of light directions and intensities are not given.
+
+        Without a lighting model, given directions alone stand for lights of equal intensity. Normal models that are
+        told no lights see the images as they are, whatever is given.
+
+        Args:
+            images: (L, H, W, 3), linear radiance of any overall scale, L >= 1, any size; an array, or anything that
+                gives the images of a slice. It is read several times, a few images at once.
+            mask: (H, W) bool.
+            lights: (L, 3) known light directions.
+            intensities: (L,) or (L, 3) known intensities, of any overall scale.
+            found: What `estimate_lights` of an estimator with the same lighting networks and options gave for these
+                images and intensities; it saves estimating the lights again, and changes nothing else.
+
+        Returns:
+            The estimate. Directions or intensities that nobody gave, estimated or assumed are empty, (0, 3) and (0,),
+            so that scoring them is refused. Diagnostics hold `seconds`, `precision` (what was computed in), `exposure`
+            (factor applied for each network), `stray_light` (L, 3) (taken off before that) and, where classes of light
+            were estimated, `confidence` (L,), the product of the probabilities of the two likeliest direction classes.
+
+        Raises:
+            InputError: sizes that do not fit, non-finite values, an empty mask, lights wanted without a lighting
+                model, or lights found though they are given.
+        """
+        if self.normals is None:
+            raise InputError("no normal model was loaded, so only lights can be estimated; load one")
+        if self.needs_lights and self.lighting is None and lights is None:
+            raise InputError("no lighting model was loaded, so light directions must be given")
+        began = time.perf_counter()
+        _check_lights(len(images), lights, intensities)
+        scene = self._survey(images, mask)
+        known = self._known(lights, intensities)
+        diagnostics = self._diagnostics(scene)
+        if found is not None:
+            lit = self._taken(found, lights, len(images), diagnostics)
+            began -= found.diagnostics["seconds"]
+        elif self.lighting is not None and (lights is None or intensities is None):
+            lit = self._estimate_lights(scene, known, diagnostics)
+        elif self.needs_lights:
+            equal = np.full(len(images), self._mean_intensity(), np.float32)
+            lit = self._lights(known.directions, equal if known.intensities is None else known.intensities)
+        else:
+            lit = None
+        multiple = 1 if self.normals.role == "pixels" else self.normals.network.size_multiple
+        view = self._view(scene, "normals", known.balance, pad_to(multiple), scene.mask.size, diagnostics)
+        normals = np.zeros((*mask.shape, 3), np.float32)
+        box = self._normals(view, lit)[0].permute(1, 2, 0).cpu().numpy()  # padded (h, w, 3)
+        box = box[: scene.mask.shape[0], : scene.mask.shape[1]]
+        normals[scene.rows, scene.columns] = np.where(scene.mask[..., None], box, np.float32(0.0))
+        directions, gains = known[:2] if lit is None else (part[0].float().cpu().numpy() for part in lit[:2])
+        diagnostics["seconds"] = time.perf_counter() - began
+        return Estimate(
+            normals,
+            np.zeros((0, 3), np.float32) if directions is None else directions,
+            np.zeros(0, np.float32) if gains is None else gains,
+            diagnostics,
+        )
+
+    @torch.inference_mode()
+    def estimate_lights(self, images: ImageSource, mask: np.ndarray, intensities: np.ndarray | None = None) -> Estimate:
+        """Estimate the lights alone, as `estimate` does on its way.
+
+        Args:
+            images, mask, intensities: As in `estimate`.
+
+        Returns:
+            An estimate whose normals are empty, (0, 0, 3).
+
+        Raises:
+            InputError: as in `estimate`, or no lighting model was loaded.
+        """
+        if self.lighting is None:
+            raise InputError("no lighting model was loaded; load one, or give the lights")
+        began = time.perf_counter()
+        _check_lights(len(images), None, intensities)
+        scene = self._survey(images, mask)
+        diagnostics = self._diagnostics(scene)
+        found = self._estimate_lights(scene, self._known(None, intensities), diagnostics)
+        directions, gains = (part[0].float().cpu().numpy() for part in found[:2])
+        diagnostics["seconds"] = time.perf_counter() - began
+        return Estimate(np.zeros((0, 0, 3), np.float32), directions, gains, diagnostics)
+
+    def _survey(self, images: ImageSource, mask: np.ndarray) -> ObjectImages:
+        return survey(images, mask, self.margin_of(mask.shape), stray=self.stray_light)
+
+    def _diagnostics(self, scene: ObjectImages) -> dict[str, Any]:
+        return {"precision": self.arithmetic.precision, "stray_light": scene.stray, "exposure": {}}
+
+    def _estimate_lights(self, scene: ObjectImages, known: _Known, diagnostics: dict[str, Any]) -> Lights:
+        """Return the lights (1, L, ...) after one or two passes; what is known stays."""
+        read_out = self.read_out if self.second is None else "expectation"
+        lights = self._lighting_pass("lighting", scene, read_out, diagnostics)
+        if self.second is not None:
+            first = self._merged(known, lights)
+            small = self._view(scene, "normals", known.balance, self._shrink, INPUT_SIZE**2, diagnostics)
+            normals, mask = self._normals(small, first), small.mask
+
+            def context(part: slice) -> Tensor:
+                return LCNetSecond.context(normals, mask, first.directions[:, part])
+
+            lights = self._lighting_pass("second", scene, self.read_out, diagnostics, context)
+        if lights.confidence is not None:
+            diagnostics["confidence"] = lights.confidence[0].float().cpu().numpy()
+        return self._merged(known, lights)
+
+    def _taken(self, found: Estimate, lights: np.ndarray | None, count: int, diagnostics: dict[str, Any]) -> Lights:
+        """Return lights (1, L, ...) that were estimated before, and what was noted of them."""
+        if lights is not None or len(found.light_directions) != count:
+            raise InputError("found holds lights of other images, or of images whose lights are given")
+        diagnostics["exposure"].update(found.diagnostics["exposure"])
+        diagnostics.update({name: found.diagnostics[name] for name in ("confidence",) if name in found.diagnostics})
+        return self._lights(found.light_directions, found.intensities)
+
+    def _lighting_pass(
+        self, place: str, scene: ObjectImages, read_out: ReadOut, diagnostics: dict[str, Any], context: Any = None
+    ) -> Lights:
+        """Return the lights (1, L, ...) that the lighting network in `place` finds, the mean over the views."""
+        network = getattr(self, place).network
+        view = self._view(scene, place, None, self._shrink, INPUT_SIZE**2, diagnostics)
+        views = self.light_views or 1
+        if views > 1:
+            view = KeptView(view)
+        found = []
+        for symmetry in SYMMETRIES[:views]:
+            turned, extra = TurnedView(view, symmetry), turned_context(symmetry, context)
+            prediction = lighting_prediction(network, turned, self.arithmetic.autocast, extra)
+            found.append((symmetry, network.lights(prediction, read_out)))
+        return mean_lights(found)
+
+    def _normals(self, view: View, lights: Lights | None) -> Tensor:
+        """Return normals (1, 3, h, w) of a view, the mean over the views it is turned into."""
+        network = self.normals.network
+        if self.normals.role == "pixels":
+            return pixel_normal_map(network, view, lights, self.arithmetic.autocast, rotations=self.rotations)
+        found = []
+        for symmetry in SYMMETRIES[: self.normal_views or 1]:
+            turned = normal_map(network, TurnedView(view, symmetry), symmetry.lights(lights), self.arithmetic.autocast)
+            found.append(symmetry.back.vectors(symmetry.back.images(turned), dim=1))
+        return functional.normalize(torch.stack(found).mean(0), dim=1) if len(found) > 1 else found[0]
+
+    def _view(
+        self,
+        scene: ObjectImages,
+        place: str,
+        balance: np.ndarray | None,
+        fit: Any,
+        pixels: int,  # of an image as the network sees it
+        diagnostics: dict[str, Any],
+    ) -> View:
+        """Return the scene as the model in `place` saw scenes in training."""
+        exposure = measure_exposure(scene.sample, getattr(self, place).augmentation())
+        diagnostics["exposure"][place] = exposure.scale
+        chunk = self.chunk_pixels or _CHUNK_PIXELS.get(self.device.type, 2**19)
+        return View(scene, exposure, balance, fit, max(1, chunk // pixels), self.device)
+
+    @property
+    def _shrink(self) -> Any:
+        return partial(resize_input, antialias=self.antialias)
+
+    def _mean_intensity(self) -> float:
+        model = self.lighting if self.normals is None else self.normals
+        return float(np.mean(model.augmentation().intensity_range))
+
+    def _known(self, lights: np.ndarray | None, intensities: np.ndarray | None) -> _Known:
+        """Bring given lights to unit length and given intensities, whose scale is their own, to that of training."""
+        directions = balance = gains = None
+        if lights is not None:
+            directions = np.asarray(lights, np.float64)
+            directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
+        if intensities is not None:
+            colours = np.asarray(intensities, np.float64)
+            colours = colours / colours.mean() * self._mean_intensity()
+            gains = (colours if colours.ndim == 1 else colours.mean(1)).astype(np.float32)
+            balance = None if colours.ndim == 1 else (colours / colours.mean(1, keepdims=True)).astype(np.float32)
+        return _Known(directions, gains, balance)
+
+    def _lights(self, directions: np.ndarray, intensities: np.ndarray) -> Lights:
+        return Lights(*(torch.from_numpy(part)[None].to(self.device) for part in (directions, intensities)))
+
+    def _merged(self, known: _Known, lights: Lights) -> Lights:
+        """Return the lights with what is known in place of what was estimated."""
+        pairs = zip(known[:2], lights[:2], strict=True)
+        return Lights(*(lit.float() if one is None else torch.from_numpy(one)[None].to(lit) for one, lit in pairs))
+
+
+def load_estimator(
+    *,
+    lighting: str | Path | None = None,
+    normals: str | Path,
+    second: str | Path | None = None,
+    device: str | torch.device | None = None,
+    **options: Any,
+) -> Estimator:
+    """Load trained models that shall work together.
+
+    Args:
+        lighting: Safetensors of a lighting model; None for known lights only, or a normal model that is told none.
+        normals: Safetensors of a normal model.
+        second: Safetensors of a second lighting pass.
+        device: Torch device; CUDA when there is one, else CPU.
+        options: Other fields of `Estimator`; the defaults are those of every command
+        (`sdps.inference.inference_config`).
+
+    Raises:
+        InputError: a file is missing, damaged, or of a model for something else.
+    """
+    device = default_device(device)
+    files = {"lighting": lighting, "normals": normals, "second": second}
+    models = {place: None if file is None else load_model(file, device, _ROLES[place]) for place, file in files.items()}
+    return Estimator(**models, device=device, **options)
+
+
+def default_device(device: str | torch.device | None = None) -> torch.device:
+    """Return the device asked for, else CUDA where there is one, else the CPU."""
+    return torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+
+
+def load_model(file: str | Path, device: torch.device, role: str | tuple[str, ...] = ()) -> TrainedModel:
+    """Load a trained model for inference on `device`.
+
+    Raises:
+        InputError: the file is missing, damaged, or of a model of another role.
+    """
+    model = load_weights(file, role)
+    model.network.to(device, memory_format=torch.channels_last)  # a third faster on CPUs
+    return model
+
+
+def _check_lights(count: int, lights: np.ndarray | None, intensities: np.ndarray | None) -> None:
+    """Refuse lights that cannot be those of `count` images, in one line."""
+    if lights is not None and np.shape(lights) != (count, 3):
+        raise InputError(f"{count} images need light directions of shape ({count}, 3), got {np.shape(lights)}")
+    if lights is not None:
+        lengths = np.linalg.norm(lights, axis=-1)
+        if not ((lengths > 0.0) & np.isfinite(lengths)).all():
+            raise InputError("a light direction is zero or NaN; give unit vectors from the surface to the light")
+    if intensities is not None:
+        if np.shape(intensities) not in ((count,), (count, 3)):
+            raise InputError(f"{count} images need as many intensities, got {np.shape(intensities)}")
+        if not ((np.asarray(intensities) > 0.0) & np.isfinite(intensities)).all():
+            raise InputError("light intensities must be positive finite numbers")

@@ -1,0 +1,1 @@
+"""Methods, learned and classical, behind one interface: choosing, loading, running."""

@@ -1,0 +1,87 @@
+"""A method as data: which networks or classical method give lights and normals, and what that is called."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sdps.classical import registry as classical
+from sdps.core.lighting import ReadOut
+from sdps.methods import pretrained
+from sdps.models.registry import COMBINATIONS, TRUE_LIGHTS
+
+NONE = ""
+CONSTANT = "constant"
+"""A predictor that sees nothing: what knowing nothing scores."""
+CLASSICAL = (*classical.METHODS, CONSTANT)
+VIEWS = ("light_views", "normal_views")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """A way from images to lights or normals.
+
+    Attributes:
+        name: Label of its row.
+        lights: A lighting model (run or file), `true` for lights that are given, or empty for none.
+        normals: A normal model, a classical method, or empty for lighting alone.
+        second: A second lighting pass, or empty.
+        intensities: `true` where only the intensities are given, else empty.
+        read_out: How light classes become lights; None for the configuration's.
+        light_views: Turned views that lights are averaged over where the configuration does not say; None for one.
+        normal_views: The same for normals.
+        paper: Row of the paper's table.
+    """
+
+    name: str
+    lights: str = NONE
+    normals: str = NONE
+    second: str = NONE
+    intensities: str = NONE
+    read_out: ReadOut | None = None
+    light_views: int | None = None
+    normal_views: int | None = None
+    paper: str = ""
+
+    def models(self) -> set[str]:
+        """Return the runs whose weights it needs."""
+        return {self.lights, self.normals, self.second} - {NONE, TRUE_LIGHTS, *CLASSICAL}
+
+
+def label(lights: str, normals: str, second: str = NONE, *, combination: str = NONE) -> str:
+    """Name what parts make together, by the combination's name and its parts where it has one."""
+    suffix = " (shipped)" if any(part.startswith(pretrained.SHIPPED) for part in (lights, normals, second)) else ""
+    lights, normals, second = (part.removeprefix(pretrained.SHIPPED) for part in (lights, normals, second))
+    if lights == TRUE_LIGHTS:
+        text = f"{normals}, true lights"
+    else:
+        text = " + ".join(part for part in (lights, second, normals) if part)
+    return (f"{combination} ({text})" if combination else text) + suffix
+
+
+def combined(
+    lights: str,
+    normals: str,
+    second: str = NONE,
+    *,
+    paper: str = "",
+    intensities: str = NONE,
+    combination: str = NONE,
+) -> Method:
+    """Return the method of parts that go together, with its label; asked for as a combination, with its views."""
+    pair = COMBINATIONS[combination] if combination else None
+    views = {field: getattr(pair, field, None) for field in VIEWS}
+    named = combination if any(views.values()) else NONE  # others are their parts, and called so
+    name = label(*map(stem, (lights, normals, second)), combination=named)
+    return Method(
+        name=name + (", true intensities" if intensities else ""),
+        lights=lights,
+        normals=normals,
+        second=second,
+        intensities=intensities,
+        paper=paper,
+        **views,
+    )
+
+
+def stem(name: str) -> str:
+    """Return what a run or weights file is called."""
+    return Path(name).stem if name.endswith(".safetensors") else name

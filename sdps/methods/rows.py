@@ -1,0 +1,132 @@
+"""The rows of the paper's tables, and which of them the weights in a folder can fill."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from sdps.inference.inference_config import InferenceConfig
+from sdps.methods import pretrained
+from sdps.methods.method import NONE, Method, combined, label
+from sdps.methods.parse import combine, parse
+from sdps.methods.pretrained import ALL, finder
+from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
+
+NORMAL_ROWS = (  # lighting, normals, second, row of the paper
+    (TRUE_LIGHTS, "psfcn", NONE, "B0"),
+    ("lcnet", "nenet", NONE, "B1"),
+    ("lcnet", "psfcn", NONE, "B2"),
+    ("lcnet-reg", "nenet-reg", NONE, "B3"),
+    ("lcnet-reg", "psfcn", NONE, "B4"),
+    (NONE, "upsfcn-deep-mask", NONE, "B5"),
+    (NONE, "upsfcn-deep", NONE, "B6"),
+    (NONE, "upsfcn-wide", NONE, "B7"),
+    (NONE, "upsfcn-light", NONE, "B8"),
+    (NONE, "upsfcn", NONE, "B9"),
+    (TRUE_LIGHTS, "nenet", NONE, ""),
+    ("lcnet", "nenet-norm", NONE, ""),
+    (TRUE_LIGHTS, "psfcn-norm", NONE, ""),
+    ("lcnet", "psfcn-norm", NONE, ""),
+    (TRUE_LIGHTS, "cnnps", NONE, ""),
+    ("lcnet", "cnnps", NONE, ""),
+    ("lcnet-joint", "nenet-joint", NONE, ""),
+    ("lcnet-soft", "psfcn", NONE, ""),
+    ("lcnet-soft", "nenet-plus", NONE, ""),
+    ("lcnet-soft", "nenet-plus", "lcnet-second", ""),
+    ("lcnet", "least-squares", NONE, ""),
+    (TRUE_LIGHTS, "least-squares", NONE, ""),
+)
+
+
+def lighting_methods(
+    out: Path, own: Sequence[str], config: InferenceConfig, ways: Sequence[Method], shipped: tuple[str, ...] = ALL
+) -> list[Method]:
+    """Return one method per lighting model trained in `out` or shipped, the paper's first, and LCNet's read-outs.
+
+    Args:
+        out: Folder of the runs.
+        own: Runs that give lights and are not called as their model.
+        config: How networks are used.
+        ways: Those of `normal_methods`: where only some shipped ones are wanted, their lights are.
+        shipped: Shipped ways that are wanted.
+    """
+    names = [name for name, item in MODELS.items() if item.role == "lighting"]
+    names += [name for name in own if name not in names]
+    names.append("lcnet-joint")
+    trained = [name for name in names if pretrained.trained_file(out, name).is_file()]
+    methods = [Method(name=name, lights=name, paper=MODELS[name].paper if name in MODELS else "") for name in trained]
+    if "lcnet" in trained:
+        others = (how for how in ("centre", "expectation", "peak") if how != config.read_out)
+        methods += [Method(name=f"lcnet, {how}", lights="lcnet", read_out=how) for how in others]
+    available, told = pretrained.shipped(), {way.lights for way in ways}
+    kept = [
+        Method(name=label(pretrained.SHIPPED + name, NONE), lights=pretrained.SHIPPED + name, paper=MODELS[name].paper)
+        for name in names
+        if name in available and (shipped == ALL or pretrained.SHIPPED + name in told)
+    ]
+    rows = [*methods, *kept]
+    return rows if config.light_views else with_views(rows, ways)
+
+
+def with_views(rows: Sequence[Method], ways: Sequence[Method]) -> list[Method]:
+    """Return rows of lights, and after them those that one of `ways` averages over turned views, averaged so."""
+    counts = {way.lights: way.light_views for way in ways if way.light_views}
+    averaged = [
+        replace(row, name=f"{row.name}, {count} views", light_views=count, paper="")
+        for row in rows
+        if (count := counts.get(row.lights))
+    ]
+    return [*rows, *averaged]
+
+
+def normal_methods(out: Path, shipped: tuple[str, ...] = ALL, config: InferenceConfig | None = None) -> list[Method]:
+    """Return the tables' rows whose models are all trained in `out`, and those that are shipped, or some of these.
+
+    Combinations that differ from their parts by the views they average over have no row where `config` fixes these.
+
+    Raises:
+        InputError: `shipped` names what is not.
+    """
+    trained, kept = [], []
+    available = set(pretrained.shipped())
+    fixed = config is not None and None not in (config.light_views, config.normal_views)
+    for method in _every_row():
+        if fixed and (method.light_views or method.normal_views):
+            continue
+        if all(pretrained.trained_file(out, name).is_file() for name in method.models()):
+            trained.append(method)
+        if method.models() and method.models() <= available:
+            kept.append(as_shipped(method))
+    if shipped != ALL:
+        kept = [_with_row(as_shipped(parse(text, finder(None)))) for text in shipped]
+    return trained + kept
+
+
+def _every_row() -> list[Method]:
+    """Return the tables' rows, and after them the combinations that average over views."""
+    rows = [combined(lights, normals, second, paper=paper) for lights, normals, second, paper in NORMAL_ROWS]
+    for name, pair in COMBINATIONS.items():
+        if pair.light_views or pair.normal_views:
+            rows.append(combined(pair.lighting, pair.normals, pair.second, combination=name))
+    return rows
+
+
+def as_shipped(method: Method) -> Method:
+    """Return the same way with the weights that travel with the package, where it needs any."""
+    parts = {part: getattr(method, part) for part in ("lights", "normals", "second")}
+    placed = {part: pretrained.SHIPPED + name for part, name in parts.items() if name in method.models()}
+    return replace(method, name=f"{method.name} (shipped)", **placed) if placed else method
+
+
+def chosen(out: Path, lights: str | None, normals: str | None, second: str | None, intensities: str | None) -> Method:
+    """Return the method that flags describe, with its row in the paper's table; see `sdps.methods.parse.combine`."""
+    return _with_row(combine(lights, normals, second, intensities, finder(out)))
+
+
+def _with_row(method: Method) -> Method:
+    return replace(method, paper=paper_row(method))
+
+
+def paper_row(method: Method) -> str:
+    """Return the row of the paper's table of normals that a combination is, or an empty string."""
+    parts = tuple(part.removeprefix(pretrained.SHIPPED) for part in (method.lights, method.normals, method.second))
+    return "" if method.intensities else next((row[3] for row in NORMAL_ROWS if row[:3] == parts), "")

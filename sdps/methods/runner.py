@@ -1,0 +1,167 @@
+"""A method with its networks loaded: images in, normals and lights out."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from render.records.shards import file_hash
+from sdps.classical import registry as classical
+from sdps.core.baselines import constant_estimate
+from sdps.core.estimate import Estimate
+from sdps.core.metrics import score
+from sdps.inference.estimator import Estimator, default_device, load_model
+from sdps.inference.image_source import ImageSource, survey
+from sdps.inference.inference_config import InferenceConfig
+from sdps.methods.method import CONSTANT, NONE, VIEWS, Method
+from sdps.models.registry import TRUE_LIGHTS
+
+if TYPE_CHECKING:
+    from sdps.models.checkpoint import TrainedModel
+
+_digest = cache(file_hash)
+_PLACES = ("lights", "second", "normals")
+
+
+@cache
+def _loaded(path: Path) -> "TrainedModel":
+    """Load a model once, however many methods use it."""
+    return load_model(path, default_device())
+
+
+class Runner:
+    """A method with its networks loaded.
+
+    Args:
+        method: What to do.
+        find: Gives the weights file of a name, or raises InputError.
+        config: How networks are used; what the method itself says of its read-out and views is filled in.
+
+    Raises:
+        InputError: weights that are missing, damaged, or of another role.
+    """
+
+    def __init__(self, method: Method, find: Callable[[str], Path], config: InferenceConfig | None = None) -> None:
+        self.method, self.config = method, _filled(config or InferenceConfig(), method)
+        self.files = {name: find(name) for name in sorted(method.models())}
+
+        def model(name: str) -> "TrainedModel | None":
+            return _loaded(self.files[name]) if name in self.files else None
+
+        lighting, normals, second = (model(name) for name in (method.lights, method.normals, method.second))
+        self.estimator = None
+        if lighting is not None or normals is not None:
+            self.estimator = Estimator(
+                lighting=lighting,
+                normals=normals,
+                second=second,
+                device=default_device(),
+                **self.config.options(),
+            )
+
+    def identity(self) -> str:
+        """Return a digest of what results depend on besides images and code: weights, settings and arithmetic."""
+        method = self.method
+        names = {place: getattr(method, place) for place in _PLACES}
+        parts = [method.intensities]
+        parts += [(place, _digest(self.files[name]) if name in self.files else name) for place, name in names.items()]
+        if self.estimator is not None:
+            used = self.config.options() | {"precision": self.estimator.arithmetic.precision}
+            parts += [used, str(self.estimator.device)]
+        return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+    def estimate(
+        self,
+        images: ImageSource,
+        mask: np.ndarray,
+        lights: np.ndarray | None,
+        intensities: np.ndarray | None,
+        found: dict[tuple, Estimate] | None = None,
+    ) -> Estimate:
+        """Run the method; of the lights it sees what it is to be given.
+
+        Args:
+            images: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time.
+            mask: (H, W) bool.
+            lights: (L, 3) directions, or None where the method is given none.
+            intensities: (L,) or (L, 3), or None where they are not known.
+            found: Lights that methods found of these very images, by what they depend on; read, and added to.
+
+        Raises:
+            InputError: images or lights the method cannot work with, in one line.
+        """
+        method, given = self.method, {}
+        if method.lights == TRUE_LIGHTS:
+            given["lights"] = lights
+        if TRUE_LIGHTS in (method.lights, method.intensities) and intensities is not None:
+            given["intensities"] = intensities
+        if method.normals == CONSTANT:
+            return constant_estimate(len(images), mask)
+        if method.normals in classical.METHODS:
+            return self._classical(images, mask, given, found)
+        if not method.normals:
+            return self._lights(images, mask, given, found)
+        if found is not None and method.lights not in (NONE, TRUE_LIGHTS):
+            given["found"] = self._lights(images, mask, given, found)
+        return self.estimator.estimate(images, mask, **given)
+
+    def _lights(
+        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: dict[tuple, Estimate] | None
+    ) -> Estimate:
+        """Estimate the lights, or take what another method with the same lighting networks found."""
+        found = {} if found is None else found
+        places = _PLACES if self.method.second else ("lights",)  # a second pass sees normals
+        used = (_digest(self.files[getattr(self.method, place)]) for place in places)
+        options = self.config.options() | ({} if self.method.second else {"normal_views": None, "rotations": None})
+        key = (*used, *options.items(), "intensities" in given)
+        if key not in found:
+            found[key] = self.estimator.estimate_lights(images, mask, given.get("intensities"))
+        return found[key]
+
+    def _classical(
+        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: dict[tuple, Estimate] | None
+    ) -> Estimate:
+        """Run a classical method, which holds the object's box of all images at once."""
+        name, told = self.method.normals, ()
+        if classical.METHODS[name].calibrated:
+            if self.method.lights == TRUE_LIGHTS:
+                told = given["lights"], given.get("intensities")
+            else:
+                lit = self._lights(images, mask, given, found)
+                told = lit.light_directions, lit.intensities
+        if isinstance(images, np.ndarray):
+            return classical.run(name, images, mask, *told)
+        scene = survey(images, mask, margin=2)
+        estimate = classical.run(name, scene.read(0, len(images)), scene.mask, *told)
+        normals = np.zeros((*mask.shape, 3), np.float32)
+        normals[scene.rows, scene.columns] = estimate.normals
+        return replace(estimate, normals=normals)
+
+    def score(
+        self,
+        estimate: Estimate,
+        mask: np.ndarray,
+        normals: np.ndarray | None,
+        lights: np.ndarray | None,
+        intensities: np.ndarray | None,
+    ) -> dict[str, float]:
+        """Return the metrics of what the method estimated itself, and nothing it was given."""
+        method, truth = self.method, {}
+        if estimate.normals.size and normals is not None:
+            truth["normals"] = normals
+        if method.lights != TRUE_LIGHTS and len(estimate.light_directions) and lights is not None:
+            truth["light_directions"] = lights
+        found = len(estimate.intensities) and TRUE_LIGHTS not in (method.lights, method.intensities)
+        if found and intensities is not None:
+            truth["intensities"] = intensities
+        return {item.name: item.value for item in score(estimate, mask, **truth)}
+
+
+def _filled(config: InferenceConfig, method: Method) -> InferenceConfig:
+    """Return the configuration with what the method says where it says nothing, one view where neither does."""
+    views = {name: getattr(config, name) or getattr(method, name) or 1 for name in VIEWS}
+    return replace(config, read_out=method.read_out or config.read_out, **views)

@@ -1,0 +1,155 @@
+"""Weights as safetensors with what is needed to use them, and trainer state to go on from.
+
+Neither file can execute code when loaded, and neither is ever half-written.
+"""
+
+import json
+import pickle
+import struct
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import nn
+
+from render.shared.config import build
+from render.shared.errors import InputError
+from render.shared.files import atomic_path, source_digest
+from sdps.data.augment import Augmentation
+from sdps.models import registry
+
+FORMAT = "sdps-weights-1"
+
+_LENGTH = struct.Struct("<Q")
+"""The first bytes of a safetensors file: the length of its header, which is JSON."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedModel:
+    """A network with its weights and where they come from.
+
+    Attributes:
+        name: Name in `sdps.models.registry` (several runs may train one model).
+        network: The network, in eval mode, weights float32.
+        options: Options it was built with.
+        metadata: `config` (the training section as plain values), `data` (SHA-256 of the manifest),
+            `code` (hash of this package), `step`, and the final validation `metrics`.
+    """
+
+    name: str
+    network: nn.Module
+    options: dict[str, Any]
+    metadata: dict[str, Any]
+
+    @property
+    def role(self) -> str:
+        """What the model is for; see `registry.ModelEntry`."""
+        return registry.entry(self.name).role
+
+    def augmentation(self) -> Augmentation:
+        """Return the augmentation of training, whose exposure test images must be brought to."""
+        return build(Augmentation, self.metadata["config"]["augmentation"], "augmentation")
+
+
+@cache
+def code_version() -> str:
+    """Return a short hash of this package's source files."""
+    return source_digest(Path(__file__).parents[1])
+
+
+def save_weights(path: str | Path, model: TrainedModel, *, half: bool = False) -> None:
+    """Write the network's weights and metadata atomically; the same model gives the same bytes.
+
+    Args:
+        path: Destination, by convention `.safetensors`.
+        model: What to save.
+        half: Store float16, half the size, to be read back as float32.
+    """
+    dtype = torch.float16 if half else torch.float32
+    tensors = {
+        name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in model.network.state_dict().items()
+    }
+    header = {"format": FORMAT, "model": model.name, "options": json.dumps(model.options)}
+    header["metadata"] = json.dumps(model.metadata)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(_with_sorted_header(save(tensors, metadata=header)))
+
+
+def _with_sorted_header(data: bytes) -> bytes:
+    """Return a safetensors file with the keys of its header in order; the library leaves them to chance."""
+    start = _LENGTH.size + _LENGTH.unpack_from(data)[0]
+    header = json.loads(data[_LENGTH.size : start])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % _LENGTH.size)  # tensors stay aligned
+    return _LENGTH.pack(len(text)) + text + data[start:]
+
+
+def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedModel:
+    """Read weights written by `save_weights` and build their network. Runs no code from the file.
+
+    Args:
+        path: The file.
+        role: Role or roles the caller can use, e.g. `lighting`; any if empty.
+
+    Raises:
+        InputError: missing, truncated or foreign file, a model of another role, or weights that do not fit it.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such weights file; train one or give another path")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path}: truncated or not a safetensors file ({error}); copy or train it again") from error
+    if header.get("format") != FORMAT:
+        raise InputError(f"{path}: not written by this project (no {FORMAT!r} header); train the network again")
+    name, options, metadata = _described(path, header)
+    roles = (role,) if isinstance(role, str) else role
+    if roles and registry.entry(name).role not in roles:
+        raise InputError(
+            f"{path}: holds {name!r}, a model for {registry.entry(name).role!r}; one for {' or '.join(roles)} is "
+            "needed here; swap the files"
+        )
+    network = registry.create(name, **options)
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:
+        detail = " ".join(str(error).split())[:160]
+        raise InputError(f"{path}: weights do not fit {name!r} ({detail}); train it again") from error
+    return TrainedModel(name, network.eval(), options, metadata)
+
+
+def _described(path: str | Path, header: dict[str, str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Return model name, options and metadata of a file's header, or refuse it."""
+    try:
+        name, options, metadata = header["model"], json.loads(header["options"]), json.loads(header["metadata"])
+        build(Augmentation, metadata["config"]["augmentation"], "augmentation")
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged header ({error}); copy or train it again") from error
+    if name not in registry.MODELS:
+        raise InputError(f"{path}: holds {name!r}, a model this version does not know; see `sdps models`")
+    return name, options, metadata
+
+
+def save_state(path: str | Path, state: dict[str, Any]) -> None:
+    """Write trainer state (tensors, numbers, text, and containers of these) atomically."""
+    with atomic_path(path) as temporary:
+        torch.save(state, temporary)
+
+
+def load_state(path: str | Path) -> dict[str, Any]:
+    """Read trainer state without executing anything in it.
+
+    Raises:
+        InputError: truncated or foreign file.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError) as error:
+        raise InputError(f"{path}: truncated or not a checkpoint; delete it to start this run afresh") from error

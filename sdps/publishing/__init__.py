@@ -1,0 +1,1 @@
+"""What goes with weights to other people: the model card and learning curves."""

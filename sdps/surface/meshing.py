@@ -1,0 +1,131 @@
+"""A depth map as a triangle mesh, and mesh files.
+
+Legend: (H, W) image sides, v vertices (one per used pixel), f triangles.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from render.shared.errors import InputError, unknown
+from render.shared.files import atomic_path
+from sdps.surface.integration import Depth
+
+FORMATS = (".ply", ".obj", ".glb")
+
+
+def unit_scale(shape: tuple[int, int]) -> float:
+    """Return the length of a pixel in half widths of the image, the longer side of (H, W) being 2."""
+    return 2.0 / max(shape)
+
+
+def mesh(
+    depth: Depth | np.ndarray,
+    mask: np.ndarray | None = None,
+    *,
+    colour: np.ndarray | None = None,
+    normals: np.ndarray | None = None,
+    steepest: float | None = None,
+) -> trimesh.Trimesh:
+    """Triangulate the masked pixels: a vertex at each pixel's centre, two triangles between four, one between three.
+
+    The frame is the camera's, x right, y up, z to the camera, with the origin at the image's centre and the longer
+    image side 2 long. Triangles face the camera (anticlockwise when seen from it). Of a square's two diagonals the one
+    across the smaller step is taken. Pixels that are part of no triangle (lines one pixel wide) get no vertex.
+
+    Args:
+        depth: Of `integrate`, or (H, W) z in pixels towards the camera.
+        mask: (H, W) bool; that of `depth` if not given.
+        colour: (H, W, 3) uint8, colours of the vertices.
+        normals: (H, W, 3), normals of the vertices, not those of the triangles around them.
+        steepest: Leave out triangles with an edge that rises by more pixels than this per pixel, such as walls across
+            discontinuities; None keeps all.
+
+    Raises:
+        InputError: sizes or types that do not fit, depth that is not finite, or no triangle.
+    """
+    z, mask = _checked(depth, mask, colour, normals)
+    index = np.full(mask.shape, -1, np.int64)
+    index[mask] = np.arange(mask.sum())
+    faces = _triangles(z, index)
+    rows, columns = np.nonzero(mask)
+    if steepest is not None:
+        corners = np.stack([columns, rows, z[mask]], axis=-1).astype(np.float64)[faces]  # (f, 3, 3)
+        edges = corners - np.roll(corners, 1, axis=1)
+        faces = faces[(np.abs(edges[..., 2]) <= steepest * np.linalg.norm(edges[..., :2], axis=-1)).all(axis=1)]
+    if not len(faces):
+        raise InputError("no three neighbouring mask pixels make a triangle; mark a larger object, or raise steepest")
+    used, faces = np.unique(faces, return_inverse=True)
+    rows, columns = rows[used], columns[used]
+    height, width = mask.shape
+    vertices = np.stack([columns - (width - 1) / 2, (height - 1) / 2 - rows, z[rows, columns]], axis=-1)
+    return trimesh.Trimesh(
+        vertices=vertices * unit_scale(mask.shape),
+        faces=faces.reshape(-1, 3),
+        vertex_normals=None if normals is None else np.asarray(normals, np.float64)[rows, columns],
+        vertex_colors=None if colour is None else colour[rows, columns],
+        process=False,
+    )
+
+
+def write_mesh(surface: trimesh.Trimesh, path: str | Path) -> None:
+    """Write a mesh with its normals and colours, whole or not at all, as .ply (binary), .obj or .glb.
+
+    Raises:
+        InputError: another suffix, or a disk that refuses the file.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise unknown("mesh format", suffix, FORMATS)
+    options = {".ply": {"vertex_normal": True}, ".obj": {"include_normals": True, "include_color": True}}
+    data = surface.export(file_type=suffix[1:], **options.get(suffix, {"include_normals": True}))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def _checked(
+    depth: Depth | np.ndarray, mask: np.ndarray | None, colour: np.ndarray | None, normals: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return z (H, W) and the mask, or refuse the arguments of `mesh`."""
+    if isinstance(depth, Depth):
+        z, mask = depth.z, depth.mask if mask is None else mask
+    elif mask is None:
+        raise InputError("a depth array needs a mask beside it")
+    else:
+        z = np.asarray(depth)
+    if mask.dtype != np.bool_ or z.shape != mask.shape or z.ndim != 2:
+        raise InputError(
+            f"depth and mask must be (H, W) and the mask bool, got {z.shape} and {mask.dtype} {mask.shape}"
+        )
+    for name, array in (("colour", colour), ("normals", normals)):
+        if array is not None and array.shape != (*mask.shape, 3):
+            raise InputError(f"{name} must be {(*mask.shape, 3)} like the mask, got {array.shape}")
+    if colour is not None and colour.dtype != np.uint8:
+        raise InputError(f"colour must be uint8, got {colour.dtype}; scale it to 0 to 255")
+    if not np.isfinite(z[mask]).all():
+        raise InputError("depth is NaN or infinite inside the mask; take these pixels out of it")
+    return z, mask
+
+
+def _triangles(z: np.ndarray, index: np.ndarray) -> np.ndarray:  # (f, 3) int64
+    """Return the triangles of pixels `index` (H, W), -1 outside the mask, anticlockwise seen from the camera."""
+    corners = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]])  # from top left, anticlockwise
+    heights = np.stack([z[:-1, :-1], z[1:, :-1], z[1:, 1:], z[:-1, 1:]])
+    there = corners >= 0
+    falling = np.abs(heights[0] - heights[2]) <= np.abs(heights[1] - heights[3])  # diagonal from top left
+    whole = there.all(axis=0)
+    parts = [
+        corners[list(triangle)][:, chosen].T
+        for triangle, chosen in (
+            ((0, 1, 2), whole & falling),
+            ((0, 2, 3), whole & falling),
+            ((0, 1, 3), whole & ~falling),
+            ((1, 2, 3), whole & ~falling),
+        )
+    ]
+    for missing in range(4):
+        rest = [corner for corner in range(4) if corner != missing]
+        parts.append(corners[rest][:, ~there[missing] & there[rest].all(axis=0)].T)
+    return np.concatenate(parts)

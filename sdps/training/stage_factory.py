@@ -1,0 +1,49 @@
+"""The stage that trains a run, by the role of its model."""
+
+from collections.abc import Mapping
+
+from render.shared.errors import InputError
+from sdps.models import registry
+from sdps.models.checkpoint import TrainedModel
+from sdps.training.joint import JointStage, SecondStage
+from sdps.training.pixel_stage import PixelStage
+from sdps.training.recipes import JOINT
+from sdps.training.stages import LightingStage, NormalStage, Stage
+from sdps.training.training_config import TrainingConfig
+
+
+def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
+    """Return the stage that trains a run.
+
+    Args:
+        name: Name of the run.
+        model: Name in the registry, or `sdps-joint`.
+        config: The run's configuration, of the model's role.
+        trained: The models it needs, by what they are for: `lighting`, `normals`, and `start` for the weights that
+            training starts from.
+
+    Raises:
+        InputError: a start of another network.
+    """
+    stage = _stage(name, model, config, trained)
+    if "start" in trained:
+        first = trained["start"]
+        try:
+            stage.network.load_state_dict(first.network.state_dict())
+        except RuntimeError as error:
+            raise InputError(f"runs.{name}.start: {first.name!r} has another network; name one of its kind") from error
+    return stage
+
+
+def _stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
+    """Return the stage with random weights."""
+    if model == JOINT:
+        return JointStage(config, trained["lighting"], trained["normals"], name=name)
+    role = registry.entry(model).role
+    if role == "lighting":
+        return LightingStage(config, model=model, name=name)
+    if role == "second":
+        return SecondStage(config, trained["lighting"], trained["normals"], model=model, name=name)
+    if role == "pixels":
+        return PixelStage(config, model=model, name=name)
+    return NormalStage(config, trained.get("lighting"), model=model, name=name)

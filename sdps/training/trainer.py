@@ -1,0 +1,396 @@
+"""The trainer of every model: load, step, log, validate, checkpoint, resume.
+
+A run's folder holds `metrics.jsonl`, `checkpoint.pt` (everything needed to go on), the best weights so far
+(`<run>-best.safetensors`) and, once finished, the last (`<run>.safetensors`). Running the same command again resumes;
+a run that was stopped and resumed takes the same steps on the same batches as one that was not. Started by `torchrun`,
+several processes share every batch and take the steps one process would take.
+"""
+
+import logging
+import math
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from render.records.manifest import read_manifest
+from render.shared.config import to_plain
+from render.shared.errors import InputError
+from render.shared.progress import progress_bar
+from sdps.core.interrupts import StopRequest, stop_on_signal
+from sdps.data.dataset import Batch, SampleKey, SceneDataset, collate
+from sdps.data.sources import BatchSource, StoredScenes
+from sdps.models.checkpoint import TrainedModel, code_version, load_state, save_state, save_weights
+from sdps.training.distributed import Team, team
+from sdps.training.loggers import JsonlLogger, Logger, Meter, TensorBoardLogger
+from sdps.training.muon import Muon
+from sdps.training.stages import Stage
+from sdps.training.training_config import TrainingConfig
+
+CHECKPOINT = "checkpoint.pt"
+METRICS = "metrics.jsonl"
+# What may differ between the parts of one run: how long, and how it is carried out, but not what is computed.
+_MAY_CHANGE = {
+    "epochs", "steps", "minutes", "workers", "cache",
+    "log_every", "validate_every", "validation_scenes", "checkpoint_minutes", "precision", "channels_last",
+}  # fmt: skip
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """How a run ended.
+
+    Attributes:
+        weights: The safetensors files by name, or None when the run was stopped before its budget was spent.
+        steps: Optimiser steps taken in all.
+        seconds: Seconds of training in all.
+        metrics: Final validation metrics, `val_...`; empty without validation scenes.
+        waiting_share: Share of this call's training time spent waiting for data.
+        interrupted: Stopped by a signal; the same call resumes.
+    """
+
+    weights: dict[str, Path] | None
+    steps: int
+    seconds: float
+    metrics: dict[str, float]
+    waiting_share: float
+    interrupted: bool
+
+
+def train(
+    stage: Stage,
+    data_folder: str | Path,
+    out_folder: str | Path,
+    *,
+    source: BatchSource | None = None,
+    device: str | torch.device | None = None,
+    loggers: Sequence[Logger] = (),
+    tensorboard: bool = False,
+) -> TrainingResult:
+    """Train a stage until its budget is spent, resuming whatever `out_folder` holds.
+
+    Args:
+        stage: What to train; carries the configuration.
+        data_folder: Rendered data with splits `train` and, for validation, `val`.
+        out_folder: Folder of the run.
+        source: Where training batches come from; by default the stored scenes of `data_folder`.
+        device: Torch device; CUDA when there is one, else CPU.
+        loggers: Receivers of metrics beside `metrics.jsonl`.
+        tensorboard: Also log to `<out_folder>/tensorboard`.
+
+    Raises:
+        InputError: unusable data, a checkpoint of another configuration or data set, or a loss that is
+            no longer finite.
+    """
+    with team(device) as here:
+        trainer = Trainer(stage, Path(data_folder), Path(out_folder), here, source)
+        try:
+            return _train(trainer, list(loggers), tensorboard)
+        finally:
+            trainer.source.close()
+
+
+def _train(trainer: "Trainer", loggers: list[Logger], tensorboard: bool) -> TrainingResult:
+    """Resume, run, validate and save."""
+    trainer.resume()
+    trainer.note_arithmetic()
+    if trainer.finished_metrics is not None and trainer.progress() >= 1.0:
+        return trainer.result(trainer.finished_metrics, 0.0, interrupted=False)
+    trainer.finished_metrics = None
+    if trainer.team.leads:
+        loggers.insert(0, JsonlLogger(trainer.folder / METRICS, trainer.step))
+        if tensorboard:
+            loggers.append(TensorBoardLogger(trainer.folder / "tensorboard"))
+    metrics: dict[str, float] = {}
+    try:
+        with stop_on_signal() as stop:
+            waiting_share, stopped = _run(trainer, loggers, stop)
+        if trainer.team.leads:
+            if not stopped:
+                metrics = trainer.finished_metrics = trainer.validate()
+                _report(loggers, trainer.step, metrics)
+                trainer.save_weights(metrics)
+            trainer.save()
+    finally:
+        for logger in loggers:
+            logger.close()
+    trainer.team.wait()  # the others may want the leader's weights next
+    if stopped:
+        _log.warning("stopped after step %d; run the same command again to resume", trainer.step)
+    return trainer.result(metrics, waiting_share, interrupted=stopped)
+
+
+def _run(trainer: "Trainer", loggers: Iterable[Logger], stop: StopRequest) -> tuple[float, bool]:
+    """Take steps until the budget is spent or a stop is requested; return the share of time waited, and whether."""
+    config = trainer.config
+    batches = trainer.source.batches(trainer.samples)
+    meter = Meter()
+    saved = time.perf_counter()
+    look = {"desc": trainer.stage.name, "bar_format": "{l_bar}{bar}| {elapsed}<{remaining} {postfix}"}
+    bar = progress_bar(total=100.0, initial=100.0 * trainer.progress(), disable=not trainer.team.leads, **look)
+    with bar:
+        while True:
+            stopped = trainer.team.any(stop.requested)
+            (progress,) = trainer.team.agree([trainer.progress()])
+            if progress >= 1.0 or stopped:
+                break
+            with meter.waiting():
+                batch = next(batches)
+            if isinstance(batch, InputError):
+                raise batch
+            meter.add(trainer.take_step(batch, progress), batch.images.shape[0] * batch.images.shape[1])
+            if trainer.step % config.log_every == 0:
+                values = meter.summary() | {"learning_rate": trainer.learning_rate, "seconds": trainer.seconds()}
+                _report(loggers, trainer.step, values)
+                bar.set_postfix_str(f"loss {values['loss']:.3f}, {values['images_per_second']:.0f} images/s")
+            if config.validate_every and trainer.step % config.validate_every == 0 and trainer.team.leads:
+                _report(loggers, trainer.step, trainer.validate())
+            if trainer.team.leads and time.perf_counter() - saved > 60.0 * config.checkpoint_minutes:
+                trainer.save()
+                saved = time.perf_counter()
+            bar.update(100.0 * min(trainer.progress(), 1.0) - bar.n)
+    return meter.total_waiting_share(), stopped
+
+
+def _report(loggers: Iterable[Logger], step: int, values: dict[str, float]) -> None:
+    for logger in loggers:
+        if values:
+            logger.log(step, values)
+
+
+class _Loss(nn.Module):
+    """A stage's loss as a module, so that `DistributedDataParallel` sees one forward pass."""
+
+    def __init__(self, stage: Stage) -> None:
+        super().__init__()
+        self.stage, self.network = stage, stage.network
+
+    def forward(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        return self.stage.loss(batch)
+
+
+class Trainer:
+    """The state of a run and what can be done to it."""
+
+    def __init__(self, stage: Stage, data: Path, folder: Path, here: Team, source: BatchSource | None = None) -> None:
+        self.stage, self.config, self.data, self.folder, self.team = stage, stage.config, data, folder, here
+        config = self.config
+        stage.to(here.device)
+        self.arithmetic = here.same_arithmetic(config.precision)
+        options = {"cache": config.cache, "skip_missing": config.skip_missing}
+        self.source = source or StoredScenes(
+            SceneDataset(data, "train", stage.sample_options(), **options),
+            batch=config.batch_scenes,
+            workers=config.workers,
+            pin_memory=here.device.type == "cuda",
+            rank=here.rank,
+            world=here.world,
+        )
+        self.validation = None
+        if config.validation_scenes and here.leads and any(scene.split == "val" for scene in read_manifest(data)):
+            self.validation = SceneDataset(data, "val", stage.validation_options(), **options)
+        self.optimiser = _optimiser(stage.network, config)
+        average = get_ema_multi_avg_fn(config.ema)
+        self.average = AveragedModel(stage.network, multi_avg_fn=average) if config.ema else None
+        if config.compile:
+            stage.network.compile()
+        self._loss: nn.Module = _Loss(stage)
+        if here.world > 1:
+            self._loss = DistributedDataParallel(self._loss)
+        self.step = self.samples = 0
+        self.computed: list[dict[str, Any]] = []
+        """Step from which on, precision and processor: what the run was computed in, part by part."""
+        self.best = math.inf
+        self.learning_rate = config.learning_rate
+        self.finished_metrics: dict[str, float] | None = None
+        self._earlier_seconds, self._started = 0.0, time.perf_counter()
+
+    def seconds(self) -> float:
+        """Return the seconds of training so far, those before a resume included."""
+        return self._earlier_seconds + time.perf_counter() - self._started
+
+    def progress(self) -> float:
+        """Return the share of the budget spent; 1 or more means done."""
+        config = self.config
+        if config.steps is not None:
+            return self.step / config.steps
+        if config.minutes is not None:
+            return self.seconds() / (60.0 * config.minutes)
+        return self.samples / (config.epochs * self.source.scenes)
+
+    def take_step(self, batch: Batch, progress: float) -> dict[str, float]:
+        """Take one optimiser step on `batch` and return its losses.
+
+        Args:
+            batch: This process's share of the step's scenes.
+            progress: Share of the budget spent, which the learning rate follows.
+
+        Raises:
+            InputError: the loss is not finite.
+        """
+        config = self.config
+        self.stage.network.train()
+        self.learning_rate = config.learning_rate_at(progress)
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.learning_rate
+        sums: dict[str, Tensor] = {}
+        for part in _parts(batch, config.accumulate):
+            with self.arithmetic.autocast():
+                loss, terms = self._loss(part.to(self.team.device))
+            (loss / config.accumulate).backward()
+            for name, value in {"loss": loss, **terms}.items():
+                sums[name] = sums.get(name, 0.0) + value.detach().double() / config.accumulate
+        # One transfer a step: a GPU is waited for once.
+        totals = self.team.mean(dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True)))
+        if not math.isfinite(totals["loss"]):
+            raise InputError(f"the loss became {totals['loss']} at step {self.step + 1}; lower learning_rate")
+        if config.clip_gradient:
+            norm = torch.nn.utils.clip_grad_norm_(self.stage.network.parameters(), config.clip_gradient)
+            totals["gradient_norm"] = float(norm)
+        self.optimiser.step()
+        self.optimiser.zero_grad(set_to_none=True)
+        if self.average is not None:
+            self.average.update_parameters(self.stage.network)
+        self.step += 1
+        self.samples += config.batch_scenes
+        return totals
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Return the stage's metrics, prefixed `val_`, averaged over fixed samples of the `val` split.
+
+        The best weights so far, by the stage's goal, are saved.
+        """
+        if self.validation is None:
+            return {}
+        trained, self.stage.network = self.stage.network, self._kept()
+        self.stage.network.eval()
+        count = min(self.config.validation_scenes, len(self.validation))
+        rows = []
+        try:
+            for index in np.linspace(0, len(self.validation) - 1, count).round().astype(int):
+                batch = collate([self.validation.sample(SampleKey(int(index), 0, int(index)))])
+                with self.arithmetic.autocast():
+                    rows.append(self.stage.metrics(batch.to(self.team.device)))
+        finally:
+            self.stage.network = trained
+        values = {f"val_{name}": float(np.mean([row[name] for row in rows])) for name in rows[0]}
+        if values[f"val_{self.stage.goal}"] < self.best:
+            self.best = values[f"val_{self.stage.goal}"]
+            self.save_weights(values, "-best")
+        return values
+
+    def _kept(self) -> nn.Module:
+        """Return the network that is validated and saved: the trained one, or its moving average."""
+        return self.stage.network if self.average is None else self.average.module
+
+    def save(self) -> None:
+        """Write the checkpoint: weights, optimiser, random state, and place in the data."""
+        cuda = torch.cuda.get_rng_state_all() if self.team.device.type == "cuda" else []
+        state = {
+            "identity": self._identity(),
+            "network": self.stage.network.state_dict(),
+            "average": self.average.state_dict() if self.average is not None else {},
+            "optimiser": self.optimiser.state_dict(),
+            "random": {"cpu": torch.get_rng_state(), "cuda": cuda},
+            "step": self.step,
+            "samples": self.samples,
+            "best": self.best,
+            "computed": self.computed,
+            "seconds": self.seconds(),
+            "finished_metrics": self.finished_metrics,
+        }
+        save_state(self.folder / CHECKPOINT, state)
+
+    def resume(self) -> None:
+        """Go on from the folder's checkpoint, if there is one.
+
+        Raises:
+            InputError: the checkpoint is damaged, or of another configuration or data set.
+        """
+        path = self.folder / CHECKPOINT
+        if not path.is_file():
+            return
+        state = load_state(path)
+        self._compare(path, state.get("identity", {}))
+        self.stage.network.load_state_dict(state["network"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        if self.average is not None:
+            self.average.load_state_dict(state["average"])
+        torch.set_rng_state(state["random"]["cpu"])
+        if self.team.device.type == "cuda" and state["random"]["cuda"]:
+            torch.cuda.set_rng_state_all(state["random"]["cuda"])
+        self.step, self.samples, self.best = state["step"], state["samples"], state["best"]
+        self.computed = state.get("computed", [])
+        self.finished_metrics = state["finished_metrics"]
+        self._earlier_seconds, self._started = state["seconds"], time.perf_counter()
+
+    def note_arithmetic(self) -> None:
+        """Record what the following steps are computed in, and say so where the run began with something else."""
+        now = {"step": self.step, "precision": self.arithmetic.precision, "device": self.arithmetic.device}
+        if self.computed and self.computed[-1]["precision"] != now["precision"]:
+            _log.warning("%s: began in %s and goes on in %s (%s)", self.stage.name, self.computed[-1]["precision"],
+                         now["precision"], self.arithmetic.reason)  # fmt: skip
+        if not self.computed or {**self.computed[-1], "step": 0} != {**now, "step": 0}:
+            self.computed.append(now)
+
+    def _identity(self) -> dict[str, Any]:
+        """Return what a checkpoint must share with the run that resumes it."""
+        fixed = {key: value for key, value in to_plain(self.config).items() if key not in _MAY_CHANGE}
+        about = {"model": self.stage.model, **self.source.identity()}
+        return about | self.stage.origin() | {f"config.{key}": value for key, value in fixed.items()}
+
+    def _compare(self, path: Path, saved: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another run; of settings that its day did not know, it had the defaults."""
+        defaults = {f"config.{key}": value for key, value in to_plain(type(self.config)()).items()}
+        for key, value in self._identity().items():
+            was = saved.get(key, defaults.get(key))
+            if isinstance(was, dict) and isinstance(defaults.get(key), dict):
+                was = defaults[key] | was
+            if was != value:
+                raise InputError(f"{path}: of another run ({key} was {was!r}, now {value!r}); choose another --out")
+
+    def save_weights(self, metrics: dict[str, float], suffix: str = "") -> None:
+        """Write each network with everything needed to use and to trace it."""
+        metadata = {
+            "config": to_plain(self.config),
+            **self.source.identity(),
+            "code": code_version(),
+            "step": self.step,
+            "computed": self.computed,
+            "seconds": round(self.seconds(), 1),
+            "metrics": metrics,
+            **self.stage.origin(),
+        }
+        for part in self.stage.parts(self._kept()):
+            model = TrainedModel(part.model, part.network, part.options, metadata)
+            save_weights(self.folder / f"{part.name}{suffix}.safetensors", model)
+
+    def result(self, metrics: dict[str, float], waiting_share: float, *, interrupted: bool) -> TrainingResult:
+        """Describe how the run ended."""
+        names = [part.name for part in self.stage.parts(self.stage.network)]
+        weights = None if interrupted else {name: self.folder / f"{name}.safetensors" for name in names}
+        return TrainingResult(weights, self.step, self.seconds(), metrics, waiting_share, interrupted)
+
+
+def _optimiser(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer | Muon:
+    """Return the optimiser that a configuration names."""
+    options = {"lr": config.learning_rate, "weight_decay": config.weight_decay}
+    if config.optimiser == "muon":
+        return Muon(network, **options)
+    kind = torch.optim.Adam if config.optimiser == "adam" else torch.optim.AdamW
+    return kind(network.parameters(), **options, fused=True)
+
+
+def _parts(batch: Batch, count: int) -> list[Batch]:
+    """Split a batch into `count` equal parts."""
+    return [Batch(*tensors) for tensors in zip(*(tensor.chunk(count) for tensor in batch), strict=True)]

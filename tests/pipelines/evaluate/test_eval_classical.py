@@ -1,0 +1,67 @@
+"""`sdps eval-classical`, `sdps bench-classical`, and the scores kept on disk."""
+
+import json
+
+import pytest
+
+from pipelines import cli
+from pipelines.bench import bench_classical
+from pipelines.evaluate.score_cache import ScoreCache
+
+SMALL = ["--set", "test.shapes=[sphere]", "--set", "test.materials=['lambertian:0.5', red-phenolic]",
+         "--set", "test.size=32", "--set", "test.spp=4", "--set", "test.bounces=0"]  # fmt: skip
+
+
+def test_tables_hold_scores_and_reasons_and_are_kept(tmp_path, capsys):
+    command = ["eval-classical", *SMALL, "--out", str(tmp_path), "--light-sets", "near-uniform:24,biased:24"]
+    assert cli.main([*command, "--methods", "least-squares,factorisation,sm10"]) == 0
+    text = capsys.readouterr().out
+    assert "Normals, mean angular error in degrees: sphere, near-uniform:24" in text
+    results = json.loads((tmp_path / "results.json").read_text())
+    rows = {(row["method"], row["lights"], row["category"]): row for row in results["rows"]}
+    assert len(rows) == 3 * 2 * 2
+    assert set(rows["least-squares", "biased:24", "lambertian"]["scores"]).isdisjoint({"direction_mae"})
+    assert rows["least-squares", "near-uniform:24", "lambertian"]["scores"]["normal_mae"] < 15
+    assert "intensity_error" in rows["factorisation", "near-uniform:24", "lambertian"]["scores"]
+    ledger = (tmp_path / "eval" / "scores.jsonl").read_text()
+    assert cli.main([*command, "--methods", "least-squares,factorisation"]) == 0  # nothing runs twice
+    assert (tmp_path / "eval" / "scores.jsonl").read_text() == ledger
+
+
+def test_unknown_method_is_one_line(capsys):
+    assert cli.main(["eval-classical", "--methods", "pf-14"]) == 2
+    assert "did you mean 'pf14'" in capsys.readouterr().err
+
+
+def test_bench_measures_each_method_in_its_own_process(tmp_path, capsys):
+    arguments = ["--height", "40", "--width", "48", "--lights", "12", "--out", str(tmp_path)]
+    assert cli.main(["bench-classical", *arguments, "--methods", "least-squares,factorisation"]) == 0
+    found = json.loads((tmp_path / "bench_classical.json").read_text())["methods"]
+    assert found["factorisation"]["peak_gib"] > 0 and found["least-squares"]["normal_mae"] < 20
+    assert "times least squares" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [["--height", "8"], ["--lights", "3"]])
+def test_bench_too_small(arguments, capsys):
+    assert cli.main(["bench-classical", *arguments]) == 2
+    assert "at least" in capsys.readouterr().err
+
+
+def test_bench_tells_refusals_from_figures():
+    found = {"sm10": {"error": "needs colour"}, "least-squares": {"error": "", "seconds": 2.0, "peak_gib": 1.0,
+             "input_gib": 0.5, "pixels": 10, "normal_mae": 3.0}}  # fmt: skip
+    text = bench_classical.table(found, bench_classical.BenchClassicalConfig())
+    assert "needs colour" in text and "yes" in text
+
+
+def test_scores_outlive_a_torn_line(tmp_path):
+    path = tmp_path / "scores.jsonl"
+    ScoreCache(path, "a").add(("method", "scene"), [1.0])
+    with path.open("a") as handle:
+        handle.write('{"identity": "a", "key": ["met')
+    cache = ScoreCache(path, "a")
+    assert cache["method", "scene"] == [1.0]
+    cache.add(("other", "scene"), 2)
+    again = ScoreCache(path, "a")
+    assert again["other", "scene"] == 2 and ("method", "scene") in again
+    assert ("method", "scene") not in ScoreCache(path, "b")

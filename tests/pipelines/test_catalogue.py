@@ -1,0 +1,54 @@
+"""What the list of materials says of files, and the file names made of material names."""
+
+import numpy as np
+import pytest
+
+from pipelines.cli import main
+from pipelines.shared.scenes import slug
+from render.materials import merl
+
+
+@pytest.fixture
+def table(tmp_path):
+    path = tmp_path / "my chrome.binary"
+    merl.write(path, np.ones((3, *merl.SHAPE)))
+    return str(path)
+
+
+def test_the_list_takes_names_categories_and_files(capsys, table):
+    assert main(["materials", "--materials", f"chrome,{table}", "--materials", "plastic"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("chrome ") and "fit error" in lines[0]
+    assert lines[1].split(table)[1].split() == ["measured", "table"]
+    assert lines[-1].startswith("11 materials") and ".binary (MERL)" in lines[-1] and ".bsdf (RGL)" in lines[-1]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--materials", "chrom"], "did you mean 'chrome'"),
+        (["--materials", "absent.binary"], "no such file"),
+        (["--materials", "chrome", "--category", "metal"], "--materials takes categories too"),
+    ],
+)
+def test_mistakes_end_in_one_line(capsys, flags, message):
+    assert main(["materials", *flags]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+def test_file_names_of_materials_are_plain_and_differ():
+    names = {
+        "chrome": "chrome",
+        "some/folder/chrome.binary": "chrome.binary",
+        "my file.bsdf": "my-file.bsdf",
+        "a/b/fit.yaml": "fit",
+        "lambertian:0.8/0.3/0.1": "lambertian-0.8-0.3-0.1",
+        "stripes:7:chrome+blue-fabric": "stripes-7-chrome--blue-fabric",
+        "noise:0:a/chrome.binary+lambertian:0.5/0.2/0.1+fit.yaml": "noise-0-chrome.binary--lambertian-0.5-0.2-0.1--fit",
+        "my_mesh+2.obj": "my-mesh-2.obj",
+    }
+    assert {name: slug(name) for name in names} == names
+    varying = [f"{pattern}:{seed}:chrome+{other}" for pattern in ("parts", "noise") for seed in (0, 10)
+               for other in ("brass", "brass+nylon", "x.binary", "x.bsdf")]  # fmt: skip
+    assert len({slug(name) for name in varying}) == len(varying)

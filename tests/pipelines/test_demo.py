@@ -1,0 +1,72 @@
+"""The demo's plan: fitted to the machine, said, kept, and carried out by the commands anyone may run."""
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+from pipelines import demo
+from pipelines.cli import main
+from pipelines.demo import NEEDS, images_per_second, make_plan, planned
+from pipelines.shared import presets
+
+FAST = {"early": 450.0, "lcnet-soft": 135.0, "nenet-plus": 210.0}
+
+
+def slower(factor: float) -> dict[str, float]:
+    return {name: rate / factor for name, rate in FAST.items()}
+
+
+def test_slow_machines_get_more_minutes_and_fewer_test_scenes() -> None:
+    preset = presets.load("demo")
+    plans = [make_plan(preset, slower(factor)) for factor in (1.0, 3.0, 5.5, 50.0)]
+    for earlier, later in itertools.pairwise(plans):
+        assert all(later.minutes[name] >= minutes for name, minutes in earlier.minutes.items())
+        assert later.materials <= earlier.materials and len(later.shipped) <= len(earlier.shipped)
+    fast, slow = plans[0], plans[2]
+    for plan, most in ((fast, 25.0), (slow, 35.0)):
+        assert sum(plan.minutes.values()) + plan.evaluation_minutes + 6.0 < most
+        for name, minutes in plan.minutes.items():
+            assert 60 * minutes * plan.images_per_second[name] >= 0.8 * NEEDS[name].images
+    assert "slower than those" in plans[3].describe(preset) and "slower than those" not in slow.describe(preset)
+
+
+def test_the_plan_is_settings_of_the_preset() -> None:
+    plan = make_plan(presets.load("demo"), slower(6.0))
+    preset = presets.load("demo", plan.overrides(presets.load("demo")))
+    for name, minutes in plan.minutes.items():
+        assert preset.run(name).config.minutes == minutes
+    assert len(preset.test.materials) == plan.materials and preset.test.shipped == plan.shipped
+
+
+def test_a_stopped_demo_goes_on_with_the_same_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    preset = presets.load("demo")
+    monkeypatch.setattr(demo, "images_per_second", lambda preset, name: FAST[name])
+    first = planned(preset, tmp_path)
+    monkeypatch.setattr(demo, "images_per_second", lambda preset, name: FAST[name] / 9)
+    assert planned(preset, tmp_path) == first
+    (tmp_path / "plan.json").write_text("{")
+    assert main(["demo", "--out", str(tmp_path)]) == 2
+
+
+def test_steps_are_timed_on_the_network_that_will_be_trained() -> None:
+    preset = presets.load("smoke", ["normals.images=2", "lighting.images=2", "lighting.batch_scenes=1"])
+    assert images_per_second(preset, "lcnet") > 0.0 and images_per_second(preset, "nenet") > 0.0
+
+
+def test_commands_run_in_order_and_stop_at_the_first_failure(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(demo, "images_per_second", lambda preset, name: FAST[name])
+    asked = []
+    real = demo.main
+
+    def run(argv: list[str]) -> int:
+        asked.append(argv)
+        return 3 if argv[0] == "train" else 0
+
+    monkeypatch.setattr("pipelines.cli.main", run)
+    parser = demo.argparse.ArgumentParser()
+    demo.add_arguments(parser)
+    code = real(parser.parse_args(["--out", str(tmp_path), "--set", "data.spp=4"]))
+    assert code == 3 and [argv[0] for argv in asked] == ["render-data", "train"]
+    assert asked[0][-3:-2] == ["--set"] or "data.spp=4" in asked[0]
+    assert "In all about" in capsys.readouterr().out

@@ -1,0 +1,227 @@
+"""`sdps infer`: photographs in; normals, lights, depth, meshes and a page out; and nothing where they are bad."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import classical_scenes as scenes
+import cv2
+import numpy as np
+import OpenEXR
+import photo_folders as folders
+import pytest
+import trimesh
+from sdps_scenes import hemisphere_lights
+
+from pipelines.bench import bench_infer
+from pipelines.cli import build_parser, main
+from pipelines.shared.machines import HERE, kinds
+from render.shared.config import to_plain
+from render.shared.errors import InputError
+from sdps import api
+from sdps.api import infer, load
+from sdps.core.metrics import direction_mae, intensity_error, normal_mae
+from sdps.data.augment import Augmentation
+from sdps.inference.inference_config import InferenceConfig, inference_config
+from sdps.methods import methods, pretrained
+from sdps.models.checkpoint import TrainedModel, save_weights
+from sdps.models.registry import create
+
+LIGHTS = hemisphere_lights(16, np.random.default_rng(0))
+GAINS = np.linspace(0.6, 1.0, 16)
+FILES = ["depth.npy", "lights.json", "mask.png", "mesh.glb", "mesh.obj", "mesh.ply", "normal.exr", "normal.npy",
+         "normal.png", "report.html", "result.json"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def hills(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, np.ndarray]:
+    """A folder of 16-bit pictures of matte hills, their normals and mask."""
+    folder = tmp_path_factory.mktemp("hills")
+    normals, mask = scenes.hills(64)
+    images = scenes.lambertian(normals, mask, LIGHTS, albedo=0.7).images * GAINS[:, None, None, None]
+    folders.write_folder(folder, images.astype(np.float32), mask)
+    rows = [f"{number}.png {x} {-y} {z} {gain}" for number, ((x, y, z), gain) in
+            enumerate(zip(LIGHTS, GAINS, strict=True), start=1)]  # fmt: skip
+    (folder / "known.txt").write_text("\n".join(rows))
+    return folder, normals, mask
+
+
+def fails(capsys: pytest.CaptureFixture, *arguments: object) -> str:
+    assert main(["infer", *map(str, arguments)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "Traceback" not in line
+    return line
+
+
+def random_models(folder: Path) -> Path:
+    """Write networks with random weights, as if trained in a folder."""
+    metadata = {"config": {"augmentation": to_plain(Augmentation())}}
+    for name in ("lcnet", "nenet"):
+        path = pretrained.trained_file(folder, name)
+        path.parent.mkdir(parents=True)
+        save_weights(path, TrainedModel(name, create(name).eval(), {}, metadata))
+    return folder
+
+
+def test_known_lights_with_y_down_give_the_normals(hills: tuple, tmp_path: Path, capsys) -> None:
+    folder, normals, mask = hills
+    flags = [
+        "--lights",
+        folder / "known.txt",
+        "--frame",
+        "y-down",
+        "--method",
+        "robust-least-squares",
+        "--out",
+        tmp_path,
+    ]
+    assert main(["infer", str(folder), *map(str, flags)]) == 0, capsys.readouterr().err
+    assert [name for name in FILES if not (tmp_path / name).is_file()] == []
+    found = np.load(tmp_path / "normal.npy")
+    assert found.dtype == np.float32 and found.shape == normals.shape and not found[~mask].any()
+    assert normal_mae(found, normals, mask) < 1.5
+    text = capsys.readouterr().out
+    assert "orthographic" in text and str(tmp_path / "report.html") in text
+    assert not list(tmp_path.glob(".infer-*"))
+
+
+def test_all_files_say_the_same(hills: tuple, tmp_path: Path, capsys) -> None:
+    folder, _, mask = hills
+    assert main(["infer", str(folder), "--method", "factorisation", "--out", str(tmp_path)]) == 0
+    found = np.load(tmp_path / "normal.npy")
+    coded = cv2.imread(str(tmp_path / "normal.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    assert coded.dtype == np.uint16
+    np.testing.assert_allclose(coded / 65535 * 2 - 1, found, atol=2e-5)
+    channels = OpenEXR.File(str(tmp_path / "normal.exr"), separate_channels=True).channels()
+    for axis, name in enumerate("XYZ"):
+        np.testing.assert_array_equal(channels[f"normal.{name}"].pixels, found[..., axis])
+    stored = json.loads((tmp_path / "lights.json").read_text())
+    assert stored["images"][0]["file"] == "1.png"
+    directions = np.array([row["direction"] for row in stored["images"]])
+    assert direction_mae(directions, LIGHTS) < 25  # equal albedo alone tells the bas-relief transformation roughly
+    # lights.json is what --lights reads.
+    again = load(folder, lights=tmp_path / "lights.json")
+    np.testing.assert_allclose(again.light_directions, directions, atol=1e-5)
+    depth = np.load(tmp_path / "depth.npy")
+    surface = trimesh.load(tmp_path / "mesh.ply", process=False)
+    assert np.ptp(surface.vertices[:, 2]) == pytest.approx(np.ptp(depth[mask]) * 2 / 64, rel=1e-3)
+    for suffix in ("obj", "glb"):
+        assert len(trimesh.load(tmp_path / f"mesh.{suffix}", force="mesh", process=False).faces) == len(surface.faces)
+    facts = json.loads((tmp_path / "result.json").read_text())
+    assert facts["method"] == "factorisation" and facts["mask"] == "file" and facts["images"] == 16
+    page = (tmp_path / "report.html").read_text()
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page) and page.count("data:image/png") >= 10
+
+
+def test_the_two_verbs(hills: tuple) -> None:
+    folder, normals, mask = hills
+    photos = load(folder, lights=folder / "known.txt", frame="y-down")
+    result = infer(photos)  # no network is shipped for known lights, or it is: both must do
+    assert normal_mae(result.normals, normals, mask) < 20
+    result = infer(photos, "robust-least-squares")
+    assert normal_mae(result.normals, normals, mask) < 1.5
+    assert intensity_error(result.intensities, GAINS) < 1e-5  # given, and kept
+    assert result.residuals.overall < 0.05
+    assert result.depth.z.shape == mask.shape
+
+
+def test_networks_with_and_without_known_lights(hills: tuple, tmp_path: Path, capsys) -> None:
+    folder, _, mask = hills
+    models = random_models(tmp_path / "runs")
+    result = infer(load(folder), "sdps", models=models)
+    assert result.method == "lcnet + nenet" and result.light_directions.shape == (16, 3)
+    assert set(result.files) == {"lcnet", "nenet"} and "light_confidence" in result.summary()
+    told = infer(load(folder, lights=folder / "known.txt", frame="y-down"), "sdps", models=models)
+    np.testing.assert_allclose(told.light_directions, LIGHTS, atol=1e-5)
+    assert set(told.files) == {"nenet"}
+    # Over all eight views an untrained network's lights average to a single one.
+    config = InferenceConfig(light_views=1)
+    only = infer(load(folder), "lcnet+least-squares", models=models, config=config)
+    assert only.method == "lcnet + least-squares" and only.normals[mask].any()
+
+
+def test_a_method_means_the_same_to_photographs_as_to_benchmarks(
+    hills: tuple, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def runner(*given: object) -> None:
+        asked.append(given)
+        raise InputError("enough")
+
+    monkeypatch.setattr(api, "Runner", runner)
+    monkeypatch.setattr(api.weights, "require", lambda name, out: Path(name))
+    with pytest.raises(InputError, match="enough"):
+        infer(load(hills[0]), "sdps-plus")
+    method, _, config = asked[0]
+    assert method == methods.parse("sdps-plus", Path) and config is None
+    flags = build_parser(["infer"]).parse_args(["infer", "photographs"])
+    assert inference_config(flags) == InferenceConfig()
+
+
+def test_folders_and_methods_that_do_not_fit_are_one_line(hills: tuple, tmp_path: Path, capsys) -> None:
+    folder, out = hills[0], tmp_path / "out"
+    assert "no such" in fails(capsys, tmp_path / "nowhere", "--out", out)
+    one = folders.write_folder(tmp_path / "one", np.full((1, 40, 40, 3), 0.5, np.float32))
+    assert "1" in fails(capsys, one, "--out", out)
+    assert "did you mean 'pf14'" in fails(capsys, folder, "--method", "pf-14", "--out", out)
+    assert "told the lights; give them with --lights" in fails(
+        capsys, folder, "--method", "least-squares", "--out", out
+    )
+    assert "holds the photographs" in fails(capsys, folder, "--method", "factorisation", "--out", folder)
+    assert "no such weights" in fails(capsys, folder, "--method", "lcnet-reg+nenet", "--models", tmp_path, "--out", out)
+    assert "--self-test" in fails(capsys, "--out", out)
+    (tmp_path / "file").write_text("")
+    flags = ["--lights", folder / "known.txt", "--method", "least-squares"]
+    assert "cannot be written" in fails(capsys, folder, *flags, "--out", tmp_path / "file" / "x")
+    assert not out.exists()
+
+
+def test_a_corrupt_file_among_good_ones_leaves_nothing(hills: tuple, tmp_path: Path, capsys) -> None:
+    images = np.random.default_rng(0).random((4, 32, 32, 3)).astype(np.float32)
+    folder = folders.write_folder(tmp_path / "photos", images)
+    path = folder / "3.png"
+    path.write_bytes(path.read_bytes()[:200])
+    line = fails(capsys, folder, "--method", "pf14", "--out", tmp_path / "out")
+    assert "3.png" in line and not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_the_self_test_scores_itself(tmp_path: Path, capsys) -> None:
+    assert main(["infer", "--self-test", "--method", "pf14", "--out", str(tmp_path)]) == 0
+    scores = json.loads((tmp_path / "self_test.json").read_text())["scores"]
+    assert scores["normals, degrees"] < 25
+    assert "against the truth" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_many_photographs_do_not_need_more_memory(tmp_path: Path) -> None:
+    normals, mask = scenes.sphere(192)
+    peaks = {}
+    for count in (100, 1000):
+        lights = hemisphere_lights(count, np.random.default_rng(1))
+        folder = tmp_path / str(count)
+        for number, light in enumerate(lights):
+            image = scenes.lambertian(normals, mask, light[None], albedo=0.7).images[0]
+            folders.write(folder / f"{number}.png", image, 8)
+        folders.write(folder / "mask.png", mask.astype(np.float32))
+        (folder / "names.txt").write_text("\n".join(f"{number}.png" for number in range(count)))
+        models = random_models(tmp_path / f"runs-{count}")
+        command = [sys.executable, "tests/support/infer_memory.py", str(folder), str(models)]
+        done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+        peaks[count] = json.loads(done.stdout.splitlines()[-1])["peak_gib"]
+    assert peaks[1000] < 1.3 * peaks[100]
+    assert peaks[1000] < 3.0
+
+
+def test_the_bench_measures_every_step(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    flags = ["--height", "48", "--width", "64", "--images", "12", "--many", "20", "--out", str(tmp_path)]
+    assert main(["bench-infer", *flags, "--methods", "factorisation"]) == 0
+    found = json.loads((tmp_path / "bench_infer.json").read_text())["kinds"]
+    assert tuple(found) == kinds()  # this machine, and it held to AVX2 where it has more
+    runs = found[HERE]
+    assert runs["factorisation, 20 pictures"]["peak_gib"] > 0 and runs["factorisation, 12 pictures"]["seconds"] > 0
+    assert "within 180 s, 3 GiB" in capsys.readouterr().out
+    assert "too dark" in bench_infer.table({"pf14": {"error": "too dark"}}, bench_infer.BenchClassicalConfig(), "here")

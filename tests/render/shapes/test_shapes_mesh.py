@@ -1,0 +1,129 @@
+"""TriangleMesh and reading meshes from files."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from render import shapes
+from render.shapes.geometry.mesh import TriangleMesh, load_mesh, vertex_normals
+from render.shared.errors import InputError
+
+CUBE = trimesh.creation.box()
+
+
+def triangle(**changes):
+    arrays = {
+        "vertices": np.eye(3, dtype=np.float32),
+        "faces": np.array([[0, 1, 2]]),
+        "normals": np.eye(3, dtype=np.float32),
+    }
+    return TriangleMesh(**(arrays | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"faces": np.zeros((0, 3), dtype=int)}, "at least one triangle"),
+        ({"faces": np.array([[0, 1, 3]])}, "index 3 is out of range"),
+        ({"faces": np.array([[0, 1, -1]])}, "index -1 is out of range"),
+        ({"faces": np.array([[0.0, 1.0, 2.0]])}, "integer"),
+        ({"vertices": np.full((3, 3), np.nan)}, "not finite"),
+        ({"vertices": np.zeros((3, 2))}, r"\(V, 3\)"),
+        ({"normals": np.eye(3)[:2]}, "2 for 3 vertices"),
+        ({"normals": 2 * np.eye(3)}, "unit length"),
+    ],
+)
+def test_construction_refuses(changes, message):
+    with pytest.raises(InputError, match=message):
+        triangle(**changes)
+
+
+def test_arrays_get_their_dtypes():
+    mesh = triangle(vertices=np.eye(3))
+    assert (mesh.vertices.dtype, mesh.faces.dtype, mesh.normals.dtype) == (np.float32, np.uint32, np.float32)
+
+
+def test_normalised_centres_on_the_bounding_sphere():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=2.5)
+    points = np.asarray(ball.vertices) + np.array([4.0, -1.0, 2.0])
+    mesh = TriangleMesh(vertices=points, faces=ball.faces, normals=vertex_normals(points, ball.faces)).normalised()
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    assert radii.max() == pytest.approx(1, abs=1e-6)
+    assert radii.min() > 0.98
+
+
+def test_rotated_turns_positions_and_normals():
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # about z: x to y
+    mesh = triangle().rotated(quarter)
+    np.testing.assert_allclose(mesh.vertices[0], [0, 1, 0], atol=1e-7)
+    np.testing.assert_allclose(mesh.normals[0], [0, 1, 0], atol=1e-7)
+    with pytest.raises(InputError, match="mirrors"):
+        triangle().rotated(np.diag([1.0, 1, -1]))
+    with pytest.raises(InputError, match="orthonormal"):
+        triangle().rotated(2 * np.eye(3))
+
+
+def test_area_weights_follow_the_larger_face():
+    # Two faces share the origin: one in the plane z = 0 of area 2, one in the plane x = 0 of area 1/2.
+    points = np.array([[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 1, 0], [0, 0, 1]])
+    normals = vertex_normals(points, np.array([[0, 1, 2], [0, 3, 4]]))
+    np.testing.assert_allclose(normals[0], np.array([1, 0, 4]) / np.sqrt(17), atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "glb", "off"])
+def test_formats_read_as_one_smooth_closed_mesh(tmp_path, suffix):
+    path = tmp_path / f"cube.{suffix}"
+    trimesh.Scene([CUBE]).export(path) if suffix == "glb" else CUBE.export(path)
+    mesh = shapes.load(str(path))
+    assert len(mesh.vertices) == 8 and len(mesh.faces) == 12
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 1, atol=1e-5)
+    # Smooth: every corner has one normal, out through the corner.
+    assert ((mesh.normals * mesh.vertices).sum(axis=1) > 0.8).all()
+
+
+def test_scene_parts_are_joined_where_the_scene_places_them(tmp_path):
+    scene = trimesh.Scene()
+    for offset in (0.0, 5.0):
+        scene.add_geometry(CUBE, transform=trimesh.transformations.translation_matrix([offset, 0, 0]))
+    path = tmp_path / "two.glb"
+    scene.export(path)
+    mesh = load_mesh(path)
+    assert len(mesh.faces) == 24
+    assert np.ptp(mesh.vertices[:, 0]) == pytest.approx(6)
+
+
+def test_inside_out_and_mixed_windings_are_repaired(tmp_path):
+    for flipped in (np.arange(12), np.arange(5)):
+        faces = np.array(CUBE.faces)
+        faces[flipped] = faces[flipped][:, ::-1]
+        path = tmp_path / "cube.ply"
+        trimesh.Trimesh(CUBE.vertices, faces, process=False).export(path)
+        mesh = load_mesh(path)
+        assert ((mesh.normals * mesh.vertices).sum(axis=1) > 0).all()
+
+
+def test_degenerate_triangles_and_loose_vertices_are_dropped(tmp_path):
+    path = tmp_path / "mesh.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 0 0\nv 9 9 9\nf 1 2 3\nf 1 2 4\nf 1 1 2\n")
+    mesh = load_mesh(path)
+    assert len(mesh.faces) == 1 and len(mesh.vertices) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("garbage.ply", b"\x00\x01 this is no mesh", "cannot be read as a mesh"),
+        ("garbage.glb", b"glTF\x02", "cannot be read as a mesh"),
+        ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles|cannot be read"),
+        ("empty.obj", b"", "no triangles|cannot be read"),
+        ("nan.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
+        ("flat.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "degenerate"),
+        ("mesh.unknown", b"something", "cannot be read as a mesh"),
+    ],
+)
+def test_unusable_files_are_one_line_errors(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        shapes.load(str(path))
+    assert "\n" not in str(caught.value) and name in str(caught.value)

@@ -1,0 +1,429 @@
+"""From shards to batches: augmentation in its order, streams of random numbers, cache, and refusals."""
+
+import json
+from dataclasses import replace
+from itertools import islice
+from multiprocessing import active_children
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from sdps_scenes import hemisphere_lights, shade, sphere_normals, write_data
+from torch.utils.data import DataLoader
+
+from render.records.manifest import read_manifest
+from render.records.shards import read_shard
+from render.shared.errors import InputError
+from sdps.core.metrics import normal_mae
+from sdps.data.augment import Augmentation, apply_symmetry, augment, exposure_scale, normalise_exposure
+from sdps.data.dataset import (
+    Batch,
+    SampleKey,
+    SampleOptions,
+    SampleStream,
+    SceneDataset,
+    choose_images,
+    collate,
+    make_sample,
+)
+from sdps.data.scene_store import StoredScene
+from sdps.data.sources import StoredScenes
+
+PLAIN = Augmentation(
+    exposure="paper", exposure_range=(1.0, 1.0), intensity_range=(1.0, 1.0), noise=0.0, clip=1e6
+)  # nothing happens
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data")
+    write_data(path, ("train",) * 5 + ("val",), lights=6, size=32)
+    return path
+
+
+def options(**changes: object) -> SampleOptions:
+    return SampleOptions(**{"seed": 0, "images": 4, "size": 32, "augmentation": Augmentation(), **changes})
+
+
+def same(first: Batch, second: Batch) -> bool:
+    return all(torch.equal(*pair) for pair in zip(first, second, strict=True))
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def test_plain_augmentation_changes_nothing() -> None:
+    images = rng().random((3, 8, 8, 3), dtype=np.float32)
+    out, intensities = augment(images, np.ones((8, 8), bool), PLAIN, rng())
+    np.testing.assert_array_equal(out, images)
+    np.testing.assert_array_equal(intensities, 1.0)
+
+
+def test_paper_order_is_clip_exposure_intensities_noise() -> None:
+    config = Augmentation(exposure="paper", exposure_range=(3.0, 3.0), noise=0.05)
+    images = np.full((500, 2, 2, 3), 4.0, np.float32)
+    images[:, 0] = 0.0  # background
+    mask = np.array([[False, False], [True, True]])
+    out, intensities = augment(images, mask, config, rng())
+    # 4 saturates at 1, as in an 8-bit file; exposure and intensity then reach 6; noise comes last and everywhere.
+    assert intensities.min() >= 0.2
+    assert intensities.max() < 2.0
+    residue = out[:, 1] - 3.0 * intensities[:, None, None]
+    assert np.abs(residue).max() <= 0.0251
+    assert np.abs(out[:, 0]).max() <= 0.025
+    assert out[:, 0].std() == pytest.approx(0.05 / np.sqrt(12.0), rel=0.05)
+    assert out.max() > 5.5
+
+
+def test_intensities_are_equal_in_the_three_channels_and_independent_of_the_image() -> None:
+    config = Augmentation(noise=0.0, clip=1e6)
+    images = rng(1).random((4, 8, 8, 3), dtype=np.float32)
+    out, intensities = augment(images, np.ones((8, 8), bool), config, rng())
+    ratio = out / images / intensities[:, None, None, None]
+    np.testing.assert_allclose(ratio, ratio[0, 0, 0, 0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("albedo", [0.003, 0.8])
+def test_mean_exposure_brings_dark_and_bright_objects_to_one_level(albedo: float) -> None:
+    normals, mask = sphere_normals(32)
+    images = shade(normals, hemisphere_lights(6, rng()), albedo)
+    config = Augmentation(mean_jitter=(1.0, 1.0), noise=0.0)
+    out, _ = augment(images, mask, config, rng())
+    assert out[:, mask].mean() == pytest.approx(0.3, rel=0.02)
+    test, scale = normalise_exposure(images, mask, config)
+    assert test[:, mask].mean() == pytest.approx(0.3, rel=0.02)
+    np.testing.assert_allclose(test, images * scale, rtol=1e-5)
+
+
+def test_exposure_is_not_held_down_by_a_few_highlights() -> None:
+    values = np.full(10_000, 0.01, np.float32)
+    values[:50] = 200.0
+    scale = exposure_scale(values, level=0.3, clip=4.0)
+    assert np.minimum(values * scale, 4.0).mean() == pytest.approx(0.3, rel=0.03)
+    # Without the clip the mean would be 1, of which the highlights hold nearly all.
+    assert scale > 10 * 0.3 / values.mean()
+    assert exposure_scale(np.zeros(9, np.float32), 0.3, 4.0) == 1.0
+
+
+def test_paper_mode_exposes_dark_test_images_as_published() -> None:
+    images, mask = np.full((2, 4, 4, 3), 0.005, np.float32), np.ones((4, 4), bool)
+    mask[0] = False
+    out, scale = normalise_exposure(images, mask, PLAIN)
+    assert scale == pytest.approx(1.5 * 4.0, rel=1e-4)
+    np.testing.assert_allclose(out[:, mask], 0.03, rtol=1e-4)
+    np.testing.assert_array_equal(out[:, ~mask], 0.0)
+
+
+@pytest.mark.parametrize(("turns", "mirror"), [(0, True), (1, False), (2, False), (3, True)])
+def test_symmetries_give_scenes_that_still_obey_lamberts_law(turns: int, mirror: bool) -> None:
+    normals, mask = sphere_normals(24)
+    normals[:12, :12] = mask[:12, :12, None] * np.array([0.6, 0.0, 0.8], np.float32)  # no longer symmetric
+    lights = hemisphere_lights(5, rng())
+    turned = apply_symmetry(shade(normals, lights), normals, mask, lights, turns, mirror)
+    np.testing.assert_allclose(turned[0], shade(turned[1], turned[3]), atol=1e-6)
+    assert not np.allclose(turned[1], normals)
+    # A sphere's own normals are the same after any symmetry: the vectors turn with the pixels.
+    sphere, disc = sphere_normals(24)
+    np.testing.assert_allclose(apply_symmetry(shade(sphere, lights), sphere, disc, lights, turns, mirror)[1], sphere)
+
+
+def test_sample_is_the_shard(folder: Path) -> None:
+    dataset = SceneDataset(folder, "train", options(augmentation=PLAIN, images=6), cache=False)
+    sample = dataset.sample(SampleKey(2, 0, 7))
+    shard = read_shard(folder / dataset.scenes[2].file)
+    order = [int(np.argmin(np.abs(shard.light_directions - row).sum(1))) for row in sample.directions.numpy()]
+    assert sorted(order) == list(range(6))
+    np.testing.assert_array_equal(sample.images.numpy(), shard.images[order].transpose(0, 3, 1, 2))
+    np.testing.assert_array_equal(sample.normals.numpy(), shard.normals.transpose(2, 0, 1))
+    np.testing.assert_array_equal(sample.mask[0].numpy(), shard.mask)
+
+
+def test_other_sizes_are_resized_with_unit_normals(folder: Path) -> None:
+    sample = SceneDataset(folder, "train", options(size=16), cache=False).sample(SampleKey(0, 0, 0))
+    assert sample.images.shape == (4, 3, 16, 16)
+    length = sample.normals.norm(dim=0)
+    torch.testing.assert_close(length, sample.mask[0])
+
+
+def test_cache_gives_the_same_samples_and_notices_a_new_shard(tmp_path: Path) -> None:
+    write_data(tmp_path, ("train",), lights=4, size=16)
+    key = SampleKey(0, 0, 0)
+    direct = SceneDataset(tmp_path, "train", options(size=16), cache=False).sample(key)
+    cached = SceneDataset(tmp_path, "train", options(size=16), cache=True)
+    for _ in range(2):  # decoded, then mapped
+        assert all(torch.equal(*pair) for pair in zip(cached.sample(key), direct, strict=True))
+    entry = {path.name.split(".")[-2]: path for path in (tmp_path / "cache").iterdir()}
+    assert entry.keys() == {"images", "truth"}
+    seen = (read_shard(next(tmp_path.rglob("*.exr"))).images != 0.0).any(axis=(0, 3))
+    assert 0 < seen.sum() < seen.size  # there is something black to leave out
+    assert np.load(entry["images"]).shape == (4, seen.sum(), 3)
+    write_data(tmp_path, ("train",), lights=4, size=16, seed=5)
+    renewed = SceneDataset(tmp_path, "train", options(size=16), cache=True).sample(key)
+    assert not torch.equal(renewed.directions, direct.directions)
+
+
+def test_samples_do_not_depend_on_the_number_of_workers(folder: Path) -> None:
+    batches = []
+    for workers in (0, 2):
+        dataset = SceneDataset(folder, "train", options())
+        stream = SampleStream(len(dataset), 2, 0)
+        loader = iter(DataLoader(dataset, batch_sampler=stream, num_workers=workers, collate_fn=collate))
+        batches.append([next(loader) for _ in range(6)])
+        del loader
+    for first, second in zip(*batches, strict=True):
+        assert all(torch.equal(*pair) for pair in zip(first, second, strict=True))
+
+
+def test_no_random_stream_is_used_twice(folder: Path) -> None:
+    dataset = SceneDataset(folder, "train", options())
+    samples = [dataset.sample(SampleKey(0, epoch, position)) for epoch in range(3) for position in range(3)]
+    drawn = {tuple(sample.intensities.tolist()) for sample in samples}
+    assert len(drawn) == 9
+
+
+def test_stream_visits_every_scene_once_per_epoch_in_a_new_order() -> None:
+    stream = iter(SampleStream(5, 2, seed=0))
+    keys = [key for _ in range(5) for key in next(stream)]
+    assert [key.epoch for key in keys] == [0] * 5 + [1] * 5
+    orders = [[key.scene for key in keys if key.epoch == epoch] for epoch in (0, 1)]
+    assert sorted(orders[0]) == sorted(orders[1]) == list(range(5))
+    assert orders[0] != orders[1]
+
+
+@pytest.mark.parametrize("taken", [0, 4, 6, 34])
+def test_stream_resumes_where_it_stopped(taken: int) -> None:
+    whole, rest = iter(SampleStream(5, 2, seed=3)), iter(SampleStream(5, 2, seed=3, taken=taken))
+    for _ in range(taken // 2):
+        next(whole)
+    assert [next(whole) for _ in range(6)] == [next(rest) for _ in range(6)]
+
+
+def test_crops_hold_enough_of_the_object(folder: Path) -> None:
+    dataset = SceneDataset(folder, "train", options(crop=12, min_object=0.5))
+    corners = set()
+    for position in range(40):
+        sample = dataset.sample(SampleKey(position % 5, 0, position))
+        row, column = sample.corner.tolist()
+        corners.add((row, column))
+        assert 0 <= row <= 20
+        assert 0 <= column <= 20
+        assert sample.mask[0, row : row + 12, column : column + 12].mean() >= 0.5
+    assert len(corners) > 20
+
+
+def test_normals_of_all_samples_face_as_the_light_says(folder: Path) -> None:
+    # Least squares on an augmented sample recovers its normals, so images, lights and normals belong together.
+    from sdps.classical.least_squares import least_squares
+
+    config = Augmentation(noise=0.0, symmetries=True, clip=1e6)
+    sample = SceneDataset(folder, "train", options(augmentation=config, images=6)).sample(SampleKey(1, 0, 3))
+    images, mask = sample.images.numpy().transpose(0, 2, 3, 1), sample.mask[0].numpy() > 0
+    mask &= images.min((0, 3)) > 1e-4  # lit by all
+    normals = sample.normals.numpy().transpose(1, 2, 0)
+    estimate = least_squares(images, mask, sample.directions.numpy(), sample.intensities.numpy())
+    assert normal_mae(estimate.normals, normals, mask) < 0.3
+
+
+def test_shard_that_differs_from_the_manifest_is_refused_in_one_line(tmp_path: Path) -> None:
+    write_data(tmp_path, ("train", "train"), lights=4, size=16)
+    first, second = (tmp_path / scene.file for scene in read_manifest(tmp_path))
+    first.write_bytes(second.read_bytes())
+    dataset = SceneDataset(tmp_path, "train", options(size=16))
+    with pytest.raises(InputError, match="the manifest says") as error:
+        dataset.sample(SampleKey(0, 0, 0))
+    assert "\n" not in str(error.value)
+    # A worker hands the same one-line error through the batch.
+    loader = DataLoader(dataset, batch_sampler=[[SampleKey(1, 0, 0), SampleKey(0, 0, 1)]], num_workers=1,
+                        collate_fn=collate)  # fmt: skip
+    assert "the manifest says" in str(next(iter(loader)))
+
+
+def test_truncated_and_missing_shards_are_refused(tmp_path: Path) -> None:
+    scenes = write_data(tmp_path, ("train", "train", "train"), lights=4, size=16)
+    path = tmp_path / scenes[0].file
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match="render it again"):
+        SceneDataset(tmp_path, "train", options(size=16)).sample(SampleKey(0, 0, 0))
+    (tmp_path / scenes[1].file).unlink()
+    with pytest.raises(InputError, match="1 of 3 shards"):
+        SceneDataset(tmp_path, "train", options(size=16))
+    assert len(SceneDataset(tmp_path, "train", options(size=16), skip_missing=True)) == 2
+    with pytest.raises(InputError, match="no scene of split 'val'"):
+        SceneDataset(tmp_path, "val", options(size=16))
+
+
+def test_scenes_that_could_not_be_rendered_are_left_out_with_one_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scenes = write_data(tmp_path, ("train",) * 4 + ("val",), lights=4, size=16)
+    for scene in scenes[:2]:
+        (tmp_path / scene.file).unlink()
+    failure = {"id": scenes[0].id, "time": "2024-01-01T00:00:00+00:00", "reason": "outside the frame"}
+    (tmp_path / "failed.jsonl").write_text(json.dumps(failure) + "\n")
+    with pytest.raises(InputError, match="2 of 4 shards"):  # one of them is still to be rendered
+        SceneDataset(tmp_path, "train", options(size=16))
+    with open(tmp_path / "failed.jsonl", "a") as handle:
+        handle.write(json.dumps(failure | {"id": scenes[1].id}) + "\n")
+    assert len(SceneDataset(tmp_path, "train", options(size=16))) == 2
+    (record,) = caplog.records
+    assert "2 of 4 scenes of split 'train' could not be rendered" in record.getMessage()
+    SceneDataset(tmp_path, "val", options(size=16))
+    assert len(caplog.records) == 1
+
+
+def test_augmentation_fields_are_checked() -> None:
+    with pytest.raises(InputError, match=r"augmentation\.intensity_range"):
+        Augmentation(intensity_range=(0.0, 2.0))
+    with pytest.raises(InputError, match=r"augmentation\.mean_level"):
+        Augmentation(mean_level=5.0, clip=4.0)
+    with pytest.raises(InputError, match=r"frontal must leave biased its share 0\.7"):
+        Augmentation(biased=0.7, frontal=0.4)
+
+
+# ---- Seeds of samples, and crops of large scenes -----------------------------------------------------
+
+
+def test_every_sample_has_a_seed_of_its_own_that_its_crop_does_not_change(folder: Path) -> None:
+    plain, cropped = (SceneDataset(folder, "train", options(**changes)) for changes in ({}, {"crop": 12}))
+    keys = [SampleKey(0, epoch, position) for epoch in range(3) for position in range(3)]
+    seeds = [plain.sample(key).seed for key in keys]
+    assert len({int(seed) for seed in seeds}) == 9
+    assert all(seed.dtype == torch.int64 and seed >= 0 for seed in seeds)
+    assert [cropped.sample(key).seed for key in keys] == seeds
+    other = SceneDataset(folder, "train", options(seed=1))
+    assert other.sample(keys[0]).seed != seeds[0]
+    assert collate([plain.sample(key) for key in keys]).seed.tolist() == [int(seed) for seed in seeds]
+
+
+def ramp(height: int, width: int) -> StoredScene:
+    """Return a scene whose images tell which row and column a pixel had, with all normals tilted alike."""
+    rows, columns = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
+    image = np.stack([rows, columns, np.ones_like(rows)], axis=-1) / 64.0
+    normals = np.tile(np.array([0.6, 0.0, 0.8], np.float32), (height, width, 1))
+    return StoredScene(np.repeat(image[None], 4, 0).astype(np.float16), normals, np.ones((height, width), bool))
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 64), (48, 80)])
+def test_large_scenes_are_rescaled_by_one_factor_and_cropped(folder: Path, height: int, width: int) -> None:
+    (scene,) = read_manifest(folder, "train")[:1]
+    config = options(augmentation=PLAIN, rescale=True)
+    steps, starts = [], []
+    for number in range(60):
+        sample = make_sample(scene, ramp(height, width), config, rng(number))
+        assert sample.images.shape == (4, 3, 32, 32)
+        inner = 64.0 * sample.images[0, :2, 1:-1, 1:-1]  # antialiasing flattens the border of the ramp
+        down, right = inner[0].diff(dim=0).mean(), inner[1].diff(dim=1).mean()
+        assert down == pytest.approx(float(right), rel=0.05)
+        assert inner[0].max() <= height and inner[1].max() <= width
+        steps.append(float(down))
+        starts.append((round(float(inner[0].min())), round(float(inner[1].min()))))
+        torch.testing.assert_close(sample.normals, torch.tensor([0.6, 0.0, 0.8])[:, None, None].expand(3, 32, 32))
+    most = min(height, width) / 32
+    assert 1.0 <= min(steps) < 1.1 and 0.95 * most < max(steps) <= most + 0.01
+    assert len(set(starts)) > 30
+    repeated = [make_sample(scene, ramp(height, width), config, rng(7)) for _ in range(2)]
+    assert same(*repeated)
+
+
+def test_rescaling_leaves_scenes_alone_that_are_not_larger(folder: Path) -> None:
+    key = SampleKey(1, 0, 3)
+    for size in (32, 48):
+        plain, rescaled = (
+            SceneDataset(folder, "train", options(size=size, rescale=rescale)).sample(key) for rescale in (False, True)
+        )
+        assert same(plain, rescaled)
+
+
+def test_rescaled_scenes_still_obey_lamberts_law(tmp_path: Path) -> None:
+    from sdps.classical.least_squares import least_squares
+
+    write_data(tmp_path, ("train",), lights=6, size=96)
+    config = options(augmentation=Augmentation(noise=0.0, symmetries=True, clip=1e6), images=6, rescale=True)
+    for position in range(4):
+        sample = SceneDataset(tmp_path, "train", config).sample(SampleKey(0, 0, position))
+        images, mask = sample.images.numpy().transpose(0, 2, 3, 1), sample.mask[0].numpy() > 0
+        mask &= images.min((0, 3)) > 1e-2  # lit by all
+        normals = sample.normals.numpy().transpose(1, 2, 0)
+        estimate = least_squares(images, mask, sample.directions.numpy(), sample.intensities.numpy())
+        assert mask.mean() > 0.1
+        assert normal_mae(estimate.normals, normals, mask) < 1.0
+
+
+# ---- The source of stored batches --------------------------------------------------------------------
+
+
+def test_stored_batches_resume_and_do_not_depend_on_the_workers(folder: Path) -> None:
+    dataset = SceneDataset(folder, "train", options())
+    whole = list(islice(StoredScenes(dataset, batch=2).batches(0), 6))
+    source = StoredScenes(dataset, batch=2, workers=2)
+    resumed = list(islice(source.batches(4), 4))
+    assert all(same(*pair) for pair in zip(whole[2:], resumed, strict=True))
+    assert len(active_children()) == 2
+    again = next(source.batches(2))  # another place: the first loader ends
+    assert same(again, whole[1])
+    assert len(active_children()) == 2
+    source.close()
+    source.close()
+    assert not active_children()
+
+
+def test_processes_share_every_batch(folder: Path) -> None:
+    dataset = SceneDataset(folder, "train", options())
+    whole = islice(StoredScenes(dataset, batch=4).batches(8), 3)
+    parts = [islice(StoredScenes(dataset, batch=4, rank=rank, world=2).batches(8), 3) for rank in range(2)]
+    for batch, *shares in zip(whole, *parts, strict=True):
+        assert [len(share.images) for share in shares] == [2, 2]
+        assert same(batch, Batch(*(torch.cat(tensors) for tensors in zip(*shares, strict=True))))
+    with pytest.raises(InputError, match="batch_scenes 4 cannot be shared by 3 processes"):
+        StoredScenes(dataset, batch=4, world=3)
+    with pytest.raises(InputError, match="rank must be from 0 to 1"):
+        StoredScenes(dataset, batch=4, rank=2, world=2)
+
+
+def test_identity_tells_data_sets_apart(folder: Path, tmp_path: Path) -> None:
+    source = StoredScenes(SceneDataset(folder, "train", options()), batch=2)
+    assert (source.scenes, source.identity()["scenes"]) == (5, 5)
+    write_data(tmp_path, ("train",) * 5 + ("val",), lights=6, size=32, seed=1)
+    other = StoredScenes(SceneDataset(tmp_path, "train", options()), batch=2)
+    assert other.identity()["data"] != source.identity()["data"]
+    json.dumps(source.identity())
+
+
+def test_stored_batches_hand_on_mistakes(tmp_path: Path) -> None:
+    scenes = write_data(tmp_path, ("train", "train"), lights=4, size=16)
+    path = tmp_path / scenes[1].file
+    path.write_bytes(path.read_bytes()[:-100])
+    source = StoredScenes(SceneDataset(tmp_path, "train", options(size=16)), batch=2, workers=1)
+    assert "render it again" in str(next(source.batches(0)))
+    source.close()
+
+
+def test_biased_samples_have_the_lights_around_one_direction() -> None:
+    directions = hemisphere_lights(64, rng(), lowest=0.05)
+    plain = options(augmentation=PLAIN, images=8)
+    biased = options(augmentation=replace(PLAIN, biased=1.0), images=8)
+    spread, centres = {plain: [], biased: []}, []
+    for seed in range(60):
+        for kind, found in spread.items():
+            chosen = choose_images(directions, kind, rng(seed))
+            assert len(set(chosen)) == 8
+            mean = directions[chosen].mean(0)
+            found.append(np.linalg.norm(mean))  # 1 for lights that are all alike
+        centres.append(mean / np.linalg.norm(mean))
+        # Without a share of biased samples the stream of the plain ones is as it was.
+        np.testing.assert_array_equal(choose_images(directions, plain, rng(seed)), rng(seed).permutation(64)[:8])
+    assert np.mean(spread[biased]) > np.mean(spread[plain]) + 0.15
+    assert np.std(centres, axis=0)[:2].min() > 0.3  # now around one direction, now around another
+
+
+def test_frontal_samples_have_the_lights_nearest_to_the_camera() -> None:
+    directions = hemisphere_lights(64, rng(), lowest=0.05)
+    nearest = np.argsort(-directions[:, 2])
+    frontal = options(augmentation=replace(PLAIN, frontal=1.0), images=8)
+    counts = [np.isin(nearest, choose_images(directions, frontal, rng(seed))).nonzero()[0].max() for seed in range(60)]
+    assert 7 <= min(counts) < 12 and 24 < max(counts) <= 31  # from as many as asked for to half of them
+    mixed = options(augmentation=replace(PLAIN, biased=0.4, frontal=0.3), images=8)
+    heights = np.array([directions[choose_images(directions, mixed, rng(seed)), 2].min() for seed in range(400)])
+    assert 0.25 < np.mean(heights >= directions[nearest[31], 2]) < 0.4  # the frontal share, and a few biased ones

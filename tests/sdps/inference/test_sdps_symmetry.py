@@ -1,0 +1,104 @@
+"""Turning scenes: the way back, agreement with training's own symmetry, and what averaging over views gives."""
+
+import numpy as np
+import pytest
+import torch
+
+from render.shared.config import to_plain
+from render.shared.errors import InputError
+from sdps.core.metrics import angle_degrees
+from sdps.data.augment import apply_symmetry
+from sdps.inference.estimator import Estimator
+from sdps.inference.symmetry import SYMMETRIES, Symmetry, mean_lights, turned_context
+from sdps.models.base import Lights
+from sdps.models.checkpoint import TrainedModel
+from sdps.models.registry import create
+from sdps.training.training_config import LightingTraining
+
+EVERY = pytest.mark.parametrize("symmetry", SYMMETRIES)
+
+
+@EVERY
+def test_every_symmetry_is_that_of_training_and_has_a_way_back(symmetry: Symmetry) -> None:
+    rng = np.random.default_rng(0)
+    images, normals = rng.random((2, 6, 6, 3)), rng.standard_normal((6, 6, 3))
+    directions = rng.standard_normal((2, 3))
+    turned = apply_symmetry(images, normals, np.ones((6, 6), bool), directions, symmetry.turns, symmetry.mirror)
+    stack, map_, lights = (
+        torch.tensor(images).movedim(-1, 1),
+        torch.tensor(normals).movedim(-1, 0),
+        torch.tensor(directions),
+    )
+    np.testing.assert_array_equal(symmetry.images(stack).movedim(1, -1), turned[0])
+    np.testing.assert_array_equal(symmetry.vectors(symmetry.images(map_), dim=0).movedim(0, -1), turned[1])
+    np.testing.assert_array_equal(symmetry.vectors(lights), turned[3])
+    assert torch.equal(symmetry.back.images(symmetry.images(stack)), stack)
+    assert torch.equal(symmetry.back.vectors(symmetry.vectors(lights)), lights)
+
+
+def test_the_first_views_are_groups_and_all_are_different() -> None:
+    probe = torch.arange(9.0).reshape(3, 3)
+    seen = [tuple(symmetry.images(probe).flatten().tolist()) for symmetry in SYMMETRIES]
+    assert len(set(seen)) == 8
+    for count in (1, 2, 4, 8):
+        products = {
+            tuple(b.images(a.images(probe)).flatten().tolist()) for a in SYMMETRIES[:count] for b in SYMMETRIES[:count]
+        }
+        assert products == set(seen[:count])
+
+
+@EVERY
+def test_the_context_of_a_second_pass_turns_with_its_vectors(symmetry: Symmetry) -> None:
+    context = torch.rand(1, 5, 4, 6, 6)
+    turned = turned_context(symmetry, lambda part: context[:, part])(slice(1, 3))
+    assert turned.shape == (1, 2, 4, 6, 6)
+    torch.testing.assert_close(turned[:, :, 3], symmetry.images(context[:, 1:3, 3]))
+    torch.testing.assert_close(turned[:, :, :3], symmetry.vectors(symmetry.images(context[:, 1:3, :3]), dim=2))
+    assert turned_context(symmetry, None) is None
+
+
+def test_the_mean_of_lights_undoes_the_turns() -> None:
+    true = torch.nn.functional.normalize(torch.rand(1, 4, 3), dim=-1)
+    gains = torch.rand(1, 4)
+    found = [(symmetry, Lights(symmetry.vectors(true), gains, gains)) for symmetry in SYMMETRIES]
+    mean = mean_lights(found)
+    for one, two in zip(mean, (true, gains, gains), strict=True):
+        torch.testing.assert_close(one, two)
+
+
+def estimator(lights: int, normals: int) -> Estimator:
+    torch.manual_seed(0)
+    metadata = {"config": to_plain(LightingTraining())}
+    names = {"lighting": "lcnet-soft", "normals": "nenet"}
+    models = {place: TrainedModel(name, create(name).eval(), {}, metadata) for place, name in names.items()}
+    views = {"light_views": lights, "normal_views": normals}
+    return Estimator(**models, device=torch.device("cpu"), precision="float32", read_out="expectation", **views)
+
+
+def differences(network: Estimator) -> tuple[float, float]:
+    """Return by how many degrees lights, and normals under given lights, change when the camera is turned."""
+    rng = np.random.default_rng(0)
+    images, mask = rng.random((3, 48, 40, 3)).astype(np.float32), np.zeros((48, 40), bool)
+    mask[4:44, 8:36] = True
+    given, quarter = torch.tensor([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [0.0, 0.0, 1.0]]), Symmetry(1)
+    turned_images, turned_mask = np.rot90(images, 1, (1, 2)), np.rot90(mask)
+    lights = network.estimate_lights(images, mask).light_directions
+    found = network.estimate_lights(turned_images, turned_mask).light_directions
+    normals = network.estimate(images, mask, given.numpy(), np.ones(3)).normals
+    turned = network.estimate(turned_images, turned_mask, quarter.vectors(given).numpy(), np.ones(3)).normals
+    back = quarter.back.vectors(torch.from_numpy(np.rot90(turned, -1).copy())).numpy()
+    lit = angle_degrees(quarter.back.vectors(torch.from_numpy(found)).numpy(), lights).max()
+    return float(lit), float(np.median(angle_degrees(back[mask], normals[mask])))
+
+
+def test_all_views_together_do_not_care_how_the_object_lies() -> None:
+    apart, level = differences(estimator(1, 1)), differences(estimator(8, 8))
+    assert min(apart) > 1.0
+    assert max(level) < 0.1 * min(apart)
+
+
+def test_numbers_of_views_that_are_no_group_are_refused() -> None:
+    with pytest.raises(InputError, match="light_views must be 1, 2, 4 or 8, got 3"):
+        estimator(3, 1)
+    with pytest.raises(InputError, match="normal_views must be 1, 2, 4 or 8, got 0"):
+        estimator(1, 0)

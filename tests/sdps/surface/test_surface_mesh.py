@@ -1,0 +1,123 @@
+"""The mesh: frame, units, winding, colours, holes, and files read back by trimesh."""
+
+import io
+
+import numpy as np
+import pytest
+import trimesh
+from surface_scenes import balls, sphere
+from trimesh.exchange.gltf import load_glb
+from trimesh.exchange.obj import load_obj
+from trimesh.exchange.ply import load_ply
+
+from render.shared.errors import InputError
+from sdps.surface.integration import integrate
+from sdps.surface.meshing import FORMATS, mesh, unit_scale, write_mesh
+
+READERS = {".ply": load_ply, ".obj": load_obj, ".glb": load_glb}
+
+
+@pytest.fixture(scope="module")
+def dome():
+    truth, normals, mask = sphere(48, 21.0, 0.9)
+    return integrate(normals, mask), normals, truth
+
+
+@pytest.fixture(scope="module")
+def surface(dome):
+    depth, normals, _ = dome
+    colour = np.random.default_rng(0).integers(0, 256, (48, 48, 3), dtype=np.uint8)
+    return mesh(depth, normals=normals, colour=colour), colour
+
+
+def test_vertices_are_in_half_widths(dome, surface):
+    depth, normals, truth = dome
+    vertices = surface[0].vertices
+    assert len(vertices) == depth.mask.sum()
+    radius = 21.0 * unit_scale(depth.mask.shape)
+    # A sphere again, about its own centre; the depth is known up to a constant.
+    z = vertices[:, 2] + (truth[depth.mask].mean()) / 24
+    assert np.allclose(np.hypot(np.hypot(vertices[:, 0], vertices[:, 1]), z), radius, atol=1e-3)
+    top = vertices[np.argmax(vertices[:, 1])]
+    assert normals[depth.mask][np.argmax(vertices[:, 1])][1] > 0.5 and top[1] > 0.5
+
+
+def test_longer_side_is_two():
+    mask = np.ones((10, 40), bool)
+    wide = mesh(np.zeros((10, 40)), mask)
+    assert np.allclose(wide.bounds, [[-0.975, -0.225, 0], [0.975, 0.225, 0]])
+    assert np.allclose(np.abs(mesh(np.zeros((40, 10)), mask.T).bounds[:, 1]), 0.975)
+
+
+def test_triangles_face_the_camera_and_agree_with_the_normals(dome, surface):
+    shape = surface[0]
+    assert (shape.face_normals[:, 2] > 0).all()
+    means = shape.vertex_normals[shape.faces].mean(axis=1)
+    agreement = (means * shape.face_normals).sum(axis=1) / np.linalg.norm(means, axis=1)
+    assert agreement.min() > 0.97
+    assert np.allclose(shape.vertex_normals, dome[1][dome[0].mask], atol=1e-5)
+
+
+def test_full_grid_and_corners():
+    assert len(mesh(np.zeros((4, 5)), np.ones((4, 5), bool)).faces) == 2 * 3 * 4
+    corner = np.ones((2, 2), bool)
+    for row in (0, 1):
+        for column in (0, 1):
+            mask = corner.copy()
+            mask[row, column] = False
+            one = mesh(np.zeros((2, 2)), mask)
+            assert len(one.faces) == 1 and one.face_normals[0, 2] == pytest.approx(1.0)
+
+
+def test_hole_stays_open_and_lines_are_left_out():
+    mask = np.zeros((12, 20), bool)
+    mask[:, :12] = True
+    mask[5:7, 5:7] = False
+    mask[3, 12:] = True  # a line
+    shape = mesh(np.zeros(mask.shape), mask)
+    # The line's first pixel has two neighbouring pixels of the block above and below, the others have none.
+    assert shape.vertices[:, 0].max() == pytest.approx((12 - 9.5) * unit_scale(mask.shape))
+    assert shape.area == pytest.approx((11 * 11 - 3 * 3 + 4 * 0.5 + 2 * 0.5) * unit_scale(mask.shape) ** 2)
+
+
+def test_steepest_removes_walls():
+    z, normals = balls()
+    mask = np.ones(z.shape, bool)
+    depth = integrate(normals, mask, discontinuities=True)
+    whole, cut = mesh(depth), mesh(depth, steepest=8.0)
+    assert 0 < len(whole.faces) - len(cut.faces) < 0.05 * len(whole.faces)
+    steps = np.ptp(cut.vertices[cut.faces][..., 2], axis=1) / unit_scale(mask.shape)
+    assert steps.max() <= 16.0
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_files_read_back(tmp_path, surface, suffix):
+    shape = surface[0]
+    write_mesh(shape, tmp_path / f"object{suffix}")
+    assert [path.name for path in tmp_path.iterdir()] == [f"object{suffix}"]
+    back = trimesh.load(tmp_path / f"object{suffix}", force="mesh", process=False)
+    assert np.allclose(back.vertices, shape.vertices, atol=1e-6)
+    assert np.array_equal(back.faces, shape.faces)
+    # trimesh.load drops the normals that its readers find, so they are asked themselves.
+    with open(tmp_path / f"object{suffix}", "rb") as handle:
+        parts = READERS[suffix](handle if suffix != ".obj" else io.TextIOWrapper(handle))
+    parts = next(iter(parts["geometry"].values())) if "geometry" in parts else parts
+    assert np.allclose(parts["vertex_normals"], shape.vertex_normals, atol=1e-5)
+    assert np.array_equal(back.visual.vertex_colors[:, :3], shape.visual.vertex_colors[:, :3])
+
+
+def test_refusals(tmp_path, dome):
+    depth, normals, _ = dome
+    with pytest.raises(InputError, match="triangle"):
+        mesh(np.zeros((5, 5)), np.eye(5, dtype=bool))
+    with pytest.raises(InputError, match="uint8"):
+        mesh(depth, colour=normals)
+    with pytest.raises(InputError, match="normals must be"):
+        mesh(depth, normals=normals[1:])
+    with pytest.raises(InputError, match="NaN"):
+        mesh(np.full((5, 5), np.nan), np.ones((5, 5), bool))
+    with pytest.raises(InputError, match="mask"):
+        mesh(np.zeros((5, 5)))
+    with pytest.raises(InputError, match="mesh format"):
+        write_mesh(mesh(depth), tmp_path / "object.stl")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,154 @@
+"""Model cards: what they say comes from the files, the rest is not recorded, and what they tell to run runs."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from sdps_scenes import write_data
+
+from pipelines.shared import presets
+from pipelines.train.train import in_order
+from render.records.manifest import MANIFEST
+from render.records.shards import file_hash
+from render.shared.config import to_plain, to_yaml
+from render.shared.errors import InputError
+from sdps.models.checkpoint import TrainedModel, load_weights, save_weights
+from sdps.models.registry import create
+from sdps.publishing.model_card import UNKNOWN, render_card, write_model_card
+from sdps.training.training_config import LightingTraining, NormalTraining
+
+CONFIG = NormalTraining(steps=8, batch_scenes=2, images=2, size=32, crop=16, lights="true", schedule="cosine")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data")
+    write_data(path, ("train", "train", "val"), lights=4, size=32)
+    return path
+
+
+def write_run(out: Path, data: Path | None, *, model: str = "nenet", name: str = "own", config=CONFIG) -> Path:
+    """Write what a finished run leaves and return its weights."""
+    metadata = {
+        "config": to_plain(config), "data": file_hash(data / MANIFEST) if data else "0" * 64, "code": "abc123",
+        "step": 8, "seconds": 5400.0, "metrics": {"val_loss": 0.3, "val_normal_mae": 12.3456}, "lights": "true",
+    }  # fmt: skip
+    torch.manual_seed(0)
+    path = out / name / f"{name}.safetensors"
+    path.parent.mkdir(parents=True)
+    save_weights(path, TrainedModel(model, create(model), {}, metadata))
+    rows = [{"step": 4, "loss": 1.0, "images_per_second": 80.0, "waiting_share": 0.02, "seconds": 2700.0},
+            {"step": 4, "val_normal_mae": 11.5}, {"step": 8, "val_normal_mae": 12.3456}]  # fmt: skip
+    (path.parent / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (path.parent / "training.yaml").write_text(to_yaml({"model": model, "training": config}))
+    return path
+
+
+def front_matter(text: str) -> dict:
+    return yaml.safe_load(text.split("---\n")[1])
+
+
+def test_the_card_tells_what_the_files_tell(tmp_path: Path, data: Path) -> None:
+    card = tmp_path / "MODEL_CARD.md"
+    write_model_card(card, write_run(tmp_path, data), data)
+    text = card.read_text()
+    for fact in ("2,210,048", "B1", "the true ones", "1.50", "80", "2.0%", "abc123", file_hash(data / MANIFEST),
+                 "train 2, val 1", "sphere", "`augmentation.intensity_range` | 0.2, 2", "`learning_rate` | 0.0005",
+                 "| normal_mae | 12.35 | degrees | mean angle between estimated and true normals",
+                 "11.5 at step 4", "x right, y up, z to the camera", "load_estimator"):  # fmt: skip
+        assert fact in text, fact
+    assert str(tmp_path) not in text  # no paths of this machine
+    assert str(data) not in text
+    head = front_matter(text)
+    assert head["tags"][-1] == "nenet"
+    metrics = head["model-index"][0]["results"][0]["metrics"]
+    assert {"type": "normal_mae", "value": 12.3456} in metrics
+
+
+def test_its_preset_repeats_the_run(tmp_path: Path, data: Path) -> None:
+    text = render_card(write_run(tmp_path, data), data)
+    block = re.search(r"```yaml\n(.*?)```", text, re.DOTALL).group(1)
+    (tmp_path / "repeat.yaml").write_text(block)
+    preset = presets.load(str(tmp_path / "repeat.yaml"))
+    assert preset.train == ("own",)
+    run = preset.run("own")
+    assert (run.model, run.config) == ("nenet", CONFIG)
+
+
+def test_the_whole_preset_is_told_where_it_is_known(tmp_path: Path, data: Path) -> None:
+    weights = write_run(tmp_path, data)
+    preset = presets.load("smoke", ["runs.first={base: psfcn}", "runs.own={base: nenet, start: first}"])
+    presets.save_resolved(preset, weights.parent)
+    block = re.search(r"```yaml\n(.*?)```", render_card(weights, data), re.DOTALL).group(1)
+    (tmp_path / "repeat.yaml").write_text(block)
+    again = presets.load(str(tmp_path / "repeat.yaml"))
+    assert again.train == ("own",) and again.data == preset.data
+    assert in_order(again, ["own"]) == in_order(preset, ["own"])
+    assert sorted(in_order(again, ["own"])) == ["first", "lcnet", "own"]
+
+
+def test_its_snippet_loads_the_weights(tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weights = write_run(tmp_path, data)
+    lighting = write_run(tmp_path, data, model="lcnet", name="lcnet", config=LightingTraining())
+    (weights.parent / "lcnet.safetensors").write_bytes(lighting.read_bytes())
+    snippet = re.search(r"```python\n(.*?)```", render_card(weights), re.DOTALL).group(1)
+    monkeypatch.chdir(weights.parent)
+    names: dict = {}
+    exec(snippet.split("# images")[0], names)  # what comes after needs images
+    assert names["estimator"].normals.name == "nenet"
+    compile(snippet, "snippet", "exec")
+
+
+def test_what_is_not_known_is_not_recorded(tmp_path: Path) -> None:
+    weights = write_run(tmp_path, None)
+    (weights.parent / "metrics.jsonl").unlink()
+    (weights.parent / "training.yaml").unlink()
+    model = load_weights(weights)
+    bare = {"config": model.metadata["config"]}
+    save_weights(weights, TrainedModel(model.name, model.network, {}, bare))
+    text = render_card(weights)
+    for row in ("optimiser steps", "hours", "images per second", "SHA-256 of the manifest", "composition"):
+        assert f"| {row} | {UNKNOWN}" in text, row
+    assert "no validation scenes" in text
+    assert "model-index" not in front_matter(text)
+
+
+def test_another_manifest_is_told(tmp_path: Path, data: Path) -> None:
+    assert "another manifest now" in render_card(write_run(tmp_path, None), data)
+
+
+def test_terms_come_from_the_caller_or_the_data_card(tmp_path: Path, data: Path) -> None:
+    weights = write_run(tmp_path, data)
+    assert "Terms of the materials and shapes: not recorded" in render_card(weights, data)
+    (data / "DATASET_CARD.md").write_text("# Data\n\n## Licences\n\nchrome: research use.\n\n## Known limits\n\nmany\n")
+    text = render_card(weights, data)
+    assert "chrome: research use." in text
+    assert "many" not in text
+    assert "| teflon | its source | its terms |" in render_card(weights, data, [("teflon", "its source", "its terms")])
+
+
+@pytest.mark.parametrize(
+    ("model", "fact"),
+    [
+        ("lcnet-reg", "this project decided: heads and loss"),
+        ("upsfcn", "does not apply"),
+        ("nenet-norm", "pixel's norm"),
+    ],
+)
+def test_models_differ(tmp_path: Path, model: str, fact: str) -> None:
+    config = LightingTraining() if model.startswith("lcnet") else CONFIG
+    weights = write_run(tmp_path, None, model=model, config=config)
+    trained = load_weights(weights)
+    metadata = {key: value for key, value in trained.metadata.items() if key != "lights"}
+    save_weights(weights, TrainedModel(model, trained.network, {}, metadata))
+    assert fact in render_card(weights)
+
+
+def test_foreign_weights_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "own.safetensors").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="truncated or not a safetensors file"):
+        write_model_card(tmp_path / "MODEL_CARD.md", tmp_path / "own.safetensors")
+    assert not (tmp_path / "MODEL_CARD.md").exists()

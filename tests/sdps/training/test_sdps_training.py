@@ -1,0 +1,442 @@
+"""The trainer: exact resume, refusals, signals, metrics on disk, and both networks learning for real."""
+
+import json
+import os
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from sdps_scenes import write_data
+
+from render.shared.config import build
+from render.shared.errors import InputError
+from sdps.data.augment import Augmentation
+from sdps.data.dataset import SampleKey, SceneDataset, collate
+from sdps.models.checkpoint import TrainedModel, load_state, load_weights, save_state, save_weights
+from sdps.models.registry import MODELS, create
+from sdps.training import recipes
+from sdps.training.joint import JointStage
+from sdps.training.stage_factory import create_stage
+from sdps.training.stages import LightingStage, NormalStage, Stage
+from sdps.training.trainer import CHECKPOINT, METRICS, TrainingResult, train
+from sdps.training.training_config import JointTraining, LightingTraining, NormalTraining
+
+TIMES = {"seconds", "images_per_second", "waiting_share"}
+QUICK = NormalTraining(
+    steps=8, batch_scenes=2, images=2, size=32, crop=16, lights="true", log_every=1, workers=0, validation_scenes=2,
+    schedule="cosine",
+)  # fmt: skip
+
+
+class StopAt:
+    """A logger that ends the run at a step: politely by a signal, or as a crash."""
+
+    def __init__(self, step: int, crash: bool = False) -> None:
+        self.step, self.crash = step, crash
+
+    def log(self, step: int, values: dict[str, float]) -> None:
+        if step != self.step:
+            return
+        if self.crash:
+            raise RuntimeError("killed")
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data")
+    write_data(path, ("train",) * 5 + ("val", "val"), lights=4, size=32)
+    return path
+
+
+def rows(out: Path) -> list[dict]:
+    """Return the metrics of a run without what measures time."""
+    lines = [json.loads(line) for line in (out / METRICS).read_text().splitlines()]
+    return [{key: value for key, value in line.items() if key not in TIMES} for line in lines]
+
+
+def assert_same_run(first: Path, second: Path) -> None:
+    assert rows(first) == rows(second)
+    weights = [load_file(out / "nenet.safetensors") for out in (first, second)]
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainingResult]:
+    out = tmp_path_factory.mktemp("whole")
+    return out, train(NormalStage(QUICK), folder, out)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_interrupted_and_resumed_run_is_the_uninterrupted_one(
+    folder: Path, uninterrupted: tuple, tmp_path: Path, workers: int
+) -> None:
+    config = replace(QUICK, workers=workers)
+    stopped = train(NormalStage(config), folder, tmp_path, loggers=[StopAt(3)])
+    assert stopped.interrupted
+    assert stopped.steps == 3
+    assert stopped.weights is None
+    resumed = train(NormalStage(config), folder, tmp_path)
+    assert resumed.steps == 8
+    assert not resumed.interrupted
+    assert_same_run(uninterrupted[0], tmp_path)
+
+
+def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, uninterrupted: tuple, tmp_path: Path) -> None:
+    config = replace(QUICK, checkpoint_minutes=1e-9)  # one every step
+    with pytest.raises(RuntimeError, match="killed"):
+        train(NormalStage(config), folder, tmp_path, loggers=[StopAt(5, crash=True)])
+    assert load_state(tmp_path / CHECKPOINT)["step"] == 4
+    assert rows(tmp_path)[-1]["step"] == 5  # written, but not saved: dropped and taken again
+    (tmp_path / METRICS).open("a").write('{"step": 6, "lo')  # half a line, as a kill leaves it
+    train(NormalStage(QUICK), folder, tmp_path)
+    assert_same_run(uninterrupted[0], tmp_path)
+
+
+def test_finished_run_is_left_alone_and_a_longer_budget_goes_on(folder: Path, tmp_path: Path) -> None:
+    config = replace(QUICK, steps=2, schedule="constant")
+    first = train(NormalStage(config), folder, tmp_path)
+    time_of_change = first.weights["nenet"].stat().st_mtime_ns
+    again = train(NormalStage(config), folder, tmp_path)
+    assert (again.steps, again.metrics) == (2, first.metrics)
+    assert again.weights["nenet"].stat().st_mtime_ns == time_of_change
+    longer = train(NormalStage(replace(config, steps=4)), folder, tmp_path)
+    whole = train(NormalStage(replace(config, steps=4)), folder, tmp_path / "whole")
+    assert longer.metrics == whole.metrics
+
+
+def test_checkpoint_of_another_run_is_refused(folder: Path, uninterrupted: tuple, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"learning_rate was 0\.0005, now 0\.1"):
+        train(NormalStage(replace(QUICK, learning_rate=0.1)), folder, uninterrupted[0])
+    (tmp_path / CHECKPOINT).write_bytes((uninterrupted[0] / CHECKPOINT).read_bytes()[:5000])
+    with pytest.raises(InputError, match="not a checkpoint; delete it"):
+        train(NormalStage(QUICK), folder, tmp_path)
+
+
+def test_a_checkpoint_older_than_a_setting_had_its_default(folder: Path, tmp_path: Path) -> None:
+    train(NormalStage(QUICK), folder, tmp_path, loggers=[StopAt(2)])
+    state = load_state(tmp_path / CHECKPOINT)
+    del state["identity"]["config.augmentation"]["frontal"], state["identity"]["config.accumulate"]
+    save_state(tmp_path / CHECKPOINT, state)
+    augmentation = replace(QUICK.augmentation, frontal=0.5)
+    for change, named in (({"augmentation": augmentation}, "augmentation"), ({"accumulate": 2}, "accumulate was 1")):
+        with pytest.raises(InputError, match=named):
+            train(NormalStage(replace(QUICK, **change)), folder, tmp_path)
+    assert train(NormalStage(QUICK), folder, tmp_path).steps == 8
+
+
+def test_minutes_are_counted_across_resumed_runs(folder: Path, tmp_path: Path) -> None:
+    config = replace(QUICK, steps=None, minutes=0.05, schedule="cosine")
+    stopped = train(NormalStage(config), folder, tmp_path, loggers=[StopAt(2)])
+    finished = train(NormalStage(config), folder, tmp_path)
+    assert finished.seconds >= 3.0
+    assert finished.seconds > stopped.seconds
+    lines = [json.loads(line) for line in (tmp_path / METRICS).read_text().splitlines()]
+    rates = [line["learning_rate"] for line in lines if "learning_rate" in line]
+    assert rates == sorted(rates, reverse=True)
+    assert rates[-1] < 0.5 * rates[0]
+
+
+def test_metrics_name_speed_waiting_and_validation(uninterrupted: tuple) -> None:
+    out, result = uninterrupted
+    lines = [json.loads(line) for line in (out / METRICS).read_text().splitlines()]
+    assert [line["step"] for line in lines] == [*range(1, 9), 8]
+    assert TIMES | {"loss", "masked_loss", "learning_rate"} <= lines[0].keys()
+    assert 0.0 <= lines[0]["waiting_share"] <= 1.0
+    assert lines[-1]["val_normal_mae"] == result.metrics["val_normal_mae"] > 0.0
+
+
+def test_tensorboard_is_an_extra(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    train(NormalStage(replace(QUICK, steps=1)), folder, tmp_path, tensorboard=True)
+    assert list((tmp_path / "tensorboard").glob("events.out.tfevents.*"))
+
+
+def test_best_and_last_weights_are_kept(folder: Path, tmp_path: Path) -> None:
+    result = train(NormalStage(replace(QUICK, validate_every=2)), folder, tmp_path)
+    lines = [json.loads(line) for line in (tmp_path / METRICS).read_text().splitlines()]
+    values = {line["step"]: line["val_normal_mae"] for line in lines if "val_normal_mae" in line}
+    best = load_weights(tmp_path / "nenet-best.safetensors").metadata
+    assert best["metrics"]["val_normal_mae"] == min(values.values()) == values[best["step"]]
+    assert load_weights(result.weights["nenet"]).metadata["step"] == 8
+
+
+def test_averaged_weights_are_validated_saved_and_resumed(folder: Path, tmp_path: Path) -> None:
+    config = replace(QUICK, ema=0.5, steps=4)
+    stage = NormalStage(config)
+    result = train(stage, folder, tmp_path / "whole")
+    saved = load_file(result.weights["nenet"])
+    moving = stage.network.state_dict()
+    assert not torch.equal(saved["normal.weight"], moving["normal.weight"])
+    # The average of decay 0.5 over four steps is nearer to the last weights than the first weights are.
+    first = NormalStage(config).network.state_dict()["normal.weight"]
+    last = moving["normal.weight"]
+    assert float((saved["normal.weight"] - last).norm()) < float((first - last).norm())
+    train(NormalStage(config), folder, tmp_path / "parts", loggers=[StopAt(2)])
+    train(NormalStage(config), folder, tmp_path / "parts")
+    assert_same_run(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_fine_tuning_together_reaches_the_lighting_network_through_the_lights(folder: Path, tmp_path: Path) -> None:
+    def model(name: str) -> TrainedModel:
+        return TrainedModel(name, create(name), {}, {"config": {"augmentation": {}}, "data": "d", "step": 1})
+
+    config = JointTraining(
+        steps=2, batch_scenes=2, images=2, size=32, crop=16, workers=0, validation_scenes=1, lighting_weight=0.0
+    )
+    stage = JointStage(config, model("lcnet"), model("nenet"))
+    before = {name: tensor.clone() for name, tensor in stage.network.state_dict().items()}
+    result = train(stage, folder, tmp_path)
+    changed = {name for name, tensor in stage.network.state_dict().items() if not torch.equal(tensor, before[name])}
+    assert {"lighting.azimuth.1.weight", "lighting.intensity.1.weight", "normals.normal.weight"} <= changed
+    assert sorted(result.weights) == ["lcnet-joint", "nenet-joint"]
+    assert load_weights(result.weights["lcnet-joint"], "lighting").name == "lcnet"
+
+
+@pytest.mark.slow
+def test_compiled_networks_take_the_same_steps(folder: Path, tmp_path: Path) -> None:
+    if shutil.which("g++") is None:
+        pytest.skip("torch.compile needs a C++ compiler on a CPU")
+    losses = []
+    for compiled in (False, True):
+        out = tmp_path / str(compiled)
+        config = LightingTraining(steps=3, batch_scenes=2, images=4, workers=0, log_every=1, validation_scenes=0,
+                                  precision="bfloat16", compile=compiled)  # fmt: skip
+        train(LightingStage(config), folder, out)
+        losses.append([row["loss"] for row in rows(out)])
+    assert losses[0] == pytest.approx(losses[1], rel=0.02)  # bfloat16 rounds elsewhere
+
+
+def test_a_stage_is_made_for_every_model(folder: Path) -> None:
+    for name, item in MODELS.items():
+        needed = recipes.run(name, {}, {}).requires
+        trained = {
+            use: TrainedModel(run, create(run).eval(), {}, {"config": {"augmentation": {}}})
+            for use, run in needed.items()
+        }
+        stage = create_stage(name, name, recipes.run(name, {}, {}).config, trained)
+        assert stage.goal == ("direction_mae" if item.role in ("lighting", "second") else "normal_mae")
+        assert len(stage.parts(stage.network)) == 1
+
+
+def test_loss_that_is_not_finite_ends_the_run(folder: Path, tmp_path: Path) -> None:
+    stage = NormalStage(QUICK)
+    torch.nn.init.constant_(stage.network.normal.weight, float("nan"))
+    with pytest.raises(InputError, match="lower learning_rate"):
+        train(stage, folder, tmp_path)
+    assert not (tmp_path / CHECKPOINT).exists()
+
+
+def test_accumulated_gradients_are_those_of_the_whole_batch(folder: Path, tmp_path: Path) -> None:
+    outs = []
+    for accumulate in (1, 2):
+        config = LightingTraining(
+            steps=1, batch_scenes=2, images=2, accumulate=accumulate, workers=0, log_every=1, validation_scenes=0
+        )
+        train(LightingStage(config), folder, tmp_path / str(accumulate))
+        outs.append(rows(tmp_path / str(accumulate))[0]["loss"])
+    assert outs[0] == pytest.approx(outs[1], rel=1e-5)
+
+
+def untrained_lcnet() -> TrainedModel:
+    return TrainedModel("lcnet", create("lcnet").eval(), {"direction_classes": 36, "intensity_classes": 20},
+                        {"config": {"augmentation": {}}, "data": "d", "step": 1})  # fmt: skip
+
+
+def test_stage_two_leaves_the_lighting_network_as_it_is(folder: Path, tmp_path: Path) -> None:
+    lighting = untrained_lcnet()
+    before = {name: tensor.clone() for name, tensor in lighting.network.state_dict().items()}
+    stage = NormalStage(replace(QUICK, steps=2, lights="lcnet"), lighting)
+    result = train(stage, folder, tmp_path)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in lighting.network.state_dict().items())
+    assert load_weights(result.weights["nenet"], "normals").metadata["lighting"]["data"] == "d"
+    # NENet is given class centres, not the true lights.
+    dataset = SceneDataset(folder, "train", stage.sample_options())
+    lights = stage.lights(collate([dataset.sample(SampleKey(0, 0, 0))]))
+    classes = lighting.network.classes
+    labels = classes.encode(lights.directions, lights.intensities)
+    torch.testing.assert_close(classes.decode(*labels)[0], lights.directions)
+
+
+def test_lights_are_moved_some_of_the_way_to_the_true_ones(folder: Path) -> None:
+    lighting = untrained_lcnet()
+    stages = [NormalStage(replace(QUICK, lights="lcnet", light_blend=blend), lighting) for blend in (0.0, 1.0)]
+    dataset = SceneDataset(folder, "train", stages[0].sample_options())
+    batch = collate([dataset.sample(SampleKey(scene, 0, scene)) for scene in range(4)])
+    found, blended = (stage.training_lights(batch) for stage in stages)
+    torch.testing.assert_close(stages[1].lights(batch).directions, found.directions)  # in validation all as found
+    torch.testing.assert_close(blended.directions.norm(dim=-1), torch.ones(4, 2))
+    share = (blended.intensities - found.intensities) / (batch.intensities - found.intensities)  # one for a sample
+    torch.testing.assert_close(share[:, 0], share[:, 1], rtol=1e-3, atol=1e-3)
+    assert ((share > 0.0) & (share < 1.0)).all() and share[:, 0].std() > 0.05
+    whole = (found.directions * batch.directions).sum(-1).arccos()
+    np.testing.assert_array_less((blended.directions * batch.directions).sum(-1).arccos(), whole + 1e-4)
+    torch.testing.assert_close(stages[1].training_lights(batch), blended)  # by the samples' seeds alone
+    true = NormalStage(replace(QUICK, light_blend=1.0)).training_lights(batch)
+    torch.testing.assert_close(true.directions, batch.directions)
+
+
+def test_validation_may_see_more_images_than_training(folder: Path, tmp_path: Path) -> None:
+    stage = NormalStage(replace(QUICK, validation_images=4))
+    assert (stage.sample_options().images, stage.validation_options().images) == (2, 4)
+    few, many = (train(NormalStage(replace(QUICK, steps=1, validation_images=count)), folder, tmp_path / str(count))
+                 for count in (None, 4))  # fmt: skip
+    assert few.metrics["val_normal_mae"] != many.metrics["val_normal_mae"]
+    saved = [load_file(result.weights["nenet"]) for result in (few, many)]
+    assert all(torch.equal(tensor, saved[1][name]) for name, tensor in saved[0].items())
+
+
+def test_weights_carry_their_origin(uninterrupted: tuple) -> None:
+    model = load_weights(uninterrupted[1].weights["nenet"], "normals")
+    assert model.metadata["step"] == 8
+    assert len(model.metadata["data"]) == 64
+    assert build(NormalTraining, model.metadata["config"]) == QUICK
+    assert model.augmentation() == QUICK.augmentation
+
+
+def test_half_precision_weights_load_as_float32(tmp_path: Path) -> None:
+    model = TrainedModel("nenet", create("nenet"), {}, {"config": {"augmentation": {}}})
+    save_weights(tmp_path / "whole.safetensors", model)
+    save_weights(tmp_path / "half.safetensors", model, half=True)
+    assert (tmp_path / "half.safetensors").stat().st_size < 0.51 * (tmp_path / "whole.safetensors").stat().st_size
+    loaded = load_weights(tmp_path / "half.safetensors", "normals").network
+    for name, tensor in loaded.state_dict().items():
+        assert tensor.dtype == torch.float32
+        torch.testing.assert_close(tensor, model.network.state_dict()[name], atol=1e-3, rtol=1e-3)
+
+
+def test_the_same_model_gives_the_same_bytes(tmp_path: Path) -> None:
+    # The library leaves the order of the header to chance: eight tries in fresh hash maps would differ.
+    model = TrainedModel("nenet", create("nenet"), {}, {"config": {"augmentation": {}}, "code": "Zürich"})
+    files = [tmp_path / f"{number}.safetensors" for number in range(8)]
+    for file in files:
+        save_weights(file, model)
+    assert len({file.read_bytes() for file in files}) == 1
+    assert load_weights(files[0]).metadata["code"] == "Zürich"
+    (tmp_path / "plain").touch()
+    assert files[0].stat().st_mode == (tmp_path / "plain").stat().st_mode  # the library itself: the owner alone
+
+
+def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path: Path) -> None:
+    weights = uninterrupted[1].weights["nenet"]
+    cut, text = tmp_path / "cut.safetensors", tmp_path / "text.safetensors"
+    cut.write_bytes(weights.read_bytes()[:-1000])
+    text.write_text("not weights")
+    misfit = tmp_path / "misfit.safetensors"
+    save_weights(
+        misfit, TrainedModel("lcnet", create("lcnet"), {"intensity_classes": 10}, {"config": {"augmentation": {}}})
+    )
+    headless, foreign = tmp_path / "headless.safetensors", tmp_path / "foreign.safetensors"
+    save_weights(headless, TrainedModel("nenet", create("nenet"), {}, {}))
+    save_weights(foreign, TrainedModel("nenet2", create("nenet"), {}, {"config": {"augmentation": {}}}))
+    cases = [
+        (weights, "lighting", "holds 'nenet', a model for 'normals'"),
+        (cut, "normals", "truncated"),
+        (text, "normals", "truncated or not a safetensors"),
+        (tmp_path / "none.safetensors", "normals", "no such weights"),
+        (misfit, "lighting", "do not fit"),
+        (headless, "normals", "damaged header"),
+        (foreign, "normals", "a model this version does not know"),
+    ]
+    for path, role, message in cases:
+        with pytest.raises(InputError, match=message) as error:
+            load_weights(path, role)
+        assert "\n" not in str(error.value)
+
+
+def test_schedules_of_the_paper() -> None:
+    lighting = LightingTraining()
+    assert (lighting.epochs, lighting.batch_scenes, lighting.images, lighting.learning_rate) == (20, 32, 32, 5e-4)
+    rates = [lighting.learning_rate_at(epoch / 20) for epoch in (0, 4.9, 5, 10, 15, 19.9)]
+    np.testing.assert_allclose(rates, [5e-4, 5e-4, 2.5e-4, 1.25e-4, 6.25e-5, 6.25e-5])
+    normal = NormalTraining()
+    assert (normal.epochs, normal.batch_scenes, normal.learning_rate_at(0.79)) == (10, 16, 5e-4 / 8)
+    warm = LightingTraining(schedule="cosine", warmup=0.1)
+    assert warm.learning_rate_at(0.05) == pytest.approx(2.5e-4)
+    assert warm.learning_rate_at(0.55) == pytest.approx(2.5e-4)
+    assert warm.learning_rate_at(1.2) == pytest.approx(0.0)
+    trapezoid = LightingTraining(schedule="trapezoid", cooldown=0.2, warmup=0.1)
+    rates = [trapezoid.learning_rate_at(progress) for progress in (0.05, 0.5, 0.79, 0.9, 1.0)]
+    np.testing.assert_allclose(rates, [2.5e-4, 5e-4, 5e-4, 2.5e-4, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"steps": 0}, "steps must be positive"),
+        ({"steps": 5, "minutes": 1.0}, "both set"),
+        ({"accumulate": 3}, "must divide"),
+        ({"epochs": 12.0}, "halve_after"),
+        ({"size": 96}, "must be 128 for LCNet, .* or 64 for a run that others start from"),
+        ({"learnin_rate": 1.0}, "did you mean 'training.learning_rate'"),
+        ({"augmentation": {"noise": 2.0}}, "noise"),
+    ],
+)
+def test_configuration_is_checked(values: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        build(LightingTraining, values, "training")
+
+
+def evaluate(stage: Stage, folder: Path) -> dict[str, float]:
+    """Return the stage's metrics on its own training scenes under augmentation it has not seen."""
+    dataset = SceneDataset(folder, "train", stage.validation_options())
+    stage.network.eval()
+    with torch.no_grad():
+        return stage.metrics(collate([dataset.sample(SampleKey(index, 999, index)) for index in range(len(dataset))]))
+
+
+OVERFIT = {
+    "schedule": "cosine",
+    "warmup": 0.05,
+    "workers": 0,
+    "validation_scenes": 0,
+    "augmentation": Augmentation(noise=0.02),
+}
+
+
+def overfit_lcnet(folder: Path, steps: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the metrics before and after training on three scenes of six lights."""
+    write_data(folder, ("train",) * 3, lights=6, size=128)
+    config = LightingTraining(
+        steps=steps, batch_scenes=3, images=6, learning_rate=1e-3, optimiser="adamw", clip_gradient=5.0, **OVERFIT
+    )
+    stage = LightingStage(config)
+    before = evaluate(stage, folder)
+    train(stage, folder, folder / "run")
+    return before, evaluate(stage, folder)
+
+
+def test_lcnet_learns_the_light_directions_of_a_few_scenes(tmp_path: Path) -> None:
+    before, after = overfit_lcnet(tmp_path, 100)
+    assert before["direction_mae"] > 20.0
+    assert after["direction_mae"] < 5.0
+
+
+@pytest.mark.slow
+def test_lcnet_learns_the_light_intensities_of_a_few_scenes(tmp_path: Path) -> None:
+    # Intensities are drawn anew on every access, so these are learned rather than remembered, which takes longer.
+    before, after = overfit_lcnet(tmp_path, 600)
+    assert before["intensity_error"] > 0.25
+    assert after["intensity_error"] < 0.15
+    assert after["direction_mae"] < 3.0
+
+
+def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
+    settings = {"runs": {"psfcn-late": {"base": "psfcn", "start": "nenet", "steps": 1}}}
+    run = recipes.run("psfcn-late", {}, settings["runs"])
+    assert run.requires == {"start": "nenet"}
+    first = TrainedModel("nenet", create("nenet"), {}, {"config": {"augmentation": {}}})
+    stage = create_stage("psfcn-late", run.model, run.config, {"start": first})
+    pairs = zip(stage.network.state_dict().values(), first.network.state_dict().values(), strict=True)
+    assert all(torch.equal(*pair) for pair in pairs)
+    other = TrainedModel("upsfcn", create("upsfcn"), {}, {"config": {"augmentation": {}}})
+    with pytest.raises(InputError, match=r"runs.psfcn-late.start: 'upsfcn' has another network"):
+        create_stage("psfcn-late", run.model, run.config, {"start": other})

@@ -1,0 +1,44 @@
+"""Rendering processes that only pretend; a small module of their own, so that spawned processes start quickly."""
+
+import os
+import signal
+import time
+
+from render.records import ledger
+from render.running.isolation import Orders, settle
+
+
+def pretend(connection, orders: Orders) -> None:
+    """Serve as a rendering process does, but only write a few bytes per scene, and fail as the material says."""
+    settle(orders)
+    connection.send(("ready",))
+    while (chunk := connection.recv()) is not None:
+        for scene in chunk.scenes():
+            connection.send(("begin", [scene.id]))
+            match scene.material:
+                case "hang":
+                    time.sleep(60)
+                case "die":
+                    os.kill(os.getpid(), signal.SIGSEGV)
+                case "quit":
+                    os._exit(3)
+                case "raise":
+                    connection.send(("failed", [scene.id], "ValueError: no", "Traceback\nValueError: no", 0.1))
+                    continue
+                case "full":
+                    connection.send(("fatal", "shards/x.exr: cannot be written (No space left on device)"))
+                    return
+            path = orders.folder / scene.file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(scene.digest().encode())
+            line = {"id": scene.id, "spec": scene.digest(), "bytes": 64, "seconds": 0.5, "stages": {"render": 0.5},
+                    "time": ledger.now(), "worker": orders.number}  # fmt: skip
+            connection.send(("done", line))
+        connection.send(("end", True))
+
+
+def stillborn(connection, orders: Orders) -> None:
+    """End before being ready, as a process does whose libLLVM aborts."""
+    settle(orders)
+    os.write(2, b"LLVM ERROR: Cannot select\n")
+    os._exit(7)
