@@ -1,5 +1,6 @@
 """Plots of the preview page: inline SVG whose ink is the page's, so that they suit light, dark and print."""
 
+import html
 import io
 import re
 from collections.abc import Sequence
@@ -10,31 +11,28 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from pipelines.shared.charts import new_figure
+
 _INK, _FILL = "#010203", "#040506"  # replaced by CSS colours
 _STYLE = {
-    "svg.fonttype": "none", "svg.hashsalt": "sdps", "font.size": 8, "font.family": "sans-serif",
-    "text.color": _INK, "axes.edgecolor": _INK, "axes.labelcolor": _INK, "xtick.color": _INK, "ytick.color": _INK,
+    "svg.fonttype": "none", "svg.hashsalt": "sdps", "text.parse_math": False,
+    "font.size": 8, "font.family": "sans-serif", "text.color": _INK, "axes.edgecolor": _INK, "axes.labelcolor": _INK,
+    "xtick.color": _INK, "ytick.color": _INK,
     "axes.spines.top": False, "axes.spines.right": False, "figure.facecolor": "none", "axes.facecolor": "none",
     "axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6,
 }  # fmt: skip
+_NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 SCATTER_LIMIT = 1500  # points; beyond, a 2-D histogram
 BARS = 20
-
-
-def _new(width: float = 3.6, height: float = 2.3) -> Figure:
-    return Figure(figsize=(width, height), layout="constrained")
 
 
 def _svg(figure: Figure, title: str) -> str:
     """Return the figure as an inline SVG element with a title, as wide as its container."""
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    figure.savefig(buffer, format="svg", transparent=True, metadata=_NO_METADATA)
     text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
-    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = text.replace("<svg", f'<svg role="img" aria-label="{title}"', 1)
+    text = re.sub(r' (width|height)="[^"]*pt"', "", text[text.index("<svg") :], count=2)
+    text = text.replace("<svg", f'<svg role="img" aria-label="{html.escape(title)}"', 1)
     return text.replace(_INK, "currentColor").replace(_FILL, "var(--accent)")
 
 
@@ -44,7 +42,7 @@ def histogram(
     """Plot a histogram of at least one value; `log` spaces the bins by factors and drops what is not positive."""
     array = np.asarray(values, np.float64)
     with rc_context(_STYLE):
-        figure = _new()
+        figure = new_figure(3.6, 2.3)
         axes = figure.add_subplot()
         if log:
             array = array[array > 0]
@@ -67,7 +65,7 @@ def bars(counts: dict[str, int], title: str) -> str:
         title = f"{title} ({BARS} of {len(counts)})"
     names = [name if len(name) < 28 else f"{name[:26]}…" for name, _ in items]
     with rc_context(_STYLE):
-        figure = _new(height=0.55 + 0.17 * max(len(items), 3))
+        figure = new_figure(3.6, 0.55 + 0.17 * max(len(items), 3))
         axes = figure.add_subplot()
         shown = axes.barh(range(len(items)), [count for _, count in items], color=_FILL, height=0.7)
         axes.bar_label(shown, padding=2, fontsize=7)
@@ -85,7 +83,7 @@ def light_disc(directions: np.ndarray) -> str:
     many = len(directions) > SCATTER_LIMIT
     rings = "white" if many else _INK
     with rc_context(_STYLE):
-        figure = _new(3.6, 2.9)
+        figure = new_figure(3.6, 2.9)
         axes = figure.add_subplot()
         if many:
             cells = 21 if len(directions) < 20 * SCATTER_LIMIT else 41

@@ -131,19 +131,6 @@ def light_intensity_plot(directions: np.ndarray, intensities: np.ndarray) -> Fig
     return figure
 
 
-def curve_plot(series: Sequence[tuple[str, np.ndarray, np.ndarray]], ylabel: str) -> Figure:
-    """Plot named (x, y) series against training minutes."""
-    figure = Figure(figsize=(4.6, 2.6), dpi=100, layout="tight")
-    axes = figure.add_subplot()
-    for name, x, y in series:
-        axes.plot(x, y, label=name, lw=1.2)
-    axes.set(xlabel="minutes", ylabel=ylabel)
-    axes.grid(alpha=0.3)
-    if len(series) > 1:
-        axes.legend(fontsize=8)
-    return figure
-
-
 def data_uri(picture: np.ndarray | Image.Image | Figure, quality: int | None = None) -> str:
     """Encode a picture as a data URI, so that a page needs no other file: PNG, or JPEG when given its quality."""
     buffer = io.BytesIO()

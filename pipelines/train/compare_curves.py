@@ -4,6 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
+import numpy as np
+
 from pipelines.shared.text_tables import number, render_text
 from render.shared.errors import InputError
 
@@ -23,11 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Draw the curves, print the last value of each run and, where asked for, the law's."""
     from sdps.publishing.extrapolation import fit_power_law, predicted_range
-    from sdps.publishing.learning_curves import compare_curves, extrapolated_curves, read_metrics, series
+    from sdps.publishing.learning_curves import compare_curves, read_metrics, series
 
-    files = named(args.runs)
-    span = between(args.between)
-    rows, laws = [], {}
+    files, span, asked = named(args.runs), between(args.between), args.at or []
+    rows, fits = [], {}
     for name, file in files.items():
         steps, values = series(read_metrics(file), args.value)
         if not len(steps):
@@ -35,17 +36,16 @@ def main(args: argparse.Namespace) -> int:
         cells = [name, f"{steps[-1]:.0f}", number(values[-1])]
         if span is not None:
             inside = (steps >= span[0]) & (steps <= span[1])
-            laws[name] = law = fit_power_law(steps[inside], values[inside])
+            law = fit_power_law(steps[inside], values[inside])
+            far = np.geomspace(steps[0], max([*asked, steps[-1]]), 100)
+            fits[name] = far, law.at(far)
             cells.append(f"{law.floor:.3g} + {law.scale:.3g} step^-{law.exponent:.2f}")
-            for at in args.at or ():
+            for at in asked:
                 low, middle, high = predicted_range(steps[inside], values[inside], at)
                 cells.append(f"{number(middle)} ({number(low)} to {number(high)})")
         rows.append(cells)
-    if laws:
-        extrapolated_curves(files, laws, args.picture, args.value, max(args.at or [0]))
-    else:
-        compare_curves(files, args.picture, args.value)
-    header = ["run", "last step", args.value, *([] if span is None else ["fit", *(f"at {k:,}" for k in args.at or ())])]
+    compare_curves(files, args.picture, args.value, fits)
+    header = ["run", "last step", args.value, *([] if span is None else ["fit", *(f"at {k:,}" for k in asked)])]
     sys.stdout.write(render_text("", header, rows) + f"{args.picture}\n")
     return 0
 

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_path, read_text
-from sdps.publishing.extrapolation import PowerLaw
 
 Rows = list[dict[str, float]]
 
@@ -84,13 +83,20 @@ def write_curves(metrics_file: str | Path, picture: str | Path) -> None:
         _save(figure, picture)
 
 
-def compare_curves(runs: Mapping[str, str | Path], picture: str | Path, value: str = "val_normal_mae") -> None:
+def compare_curves(
+    runs: Mapping[str, str | Path],
+    picture: str | Path,
+    value: str = "val_normal_mae",
+    fits: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
+) -> None:
     """Draw one metric of several runs over each other, against steps and, where recorded, against hours.
 
     Args:
         runs: The `metrics.jsonl` of each run by the name its curve gets.
         picture: PNG to write, 1,000 pixels wide.
         value: Name of the metric.
+        fits: Steps and values fitted to some or all runs, by the run's name; drawn dotted, against steps alone, and
+            all axes are then logarithmic.
 
     Raises:
         InputError: no runs, a run without metrics, or none that recorded `value`.
@@ -102,58 +108,53 @@ def compare_curves(runs: Mapping[str, str | Path], picture: str | Path, value: s
     if value not in known:
         raise unknown("metric", value, sorted(known - {"step", "seconds"}))
     kept = {name: rows for name, rows in read.items() if any(value in row for row in rows)}
-    timed = any(len(_clock(rows)[0]) > 1 for rows in kept.values())
+    scales = ["step"] if fits or not any(map(_timed, kept.values())) else ["step", "hours"]
     with rc_context(_STYLE):
         figure = Figure(figsize=(_WIDTH, 4.2), dpi=_DPI, layout="constrained")
-        for number, against in enumerate(("step", "hours") if timed else ("step",)):
-            axes = figure.add_subplot(1, 1 + timed, number + 1)
-            for place, (name, rows) in enumerate(kept.items()):
-                steps, values = series(rows, value)
-                if against == "hours" and len(_clock(rows)[0]) < 2:
-                    continue
-                places = _hours(rows, steps) if against == "hours" else steps
-                # Beyond the ten colours of the cycle, another line.
-                axes.plot(places, values, marker="o", ms=3, lw=1.3, color=f"C{place % 10}", label=name,
-                          ls=("-", "--", ":")[place // 10 % 3])  # fmt: skip
-            axes.set(
-                xlabel="optimiser step" if against == "step" else "hours of training",
-                ylim=_from_zero(axes),
-                xlim=(0, None),
-            )
-            axes.set_ylabel(f"{_spoken(value)}, {_unit(value)}" if _unit(value) != "loss" else _spoken(value))
+        for number, against in enumerate(scales):
+            axes = figure.add_subplot(1, len(scales), number + 1)
+            _draw_runs(axes, kept, value, against)
             if number == 0:
                 axes.legend(ncols=1 + len(kept) // 10)
+        if fits:
+            for place, name in enumerate(kept):
+                if name in fits:
+                    axes.plot(*fits[name], ls=":", lw=1.3, color=f"C{place % 10}")
+            axes.set(xscale="log", yscale="log")
+            axes.autoscale()
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter("{x:g}")
         _save(figure, picture)
 
 
-def extrapolated_curves(
-    runs: Mapping[str, str | Path], laws: Mapping[str, PowerLaw], picture: str | Path, value: str, until: float
-) -> None:
-    """Draw one metric of several runs, and the laws fitted to them dotted, on logarithmic axes.
-
-    Args:
-        runs: The `metrics.jsonl` of each run by the name its curve gets.
-        laws: Of some or all runs.
-        picture: PNG to write, 1,000 pixels wide.
-        value: Name of the metric.
-        until: Step up to which laws are drawn, if that is beyond the last one taken.
-    """
+def metric_figure(runs: Mapping[str, Rows], value: str, title: str) -> Figure:
+    """Return a small chart of one metric of several runs, against minutes where every run recorded its time."""
     with rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH, 4.8), dpi=_DPI, layout="constrained")
+        figure = Figure(figsize=(4.6, 2.6), dpi=_DPI, layout="constrained")
         axes = figure.add_subplot()
-        for place, (name, file) in enumerate(runs.items()):
-            steps, values = series(read_metrics(file), value)
-            if not len(steps):
+        _draw_runs(axes, runs, value, "minutes" if all(map(_timed, runs.values())) else "step")
+        axes.set_ylabel(title)
+        if len(runs) > 1:
+            axes.legend()
+    return figure
+
+
+def _draw_runs(axes: Axes, runs: Mapping[str, Rows], value: str, against: str) -> None:
+    """Plot a metric of runs against `step`, `hours` or `minutes`; runs without a clock only against steps."""
+    for place, (name, rows) in enumerate(runs.items()):
+        places, values = series(rows, value)
+        if against != "step":
+            if not _timed(rows):
                 continue
-            axes.loglog(steps, values, marker="o", ms=3, lw=1.3, color=f"C{place % 10}", label=name)
-            if name in laws:
-                far = np.geomspace(steps[0], max(until, steps[-1]), 100)
-                axes.loglog(far, laws[name].at(far), ls=":", lw=1.3, color=f"C{place % 10}")
-        axes.set(xlabel="optimiser step", ylabel=f"{_spoken(value)}, {_unit(value)}")
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter("{x:g}")
-        axes.legend()
-        _save(figure, picture)
+            places = _hours(rows, places) * (60 if against == "minutes" else 1)
+        marks = {"marker": "o", "ms": 3} if value.startswith("val_") else {}
+        # Beyond the ten colours of the cycle, another line.
+        axes.plot(places, values, lw=1.3, color=f"C{place % 10}", label=name, ls=("-", "--", ":")[place // 10 % 3],
+                  **marks)  # fmt: skip
+    axes.set(xlabel="optimiser step" if against == "step" else f"{against} of training", ylim=_from_zero(axes),
+             xlim=(0, None))  # fmt: skip
+    unit = _unit(value)
+    axes.set_ylabel(_spoken(value) if unit == "loss" else f"{_spoken(value)}, {unit}")
 
 
 def _panels(rows: Rows) -> list[_Panel]:
@@ -201,7 +202,7 @@ def _from_zero(axes: Axes) -> tuple[float, float]:
 
 def _hours_above(axes: Axes, rows: Rows, *, label: bool) -> None:
     """Add an axis of hours above, where the run's time is known."""
-    if len(_clock(rows)[0]) < 2:
+    if not _timed(rows):
         axes.spines["top"].set_visible(False)
         return
     above = axes.secondary_xaxis(
@@ -210,6 +211,10 @@ def _hours_above(axes: Axes, rows: Rows, *, label: bool) -> None:
     if label:
         above.set_xlabel("hours of training", fontsize=8.5)
     above.tick_params(labelsize=8)
+
+
+def _timed(rows: Rows) -> bool:
+    return len(_clock(rows)[0]) > 1
 
 
 def _clock(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
@@ -243,10 +248,8 @@ def series(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
 def _smooth(values: np.ndarray) -> np.ndarray:
     """Return the running mean over a window about each point, cut off at the ends."""
     half = max(1, round(_SMOOTHED * len(values) / 2))
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    places = np.arange(len(values))
-    first, last = np.maximum(places - half, 0), np.minimum(places + half + 1, len(values))
-    return (sums[last] - sums[first]) / (last - first)
+    sums, counts = (np.convolve(each, np.ones(2 * half + 1))[half:-half] for each in (values, np.ones_like(values)))
+    return sums / counts
 
 
 def _unit(name: str) -> str:

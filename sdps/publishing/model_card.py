@@ -8,14 +8,15 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
 from render.records.shards import file_hash
 from render.shared.errors import InputError
-from render.shared.files import markdown_table, read_text, write_text
+from render.shared.files import read_text, write_text
+from render.shared.templates import fill
 from sdps.models import registry
 from sdps.models.blocks import parameter_count
 from sdps.models.checkpoint import TrainedModel, load_weights
@@ -25,6 +26,7 @@ from sdps.publishing.learning_curves import Rows, read_metrics
 UNKNOWN = "not recorded"
 _METRICS, _DATASET_CARD = "metrics.jsonl", "DATASET_CARD.md"
 _PRESET, _TRAINING = "config.yaml", "training.yaml"  # what `sdps train` leaves beside the weights
+_LICENCES = re.compile(r"^## Licences\n(.*?)(?=^## |\Z)", re.DOTALL | re.MULTILINE)  # section of a dataset card
 _GIVES = {
     "lighting": "direction and relative intensity of the light of every image",
     "second": "direction and relative intensity of the light of every image, from the images and a first estimate of "
@@ -40,26 +42,8 @@ _DEFINITIONS = {
 }
 _READ_OUTS = {"expectation": "lights read out as expectation over the classes", "peak": "lights read out at the "
               "interpolated peak of the class probabilities"}  # fmt: skip
-_LIMITS = """\
-- For photometric stereo: one object, a fixed camera, one distant light per image, all images under different lights.
-- Trained on rendered images under an orthographic camera and directional lights in front of the object. Near lights,
-  perspective, ambient light and the optics of real cameras were not among them.
-- Materials in training are opaque. Transmission, subsurface scattering and fluorescence were not among them.
-- Input has to be linear: images with gamma, tone mapping or automatic exposure between them break the model's premise.
-- The figures above are of scenes like those of training. They are no promise for photographs: measure on your own.
-"""
-
-
-class _Sources(NamedTuple):
-    """What a card is made from."""
-
-    run: str  # name of the run, which is that of its folder
-    file: str  # name of the weights file
-    stored: str  # its size and type of number
-    model: TrainedModel
-    rows: Rows  # metrics of the run, empty where there are none
-    base: str  # model the run trains, `sdps-joint` included
-    preset: dict[str, Any]  # resolved, empty where it is not recorded
+_LIGHTS = {TRUE_LIGHTS: "the true ones", "": "does not apply", "none": "it is told none"}
+_TEMPLATE = Path(__file__).with_name("model_card.md.j2")
 
 
 def write_model_card(
@@ -92,39 +76,55 @@ def render_card(
     shipped: str | Path | None = None,
 ) -> str:
     """Compose the card; see `write_model_card`."""
-    weights = Path(weights)
+    weights, copy = Path(weights), Path(shipped or weights)
     model = load_weights(weights)
+    metadata, config, entry = model.metadata, model.metadata["config"], registry.entry(model.name)
     metrics = weights.parent / _METRICS
     rows = read_metrics(metrics) if metrics.is_file() and metrics.stat().st_size else []
-    run = weights.absolute().parent.name
-    file = weights if shipped is None else Path(shipped)
-    stored = f"{file.stat().st_size / 1e6:.1f} MB as {'float32' if shipped is None else 'float16'}"
-    source = _Sources(run, file.name, stored, model, rows, _base(weights.parent) or model.name, _preset(weights.parent))
+    scores = {name.removeprefix("val_"): float(value) for name, value in (metadata.get("metrics") or {}).items()}
     folder = Path(data) if data is not None and (Path(data) / MANIFEST).is_file() else None
-    sections = [
-        _front_matter(source),
-        f"# {weights.stem}\n\n{_about(source)}",
-        _input(model),
-        _training(source),
-        _data(model, folder),
-        _validation(source),
-        f"## Intended use and limits\n\n{_LIMITS}",
-        _licences(folder, terms),
-        _repeat(source),
-        _load(source),
-    ]
-    return "\n".join(sections)
+    card = read_text(folder / _DATASET_CARD) if folder is not None and (folder / _DATASET_CARD).is_file() else ""
+    lights = metadata.get("lights") or entry.lights
+    composition = _data(model, folder)
+    return fill(
+        _TEMPLATE,
+        unknown=UNKNOWN,
+        head=_front_matter(model, copy.stem, scores, pretrained=shipped is not None),
+        name=weights.stem,
+        file=copy.name,
+        size=f"{copy.stat().st_size / 1e6:.1f} MB as {'float32' if shipped is None else 'float16'}",
+        model=model,
+        network=model.network,
+        entry=entry,
+        gives=_GIVES[entry.role],
+        parameters=parameter_count(model.network),
+        lights=_LIGHTS.get(lights, f"those of `{lights}`"),
+        options=_value(model.options),
+        input=model.augmentation(),
+        training=_training(metadata, rows),
+        config=config,
+        settings=[(f"`{name}`", _value(value)) for name, value in _flat(config)],
+        data=composition,
+        data_card=card and "composition" not in dict(composition),
+        scores=[(name, f"{value:.4g}", *_defined(name), _best(rows, name)) for name, value in scores.items()],
+        pretrained=shipped is not None,
+        terms=terms,
+        data_terms="".join(_LICENCES.findall(card)).strip(),
+        **_repeat(weights, model),
+    )
 
 
-def _base(folder: Path) -> str:
-    """Return the model of the run, if that is recorded beside the weights."""
-    return str(_plain(folder / _TRAINING).get("model", ""))
-
-
-def _preset(folder: Path) -> dict[str, Any]:
-    """Return the resolved preset beside the weights; empty if there is none."""
-    values = _plain(folder / _PRESET)
-    return values if "data" in values else {}
+def _repeat(weights: Path, model: TrainedModel) -> dict[str, Any]:
+    """Return the preset that trains a run again, the name of the one it was trained with, and the runs it needs."""
+    run, config = weights.absolute().parent.name, model.metadata["config"]
+    again = {"name": "repeat", "description": f"Trains {run} again.", "train": [run]}
+    recorded = _plain(weights.parent / _PRESET)
+    if "data" in recorded:
+        kept = {name: value for name, value in recorded.items() if name != "test"}
+        return {"preset": {**kept, **again}, "recorded": recorded.get("name", UNKNOWN), "needed": []}
+    base = _plain(weights.parent / _TRAINING).get("model") or model.name
+    needed = [f"`{config[key]}`" for key in ("lights", "normals") if config.get(key) not in (None, "", TRUE_LIGHTS)]
+    return {"preset": {**again, "runs": {run: {"base": str(base), **config}}}, "recorded": "", "needed": needed}
 
 
 def _plain(file: Path) -> dict[str, Any]:
@@ -135,106 +135,62 @@ def _plain(file: Path) -> dict[str, Any]:
     return values if isinstance(values, dict) else {}
 
 
-def _front_matter(source: _Sources) -> str:
+def _front_matter(model: TrainedModel, name: str, scores: Mapping[str, float], *, pretrained: bool) -> dict[str, Any]:
+    licence = {"license_name": "terms-of-the-training-data"}
+    if pretrained:
+        licence = {"license_name": "research-use", "license_link": "LICENSE-DATA"}
+    kind = "surface-normals" if "normal" in _GIVES[model.role] else "lighting"
     values: dict[str, Any] = {
         "library_name": "sdps",
-        "license": "unknown",
+        "license": "other",
+        **licence,
         "pipeline_tag": "image-to-image",
-        "tags": ["photometric-stereo", "surface-normals" if "normal" in _GIVES[source.model.role] else "lighting",
-                 "synthetic", source.model.name],
-    }  # fmt: skip
-    found = _metrics(source)
-    if found:
-        task = {"type": "image-to-image", "name": "uncalibrated photometric stereo"}
-        data = {"type": "rendered", "name": f"manifest {str(source.model.metadata.get('data', UNKNOWN))[:12]}",
-                "split": "val"}  # fmt: skip
-        scores = [{"type": name, "value": round(value, 4)} for name, value in found.items()]
-        result = {"task": task, "dataset": data, "metrics": scores}
-        values["model-index"] = [{"name": Path(source.file).stem, "results": [result]}]
-    return f"---\n{yaml.safe_dump(values, sort_keys=False)}---\n"
+        "tags": ["photometric-stereo", kind, "synthetic", model.name],
+    }
+    if scores:
+        result = {
+            "task": {"type": "image-to-image", "name": "uncalibrated photometric stereo"},
+            "dataset": {
+                "type": "rendered",
+                "name": f"manifest {str(model.metadata.get('data', UNKNOWN))[:12]}",
+                "split": "val",
+            },
+            "metrics": [{"type": key, "value": round(value, 4)} for key, value in scores.items()],
+        }
+        values["model-index"] = [{"name": name, "results": [result]}]
+    return values
 
 
-def _about(source: _Sources) -> str:
-    entry, model = registry.entry(source.model.name), source.model
-    lights = model.metadata.get("lights") or entry.lights
-    rows = [
-        ("model", f"`{model.name}`: {entry.summary}"),
-        ("gives", _GIVES[entry.role]),
-        ("parameters", f"{parameter_count(model.network):,}"),
-        ("row of the paper's tables (SDPS-Net, CVPR 2019)", entry.paper or "none"),
-        ("lights it was trained on", {TRUE_LIGHTS: "the true ones", "": "does not apply", "none": "it is told none"}
-         .get(lights, f"those of `{lights}`")),
-        ("reconstruction", f"the paper leaves open, and this project decided: {entry.reconstruction}"
-         if entry.reconstruction else "no; layers as published or derived from them"),
-        ("options of the network", _value(model.options) if model.options else "defaults"),
-        ("weights", f"`{source.file}` (safetensors, {source.stored}); loading runs no code"),
-    ]  # fmt: skip
-    return f"{entry.summary}.\n\n" + markdown_table(("what", "value"), rows)
-
-
-def _input(model: TrainedModel) -> str:
-    """Say what the network takes, from its own attributes and the exposure of its training."""
-    network, augmentation = model.network, model.augmentation()
-    low, high = augmentation.intensity_range
-    mask = getattr(network, "use_mask", False) or getattr(network, "needs_mask", False)
-    lines = [
-        "Images (L, H, W, 3) of linear radiance, of any overall scale, and the object's mask (H, W); see below for "
-        "how to call it.",
-        "Frame: x right, y up, z to the camera, for normals and lights. A light direction points from the surface to "
-        "the light.",
-        f"Exposure `{augmentation.exposure}`, to which `sdps.inference.estimator` brings the images: "
-        + (f"mean over the object {augmentation.mean_level:g}, clipped at {augmentation.clip:g}."
-           if augmentation.exposure == "mean" else f"as published, clipped at {augmentation.clip:g} in training."),
-        f"Relative light intensities from {low:g} to {high:g}.",
-        f"The mask {'is an input of the network' if mask else 'is no input of the network'}.",
-    ]  # fmt: skip
-    if model.role in ("lighting", "second"):
-        lines.append("The network sees 128x128; larger images are shrunk.")
-    if getattr(network, "needs_lights", False):
-        lines.append("It is told the light directions, and images are divided by the light intensities.")
-    if getattr(network, "per_pixel", False):
-        lines.append("Images are divided by each pixel's norm over the lights.")
-    return "## What it expects\n\n" + "".join(f"- {line}\n" for line in lines)
-
-
-def _training(source: _Sources) -> str:
-    metadata, rows = source.model.metadata, source.rows
+def _training(metadata: Mapping[str, Any], rows: Rows) -> list[tuple[str, str]]:
+    """List what the weights and the metrics tell about the run."""
     seconds, step = metadata.get("seconds"), metadata.get("step")
+    loss = [row["loss"] for row in rows if "loss" in row]
     facts = [
         ("optimiser steps", UNKNOWN if step is None else f"{step:,}"),
         ("hours", UNKNOWN if seconds is None else f"{seconds / 3600:.2f}"),
         ("computed in", _computed(metadata)),
         ("images per second", _mean(rows, "images_per_second", "{:.0f}")),
         ("share of time waiting for data", _mean(rows, "waiting_share", "{:.1%}")),
-        ("last training loss", _last(rows, "loss")),
+        ("last training loss", f"{loss[-1]:.4g}" if loss else UNKNOWN),
         ("code version (hash of the package's source)", f"`{metadata.get('code', UNKNOWN)}`"),
     ]
     for use in ("lighting", "normals"):
         if isinstance(metadata.get(use), Mapping):
             facts.append((f"frozen {use} model it was trained with", _value(metadata[use])))
-    settings = [(f"`{name}`", _value(value)) for name, value in _flat(metadata["config"])]
-    return (
-        f"## How it was trained\n\n{markdown_table(('what', 'value'), facts)}\nAll settings, resolved:\n\n"
-        f"{markdown_table(('setting', 'value'), settings)}"
-    )
+    return facts
 
 
-def _data(model: TrainedModel, folder: Path | None) -> str:
+def _data(model: TrainedModel, folder: Path | None) -> list[tuple[str, Any]]:
     """Tell the composition of the data folder, if it is at hand and the one trained on."""
-    digest = model.metadata.get("data")
+    digest, scenes = model.metadata.get("data"), model.metadata.get("scenes")
     rows: list[tuple[str, Any]] = [("SHA-256 of the manifest", f"`{digest}`" if digest else UNKNOWN)]
-    if model.metadata.get("scenes") is not None:
-        rows.append(("scenes per epoch", f"{model.metadata['scenes']:,}"))
-    note = ""
+    if scenes is not None:
+        rows.append(("scenes per epoch", f"{scenes:,}"))
     if folder is None:
-        rows.append(("composition", UNKNOWN))
-    elif digest and digest != file_hash(folder / MANIFEST):
-        rows.append(("composition", f"{UNKNOWN}; the data folder at hand has another manifest now"))
-    else:
-        rows += _composition(read_manifest(folder))
-        if (folder / _DATASET_CARD).is_file():
-            note = f"\nThe data folder's own `{_DATASET_CARD}` tells how the scenes were made.\n"
-    return f"## Data\n\n{markdown_table(('what', 'value'), rows)}{note}"
+        return [*rows, ("composition", UNKNOWN)]
+    if digest and digest != file_hash(folder / MANIFEST):
+        return [*rows, ("composition", f"{UNKNOWN}; the data folder at hand has another manifest now")]
+    return [*rows, *_composition(read_manifest(folder))]
 
 
 def _composition(scenes: Sequence[SceneSpec]) -> list[tuple[str, str]]:
@@ -249,21 +205,6 @@ def _composition(scenes: Sequence[SceneSpec]) -> list[tuple[str, str]]:
     ]
 
 
-def _validation(source: _Sources) -> str:
-    """List the validation figures with their definitions."""
-    found = _metrics(source)
-    if not found:
-        return f"## Validation\n\n{UNKNOWN.capitalize()}: the run had no validation scenes.\n"
-    config = source.model.metadata["config"]
-    rows = [(name, f"{value:.4g}", *_defined(name), _best(source.rows, name)) for name, value in found.items()]
-    header = ("metric", "value", "unit", "definition", "best during the run")
-    scenes, images = (config.get(name, UNKNOWN) for name in ("validation_scenes", "images"))
-    return (
-        f"## Validation\n\nMeans over at most {scenes} scenes of split `val`, which training does not see, {images} "
-        f"images of each, augmented like those of training.\n\n{markdown_table(header, rows)}"
-    )
-
-
 def _defined(name: str) -> tuple[str, str]:
     """Return unit and definition of a metric."""
     for key, (unit, text) in _DEFINITIONS.items():
@@ -271,86 +212,6 @@ def _defined(name: str) -> tuple[str, str]:
             how = _READ_OUTS.get(name.removeprefix(f"{key}_"))
             return unit or "-", f"{text}; {how}" if how else text
     return UNKNOWN, UNKNOWN
-
-
-def _licences(folder: Path | None, terms: Sequence[tuple[str, str, str]]) -> str:
-    text = "The licence of these weights is not stated. What they were trained on has terms of its own.\n\n"
-    if terms:
-        return "## Licences\n\n" + text + markdown_table(("materials", "source", "terms"), terms)
-    card = ""
-    if folder is not None and (folder / _DATASET_CARD).is_file():
-        found = re.search(
-            r"^## Licences\n(.*?)(?=^## |\Z)", read_text(folder / _DATASET_CARD), re.DOTALL | re.MULTILINE
-        )
-        card = found.group(1).strip() if found else ""
-    if card:
-        return f"## Licences\n\n{text}From the card of the data:\n\n{card}\n"
-    return (
-        f"## Licences\n\n{text}Terms of the materials and shapes: {UNKNOWN} here; `sdps data card` writes them into "
-        "the data folder. Built-in materials with the names of measured ones are fits to the MERL BRDF database: "
-        "research use, cite Matusik et al., A Data-Driven Reflectance Model, SIGGRAPH 2003.\n"
-    )
-
-
-def _repeat(source: _Sources) -> str:
-    """Give a preset that resolves to this run's settings, and the command that trains it."""
-    if source.preset:
-        return _repeat_all(source)
-    config = source.model.metadata["config"]
-    preset = {"name": "repeat", "description": f"Trains {source.run} again.", "train": [source.run],
-              "runs": {source.run: {"base": source.base, **config}}}  # fmt: skip
-    needed = [f"`{config[key]}`" for key in ("lights", "normals") if config.get(key) not in (None, "", TRUE_LIGHTS)]
-    first = f" It needs {' and '.join(needed)} in `OUT/models`, and trains what is missing first." if needed else ""
-    text = yaml.safe_dump(preset, sort_keys=False, width=120)
-    return (
-        f"## How to repeat it\n\nSave this as `repeat.yaml` and run `sdps train --preset repeat.yaml --data DATA --out "
-        f"OUT`, with the data folder above as DATA.{first}\n\n```yaml\n{text}```\n"
-    )
-
-
-def _repeat_all(source: _Sources) -> str:
-    """Give the preset that was trained with, for data, this run, and those whose weights it needs."""
-    kept = {name: value for name, value in source.preset.items() if name != "test"}
-    preset = {**kept, "name": "repeat", "description": f"Trains {source.run} again.", "train": [source.run]}
-    text = yaml.safe_dump(preset, sort_keys=False, width=120)
-    return (
-        "## How to repeat it\n\nSave this as `repeat.yaml`; it is the preset "
-        f"`{source.preset.get('name', UNKNOWN)}` with all settings as they were. `sdps render-data --preset "
-        "repeat.yaml --out OUT` makes the data again, `sdps train --preset repeat.yaml --out OUT` trains this run, "
-        f"after those whose weights it needs.\n\n```yaml\n{text}```\n"
-    )
-
-
-def _load(source: _Sources) -> str:
-    """Give a Python snippet that uses the weights."""
-    role, entry = source.model.role, registry.entry(source.model.name)
-    files = {
-        "lighting": (f'lighting="{source.file}", normals="nenet.safetensors"', ""),
-        "second": (f'lighting="{entry.lights}.safetensors", '
-                   f'normals="{entry.normals}.safetensors", second="{source.file}"', ""),
-        "normals": (f'lighting="lcnet.safetensors", normals="{source.file}"', ", lights, intensities"),
-        "pixels": (f'lighting="lcnet.safetensors", normals="{source.file}"', ", lights, intensities"),
-    }  # fmt: skip
-    arguments, known = files[role]
-    note = "  # leave lights, intensities out to have them estimated" if known else ""
-    if role in ("normals", "pixels") and not getattr(source.model.network, "needs_lights", role == "pixels"):
-        arguments, known, note = f'normals="{source.file}"', "", ""
-    return f"""## How to load it
-
-```python
-from sdps.inference import load_estimator
-
-estimator = load_estimator({arguments})
-# images (L, H, W, 3) float, linear; mask (H, W) bool
-estimate = estimator.estimate(images, mask{known}){note}
-```
-"""
-
-
-def _metrics(source: _Sources) -> dict[str, float]:
-    """Return the validation figures of the weights by name, without `val_`."""
-    recorded = source.model.metadata.get("metrics") or {}
-    return {name.removeprefix("val_"): float(value) for name, value in recorded.items()}
 
 
 def _best(rows: Rows, name: str) -> str:
@@ -361,11 +222,6 @@ def _best(rows: Rows, name: str) -> str:
 def _mean(rows: Rows, name: str, form: str) -> str:
     values = [row[name] for row in rows if name in row]
     return form.format(sum(values) / len(values)) if values else UNKNOWN
-
-
-def _last(rows: Rows, name: str) -> str:
-    values = [row[name] for row in rows if name in row]
-    return f"{values[-1]:.4g}" if values else UNKNOWN
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
