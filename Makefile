@@ -100,7 +100,7 @@ infer: OUT = out/infer
 infer: $(READY)
 	$(SDPS) infer '$(PHOTOS)' --out $(OUT) $(if $(METHOD),--method '$(METHOD)') $(if $(RUNS),--models $(RUNS))
 
-# Weights of finished runs into assets/weights; then their tables, there and in the README. DATA: DiLiGenT's folder.
+# Weights of finished runs into assets/weights; then their tables, there and in docs/results.md. DATA: DiLiGenT's folder.
 ship: PRESET = ship
 ship: $(READY)
 	$(SDPS) ship --preset $(PRESET) --out $(OUT) $(if $(MODELS),--models '$(MODELS)')
@@ -110,7 +110,7 @@ shipped-results: PRESET = ship
 shipped-results: $(ASSETS_READY)
 	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) --set 'test.shipped=[all]' $(SETTINGS)
 	$(if $(DATA),$(SDPS) eval-diligent '$(DATA)' --out $(OUT) --methods '$(or $(METHODS),learned)')
-	$(SDPS) shipped-results --out $(OUT) --readme README.md
+	$(SDPS) shipped-results --out $(OUT) --page docs/results.md
 
 report: $(READY)
 	$(SDPS) report $(OUT)

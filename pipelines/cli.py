@@ -60,7 +60,7 @@ COMMANDS: dict[str, Command | Group] = {
     "eval-photos": Command("benchmarks.eval_photos", "score uncalibrated methods on real photographs"),
     "curves": Command("train.compare_curves", "draw learning curves of runs, and where they are heading"),
     "ship": Command("train.ship", "copy trained weights to where commands find them without being told"),
-    "shipped-results": Command("evaluate.shipped_results", "write down how good the pretrained weights are"),
+    "shipped-results": Command("report.shipped_results", "write down how good the pretrained weights are"),
     "report": Command("report.page", "collect everything evaluated into one page"),
     "regenerate": Command("rendering.regenerate", "render test scenes of chosen shapes and materials"),
     "fit-material": Command("rendering.fit_material", "fit the built-in model to a MERL .binary table"),

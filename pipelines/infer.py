@@ -167,7 +167,8 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
             ("integrability, RMS residual", f"{result.depth.residual:.2f}°")]  # fmt: skip
     if result.residuals is not None:
         rows.append(("photographs against Lambert's law, relative RMS", f"{result.residuals.overall:.3f}"))
-    tables = [checks, Table(title="Figures", header=("what", "value"), rows=tuple(rows))]
+    note = f"Terms of the weights: {facts['terms']}." if facts["terms"] else ""
+    tables = [checks, Table(title="Figures", header=("what", "value"), rows=tuple(rows), note=note)]
     if len(result.light_directions):
         gains = result.gains
         gains = gains if gains.ndim == 1 else gains.mean(1)

@@ -133,6 +133,7 @@ class Inference:
         facts = {
             "method": self.method,
             "weights": {name: str(path) for name, path in self.files.items()},
+            "terms": pretrained.terms(self.files.values()),
             "images": len(photos),
             "size": list(photos.shape),
             "bits": photos.bits,

@@ -1,5 +1,6 @@
 """Where trained weights lie: in the folder of the runs that made them, or shipped with the package."""
 
+from collections.abc import Iterable
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -14,6 +15,8 @@ SHIPPED = "shipped:"
 
 ALL = ("all",)
 """Where names of pretrained ways are asked for: every one."""
+TERMS = "research use: weights trained on materials fitted to MERL data, LICENSE-DATA"
+"""Terms of the weights shipped with the package."""
 _SUFFIX = ".safetensors"
 
 
@@ -25,6 +28,12 @@ def shipped_folder() -> Path:
 def shipped() -> list[str]:
     """Return the names of the shipped weights."""
     return sorted(path.stem for path in shipped_folder().glob(f"*{_SUFFIX}"))
+
+
+def terms(files: Iterable[Path]) -> str:
+    """Return the terms of use of weights files, as far as shipped ones are among them; else empty."""
+    folder = shipped_folder().resolve()
+    return TERMS if any(file.resolve().parent == folder for file in files) else ""
 
 
 def trained(out: Path | None) -> list[str]:

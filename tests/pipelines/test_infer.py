@@ -17,6 +17,7 @@ from sdps_scenes import hemisphere_lights
 
 from pipelines.bench import bench_infer
 from pipelines.cli import build_parser, main
+from pipelines.infer import write_page
 from pipelines.shared.machines import HERE, kinds
 from render.shared.config import to_plain
 from render.shared.errors import InputError
@@ -111,6 +112,7 @@ def test_all_files_say_the_same(hills: tuple, tmp_path: Path, capsys) -> None:
         assert len(trimesh.load(tmp_path / f"mesh.{suffix}", force="mesh", process=False).faces) == len(surface.faces)
     facts = json.loads((tmp_path / "result.json").read_text())
     assert facts["method"] == "factorisation" and facts["mask"] == "file" and facts["images"] == 16
+    assert facts["terms"] == ""  # no weights
     page = (tmp_path / "report.html").read_text()
     assert not re.search(r"(src|href)=\"(?!data:|#)", page) and page.count("data:image/png") >= 10
 
@@ -140,6 +142,18 @@ def test_networks_with_and_without_known_lights(hills: tuple, tmp_path: Path, ca
     config = InferenceConfig(light_views=1)
     only = infer(load(folder), "lcnet+least-squares", models=models, config=config)
     assert only.method == "lcnet + least-squares" and only.normals[mask].any()
+
+
+def test_the_terms_of_pretrained_weights_are_told(
+    hills: tuple, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    models = random_models(tmp_path / "runs")
+    result = infer(load(hills[0]), "sdps", models=models)
+    assert result.summary()["terms"] == ""
+    monkeypatch.setattr(pretrained, "shipped_folder", lambda: models / "models" / "lcnet")
+    assert result.summary()["terms"] == pretrained.TERMS and "research use" in pretrained.TERMS
+    page = write_page(tmp_path / "page.html", result).read_text()
+    assert "research use: weights trained on materials fitted to MERL data, LICENSE-DATA" in page
 
 
 def test_a_method_means_the_same_to_photographs_as_to_benchmarks(

@@ -167,6 +167,18 @@ def test_licences_that_are_no_identifier(folder, license, expected):
     assert expected.items() <= parts_of(folder)[0].items()
 
 
+def test_names_break_no_table(folder):
+    shard = sphere_shard(name="a")
+    write_folder(folder, [shard], [scene_of(shard, shape="meshes/<i>&|.ply", split="va|l")])
+    write_card(folder, "Tiny <b> & | co")
+    front, text = parts_of(folder)
+    assert front["pretty_name"] == "Tiny <b> & | co" and r"# Tiny &lt;b&gt; &amp; \| co" in text
+    assert r"| &lt;i&gt;&amp;\|.ply | 1 | 1 | 1 |" in text and r"| va\|l | 1 |" in text
+    assert "| `shards/<id>.exr` |" in text  # code is left as it is
+    for rows in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        assert len({len(re.findall(r"(?<!\\)\|", row)) for row in rows.splitlines()}) == 1, rows
+
+
 def test_the_validation_is_quoted_and_a_stale_one_told(folder):
     assert main(["data", "validate", str(folder)]) == 0
     write_card(folder)

@@ -13,7 +13,7 @@ from PIL import Image
 from pipelines.cli import main
 from pipelines.data import preview_plots
 from pipelines.data.data_preview import ON_PAGE, PER_SHEET, preview
-from pipelines.data.preview_page import BUDGET, scene_gallery
+from pipelines.data.preview_page import BUDGET, gallery
 from pipelines.shared import pictures
 from render.planning.composition import category, components, compose, family, light_directions
 from render.records.manifest import View
@@ -88,8 +88,8 @@ def test_the_page_stays_small():
     """Noise is the worst case for the encoder."""
     noise = np.random.default_rng(0).integers(0, 256, (128, 512, 3), dtype=np.uint8)
     scene = scene_of(sphere_shard())
-    assert len(scene_gallery([(scene, noise)] * 2)) > 0.02 * BUDGET
-    assert len(scene_gallery([(scene, noise)] * ON_PAGE)) <= BUDGET
+    sizes = [sum(len(uri) for _, uri, _, _ in gallery([(scene, noise)] * count)) for count in (2, ON_PAGE)]
+    assert sizes[0] > 0.02 * BUDGET and sizes[1] <= BUDGET
 
 
 def test_partly_rendered_and_damaged_folders(tmp_path):
@@ -100,6 +100,17 @@ def test_partly_rendered_and_damaged_folders(tmp_path):
     preview(tmp_path)
     page = page_of(tmp_path)
     assert page.images == 2 and "3 of 4" in page.text and f"1 shards could not be read ({scenes[2].id})" in page.text
+
+
+def test_names_break_no_page(tmp_path):
+    name = "<b>&|$x$"
+    shard = sphere_shard()
+    write_folder(tmp_path, [shard], [scene_of(shard, shape=f"meshes/{name}.ply", material=name, split='val"')])
+    (tmp_path / "config.yaml").write_text(f"name: '{name}'\ndescription: a & b\n")
+    preview(tmp_path)
+    page = page_of(tmp_path)
+    assert page.open == [] and page.images == 1 and page.text.count(name) >= 6
+    assert "<b>&" not in (tmp_path / "preview.html").read_text() and "&amp;amp;" not in page.text
 
 
 def test_failures_and_validation_are_told(tmp_path):

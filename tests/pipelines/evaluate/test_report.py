@@ -1,6 +1,7 @@
 """The page of everything evaluated: sections on disk, one self-contained file, whole in a browser, phone and print."""
 
 import html
+import json
 import re
 import shutil
 import subprocess
@@ -64,6 +65,31 @@ def test_the_page_is_one_file_and_escapes_what_it_shows(out: Path, capsys: pytes
     assert page.count("data:image/png;base64,") == 8
     assert not re.search(r"(src|href)=\"(?!data:|#)", page) and "<script" not in page
     assert page.count('class="published"') == 1 and "<code>sdps x</code>" in page
+
+
+def test_names_break_no_page(tmp_path: Path) -> None:
+    name = '<b>&|"'
+    table = Table(title=name, header=(name, "n"), rows=((name, "1"),), note=name)
+    writer = SectionWriter(Section(name="x", title=name, text=name, command=name, tables=(table,)))
+    writer.strip(name, [(name, np.zeros((8, 8, 3), np.uint8))])
+    writer.write(tmp_path)
+    render(tmp_path / "page.html", [tmp_path], name, name)
+    body = (tmp_path / "page.html").read_text().partition("<body>")[2]
+    assert body.count(html.escape(name).replace("&quot;", "&#34;")) == 13 and "<b>" not in body and '"">' not in body
+
+
+def test_learning_curves_are_shown(tmp_path: Path) -> None:
+    for name, seconds in (("lcnet", 60.0), ("nenet", 30.0)):
+        (tmp_path / "models" / name).mkdir(parents=True)
+        rows = [{"step": k, "seconds": seconds * k, "loss": 1 / k, "val_normal_mae": 9 / k} for k in (1, 2, 3)]
+        (tmp_path / "models" / name / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (tmp_path / "models" / "begun").mkdir()
+    (tmp_path / "models" / "begun" / "metrics.jsonl").write_text("")
+    render(tmp_path / "page.html", [tmp_path], "Title", "")
+    page = (tmp_path / "page.html").read_text()
+    for text in ("normals, degrees", "lcnet: training loss", "nenet: training loss"):
+        assert f'alt="{text} over training"' in page
+    assert page.count("data:image/png;base64,") == 3 and '<a href="#s0">Training</a>' in page
 
 
 def test_what_is_missing_is_one_line(out: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

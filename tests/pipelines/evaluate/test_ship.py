@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pipelines import cli
-from pipelines.evaluate import shipped_results
+from pipelines.report import shipped_results
 from pipelines.train.ship import ship
 from render.shared.config import to_plain
 from render.shared.errors import InputError
@@ -46,7 +46,7 @@ def test_shipped_weights_are_halves_with_card_and_curve(tmp_path: Path, kept: Pa
     )
     assert all(torch.equal(after[name], value.half().float()) for name, value in before.items())
     card = (kept / "lcnet.md").read_text()
-    assert "8.8 MB as float16" in card and "4,409,692" in card
+    assert "8.8 MB as float16" in card and "4,409,692" in card and "license_name: research-use" in card
     written = {path: path.read_bytes() for path in kept.iterdir()}
     ship(["lcnet"], tmp_path / "run", kept)
     assert all(path.read_bytes() == data for path, data in written.items())  # git sees nothing new
@@ -85,12 +85,12 @@ def evaluation(out: Path, used: Path) -> None:
         (out / name / "results.json").write_text(json.dumps(values))
 
 
-def test_results_go_beside_the_weights_and_into_the_readme(tmp_path: Path, kept: Path) -> None:
+def test_results_go_beside_the_weights_and_into_a_page(tmp_path: Path, kept: Path) -> None:
     save_weights(kept / "lcnet.safetensors", load_weights(finished_run(tmp_path / "run")), half=True)
     evaluation(tmp_path / "out", kept / "lcnet.safetensors")
-    page = tmp_path / "README.md"
+    page = tmp_path / "results.md"
     page.write_text(f"before\n{shipped_results.BEGIN}\nold\n{shipped_results.END}\nafter\n")
-    command = ["shipped-results", "--out", str(tmp_path / "out"), "--readme", str(page)]
+    command = ["shipped-results", "--out", str(tmp_path / "out"), "--page", str(page)]
     assert cli.main(command) == 0
     text = (kept / "RESULTS.md").read_text()
     assert "2 scenes (sphere; 2 materials), 64 samples a pixel, 5 draws of light intensities" in text
@@ -117,7 +117,7 @@ def test_results_of_other_weights_and_pages_without_marks_are_refused(
     evaluation(tmp_path / "again", kept / "lcnet.safetensors")
     page = tmp_path / "page.md"
     page.write_text("no marks")
-    assert cli.main(["shipped-results", "--out", str(tmp_path / "again"), "--readme", str(page)]) == 2
+    assert cli.main(["shipped-results", "--out", str(tmp_path / "again"), "--page", str(page)]) == 2
     assert "has no marks" in capsys.readouterr().err
     assert page.read_text() == "no marks" and not (kept / "RESULTS.md").exists()
     assert cli.main(["shipped-results", "--out", str(tmp_path / "none")]) == 2

@@ -15,6 +15,7 @@ from render.records.manifest import MANIFEST
 from render.records.shards import file_hash
 from render.shared.config import to_plain, to_yaml
 from render.shared.errors import InputError
+from sdps.methods import pretrained
 from sdps.models.checkpoint import TrainedModel, load_weights, save_weights
 from sdps.models.registry import create
 from sdps.publishing.model_card import UNKNOWN, render_card, write_model_card
@@ -128,6 +129,32 @@ def test_terms_come_from_the_caller_or_the_data_card(tmp_path: Path, data: Path)
     assert "chrome: research use." in text
     assert "many" not in text
     assert "| teflon | its source | its terms |" in render_card(weights, data, [("teflon", "its source", "its terms")])
+
+
+def test_licences(tmp_path: Path, data: Path) -> None:
+    weights = write_run(tmp_path, data)
+    text = render_card(weights, data)
+    assert front_matter(text)["license_name"] == "terms-of-the-training-data"
+    assert "as the terms of the training data's materials allow; those fitted to MERL: research use" in text
+    text = render_card(weights, data, shipped=weights)
+    assert {"license": "other", "license_name": "research-use", "license_link": "LICENSE-DATA"}.items() <= front_matter(
+        text
+    ).items()
+    assert "research use only (`LICENSE-DATA`)" in text and "MIT (`LICENSE`)" in text
+
+
+def test_pretrained_weights_say_the_same() -> None:
+    """Their cards were not all written by the template as it is now."""
+    cards = sorted(pretrained.shipped_folder().glob("*net*.md")) + sorted(pretrained.shipped_folder().glob("psfcn.md"))
+    assert len(cards) == len(pretrained.shipped())
+    for card in cards:
+        text = card.read_text()
+        assert front_matter(text)["license_name"] == "research-use" and "research use only (`LICENSE-DATA`)" in text
+
+
+def test_names_break_no_table(tmp_path: Path) -> None:
+    text = render_card(write_run(tmp_path, None), terms=[("<b>&|", "x", "y")])
+    assert r"| &lt;b&gt;&amp;\| | x | y |" in text
 
 
 @pytest.mark.parametrize(

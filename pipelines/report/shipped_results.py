@@ -1,4 +1,4 @@
-"""`sdps shipped-results`: what the shipped weights were measured to do, as Markdown beside them and in the README.
+"""`sdps shipped-results`: what the shipped weights were measured to do, as Markdown beside them and in the docs.
 
 Reads the `results.json` of `sdps eval-merltest` and, where there is one, of `sdps eval-diligent` in one folder that
 holds no models of its own, so that every learned row is a shipped one. `make shipped-results` runs all three.
@@ -7,13 +7,14 @@ holds no models of its own, so that every learned row is a shipped one. `make sh
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from render.records.shards import file_hash
 from render.shared.errors import InputError
-from render.shared.files import markdown_table, read_text, write_text
+from render.shared.files import read_text, write_text
+from render.shared.templates import fill
 from sdps.methods import pretrained
 
 BEGIN, END = "<!-- shipped results: begin -->", "<!-- shipped results: end -->"
@@ -23,6 +24,7 @@ _COMPARED = ("SDPS-Net", "LCNet_reg + NENet", "UPS-FCN deep+mask", "LCNet", "LCN
 """Published rows of DiLiGenT that stand beside ours."""
 
 _PAPERS_OWN = ("A0", "B1")
+_TEMPLATE = Path(__file__).with_name("shipped_results.md.j2")
 
 Table = Mapping[str, Sequence[Any]]
 
@@ -32,18 +34,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/shipped"),
                         help="--out of eval-merltest and eval-diligent (default: out/shipped)")  # fmt: skip
     parser.add_argument("--into", type=Path, default=None, help="folder (default: the package's own, assets/weights)")
-    parser.add_argument("--readme", type=Path, default=None,
-                        help="page whose part between the marks is replaced (default: none)")  # fmt: skip
+    parser.add_argument("--page", "--readme", type=Path, default=None,
+                        help="page to write between its marks, such as docs/results.md (default: none)")  # fmt: skip
 
 
 def main(args: argparse.Namespace) -> int:
     """Write <into>/RESULTS.md, and the same tables into the page."""
     text = results_text(args.out)
     file = (args.into or pretrained.shipped_folder()) / RESULTS
-    page = replaced(args.readme, text) if args.readme else None  # a page without marks is refused before anything
+    page = replaced(args.page, text) if args.page else None  # a page without marks is refused before anything
     write_text(file, f"# What the shipped weights do\n\n{text}")
     if page is not None:
-        write_text(args.readme, page)
+        write_text(args.page, page)
     sys.stdout.write(f"{file}\n")
     return 0
 
@@ -55,25 +57,18 @@ def results_text(out: Path) -> str:
         InputError: no evaluation of MERL-Test there, or one of weights that are not the shipped ones.
     """
     merltest = _read(out / "eval" / "results.json", "run `make shipped-results`")
-    config = merltest["config"]
-    scenes = merltest["scenes"]
-    shapes = ", ".join(dict.fromkeys(scene["shape"] for scene in scenes))
-    about = (
-        f"MERL-Test, regenerated: {len(scenes)} scenes ({shapes}; {len({s['material'] for s in scenes})} materials), "
-        f"{config['spp']} samples a pixel, {config['repeats']} draw{'s' if config['repeats'] > 1 else ''} of light "
-        f"intensities each. {merltest['networks']} In brackets the paper's figure, of its own rendering."
-    )
-    parts = [about, *(_markdown(title, _measured(table)) for title, table in merltest["tables"].items())]
-    files = dict(merltest["weights"])
     real = out / "diligent" / "results.json"
-    if real.is_file():
-        diligent = _read(real, "run `make shipped-results DATA=...`")
-        bits = diligent["protocol"]["bits"]
-        parts.append(f"Real photographs, DiLiGenT, {bits} bits, {', '.join(diligent['objects'])}:")
-        parts += [_markdown(title, _compared(table)) for title, table in diligent["tables"].items()]
-        files |= diligent["weights"]
-    parts.append(_weights(files))
-    return "\n\n".join(parts) + "\n"
+    diligent = _read(real, "run `make shipped-results DATA=...`") if real.is_file() else {}
+    return fill(
+        _TEMPLATE,
+        config=merltest["config"],
+        scenes=merltest["scenes"],
+        networks=merltest["networks"],
+        merltest={title: _measured(table) for title, table in merltest["tables"].items()},
+        real=diligent,
+        diligent={title: _compared(table) for title, table in diligent.get("tables", {}).items()},
+        weights=_digests({**merltest["weights"], **diligent.get("weights", {})}.values()),
+    )
 
 
 def _read(path: Path, remedy: str) -> dict[str, Any]:
@@ -108,23 +103,19 @@ def _compared(table: Table) -> Table:
     return {"header": [table["header"][k] for k in kept], "rows": [[row[k] for k in kept] for row in rows]}
 
 
-def _markdown(title: str, table: Table) -> str:
-    return f"**{title}**\n\n{markdown_table(table['header'], table['rows'])}".rstrip()
-
-
-def _weights(files: Mapping[str, str]) -> str:
-    """List the weights by digest, so that the tables cannot outlive them unnoticed.
+def _digests(files: Iterable[str]) -> dict[str, str]:
+    """Return the beginning of each weights file's SHA-256, so that the tables cannot outlive them unnoticed.
 
     Raises:
         InputError: weights from elsewhere.
     """
     folder = pretrained.shipped_folder().resolve()
-    lines = []
-    for file in sorted(map(Path, files.values())):
+    digests = {}
+    for file in sorted(map(Path, files)):
         if file.resolve().parent != folder:
             raise InputError(f"{file}: evaluated beside the shipped weights; use an --out without trained models")
-        lines.append(f"`{file.name}` {file_hash(file)[:12]}")
-    return "SHA-256 of the weights begin with: " + ", ".join(lines) + "."
+        digests[file.name] = file_hash(file)[:12]
+    return digests
 
 
 def replaced(page: Path, text: str) -> str:
