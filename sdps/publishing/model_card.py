@@ -47,12 +47,7 @@ _TEMPLATE = Path(__file__).with_name("model_card.md.j2")
 
 
 def write_model_card(
-    path: str | Path,
-    weights: str | Path,
-    data: str | Path | None = None,
-    *,
-    terms: Sequence[tuple[str, str, str]] = (),
-    shipped: str | Path | None = None,
+    path: str | Path, weights: str | Path, data: str | Path | None = None, *, shipped: str | Path | None = None
 ) -> None:
     """Write the card of trained weights; metrics and configuration of the run are looked for beside them.
 
@@ -60,21 +55,15 @@ def write_model_card(
         path: The card, by convention `MODEL_CARD.md` beside the weights.
         weights: The safetensors file, in its run's folder.
         data: The data folder trained on, for its composition.
-        terms: Rows of materials, their source and their terms of use; by default, what the data folder's card says.
         shipped: A copy of the weights, rounded, that the card is to travel with.
 
     Raises:
         InputError: weights that cannot be loaded, a damaged manifest, or an unwritable disk.
     """
-    write_text(path, render_card(weights, data, terms, shipped))
+    write_text(path, render_card(weights, data, shipped))
 
 
-def render_card(
-    weights: str | Path,
-    data: str | Path | None = None,
-    terms: Sequence[tuple[str, str, str]] = (),
-    shipped: str | Path | None = None,
-) -> str:
+def render_card(weights: str | Path, data: str | Path | None = None, shipped: str | Path | None = None) -> str:
     """Compose the card; see `write_model_card`."""
     weights, copy = Path(weights), Path(shipped or weights)
     model = load_weights(weights)
@@ -108,7 +97,6 @@ def render_card(
         data_card=card and "composition" not in dict(composition),
         scores=[(name, f"{value:.4g}", *_defined(name), _best(rows, name)) for name, value in scores.items()],
         pretrained=shipped is not None,
-        terms=terms,
         data_terms="".join(_LICENCES.findall(card)).strip(),
         **_repeat(weights, model),
     )
@@ -164,11 +152,12 @@ def _front_matter(model: TrainedModel, name: str, scores: Mapping[str, float], *
 def _training(metadata: Mapping[str, Any], rows: Rows) -> list[tuple[str, str]]:
     """List what the weights and the metrics tell about the run."""
     seconds, step = metadata.get("seconds"), metadata.get("step")
+    parts = [f"{p['precision']} on {p['device']} from step {p['step']}" for p in metadata.get("computed") or ()]
     loss = [row["loss"] for row in rows if "loss" in row]
     facts = [
         ("optimiser steps", UNKNOWN if step is None else f"{step:,}"),
         ("hours", UNKNOWN if seconds is None else f"{seconds / 3600:.2f}"),
-        ("computed in", _computed(metadata)),
+        ("computed in", "; ".join(parts) or UNKNOWN),
         ("images per second", _mean(rows, "images_per_second", "{:.0f}")),
         ("share of time waiting for data", _mean(rows, "waiting_share", "{:.1%}")),
         ("last training loss", f"{loss[-1]:.4g}" if loss else UNKNOWN),
@@ -244,12 +233,6 @@ def _value(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:g}" if isinstance(value, float) else str(value) or "empty"
-
-
-def _computed(metadata: Mapping[str, Any]) -> str:
-    """Spell what the steps were computed in."""
-    parts = metadata.get("computed")
-    return "; ".join(f"{p['precision']} on {p['device']} from step {p['step']}" for p in parts) if parts else UNKNOWN
 
 
 def _counts(counts: Mapping[Any, int]) -> str:

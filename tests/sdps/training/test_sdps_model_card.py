@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -121,14 +122,13 @@ def test_another_manifest_is_told(tmp_path: Path, data: Path) -> None:
     assert "another manifest now" in render_card(write_run(tmp_path, None), data)
 
 
-def test_terms_come_from_the_caller_or_the_data_card(tmp_path: Path, data: Path) -> None:
+def test_terms_come_from_the_data_card(tmp_path: Path, data: Path) -> None:
     weights = write_run(tmp_path, data)
     assert "Terms of the materials and shapes: not recorded" in render_card(weights, data)
     (data / "DATASET_CARD.md").write_text("# Data\n\n## Licences\n\nchrome: research use.\n\n## Known limits\n\nmany\n")
     text = render_card(weights, data)
     assert "chrome: research use." in text
     assert "many" not in text
-    assert "| teflon | its source | its terms |" in render_card(weights, data, [("teflon", "its source", "its terms")])
 
 
 def test_licences(tmp_path: Path, data: Path) -> None:
@@ -153,8 +153,9 @@ def test_pretrained_weights_say_the_same() -> None:
 
 
 def test_names_break_no_table(tmp_path: Path) -> None:
-    text = render_card(write_run(tmp_path, None), terms=[("<b>&|", "x", "y")])
-    assert r"| &lt;b&gt;&amp;\| | x | y |" in text
+    config = replace(CONFIG, lights="<b>&|", start="x|y")
+    text = render_card(write_run(tmp_path, None, name="a|b", config=config))
+    assert r"| `lights` | &lt;b&gt;&amp;\| |" in text and r"| `start` | x\|y |" in text
 
 
 @pytest.mark.parametrize(
