@@ -15,9 +15,8 @@ from pipelines.shared.charts import new_figure
 
 _INK, _FILL = "#010203", "#040506"  # replaced by CSS colours
 _STYLE = {
-    "svg.fonttype": "none", "svg.hashsalt": "sdps", "text.parse_math": False,
-    "font.size": 8, "font.family": "sans-serif", "text.color": _INK, "axes.edgecolor": _INK, "axes.labelcolor": _INK,
-    "xtick.color": _INK, "ytick.color": _INK,
+    "svg.fonttype": "none", "svg.hashsalt": "sdps", "font.size": 8, "font.family": "sans-serif",
+    "text.color": _INK, "axes.edgecolor": _INK, "axes.labelcolor": _INK, "xtick.color": _INK, "ytick.color": _INK,
     "axes.spines.top": False, "axes.spines.right": False, "figure.facecolor": "none", "axes.facecolor": "none",
     "axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6,
 }  # fmt: skip
@@ -64,6 +63,7 @@ def bars(counts: dict[str, int], title: str) -> str:
     if len(counts) > BARS:
         title = f"{title} ({BARS} of {len(counts)})"
     names = [name if len(name) < 28 else f"{name[:26]}…" for name, _ in items]
+    names = [name.replace("$", r"\$") for name in names]  # which would begin a formula
     with rc_context(_STYLE):
         figure = new_figure(3.6, 0.55 + 0.17 * max(len(items), 3))
         axes = figure.add_subplot()
