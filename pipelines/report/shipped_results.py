@@ -34,8 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/shipped"),
                         help="--out of eval-merltest and eval-diligent (default: out/shipped)")  # fmt: skip
     parser.add_argument("--into", type=Path, default=None, help="folder (default: the package's own, assets/weights)")
-    parser.add_argument("--page", "--readme", type=Path, default=None,
+    parser.add_argument("--page", type=Path, default=None,
                         help="page to write between its marks, such as docs/results.md (default: none)")  # fmt: skip
+    parser.add_argument("--readme", dest="page", type=Path, default=None, help=argparse.SUPPRESS)  # its name in 0.1
 
 
 def main(args: argparse.Namespace) -> int:
