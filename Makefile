@@ -25,14 +25,15 @@ VENV := .venv
 SDPS := $(VENV)/bin/sdps
 READY := $(VENV)/.ready
 ASSETS_READY := $(VENV)/.assets-ready
+DOCS_READY := $(VENV)/.docs-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow test-gpu lint bench bench-train bench-classical bench-infer bench-surface clean
+	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow test-gpu lint bench bench-train bench-classical bench-infer bench-surface docs clean
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo | test | lint | bench | bench-train | models | doctor"
+	@echo "make demo | test | lint | bench | bench-train | models | doctor | docs"
 	@echo "make render-data | train | eval-merltest   PRESET=smoke|demo|small|study|paper OUT=folder SET='section.field=value ...'"
 	@echo "make train MODELS=lcnet,nenet,sdps-plus   also STREAM=1: render while training, store nothing"
 	@echo "make study   every model of the paper on equal data and steps, then tables A and B"
@@ -55,6 +56,10 @@ $(ASSETS_READY): $(READY)
 	$(SDPS) doctor --fix
 	@touch $@
 
+$(DOCS_READY): $(READY)
+	$(VENV)/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[test,docs]'
+	@touch $@
+
 setup: $(ASSETS_READY)
 
 doctor: $(READY)
@@ -69,7 +74,7 @@ train: $(ASSETS_READY)
 models: $(READY)
 	$(SDPS) models
 
-# The ablation study of docs/models.md: every model, the same data and steps.
+# The study of docs/studies/model-comparison.md: every model, the same data and steps.
 study: PRESET = study
 study: $(ASSETS_READY)
 	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
@@ -100,7 +105,7 @@ infer: OUT = out/infer
 infer: $(READY)
 	$(SDPS) infer '$(PHOTOS)' --out $(OUT) $(if $(METHOD),--method '$(METHOD)') $(if $(RUNS),--models $(RUNS))
 
-# Weights of finished runs into assets/weights; then their tables, there and in the README. DATA: DiLiGenT's folder.
+# Weights of finished runs into assets/weights; then their tables, there and in docs/results.md. DATA: DiLiGenT's folder.
 ship: PRESET = ship
 ship: $(READY)
 	$(SDPS) ship --preset $(PRESET) --out $(OUT) $(if $(MODELS),--models '$(MODELS)')
@@ -110,7 +115,7 @@ shipped-results: PRESET = ship
 shipped-results: $(ASSETS_READY)
 	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) --set 'test.shipped=[all]' $(SETTINGS)
 	$(if $(DATA),$(SDPS) eval-diligent '$(DATA)' --out $(OUT) --methods '$(or $(METHODS),learned)')
-	$(SDPS) shipped-results --out $(OUT) --readme README.md
+	$(SDPS) shipped-results --out $(OUT) --readme docs/results.md
 
 report: $(READY)
 	$(SDPS) report $(OUT)
@@ -162,6 +167,10 @@ bench-infer: $(READY)
 bench-surface: OUT = out/bench-surface
 bench-surface: $(READY)
 	$(SDPS) bench-surface $(DATA) --out $(OUT)
+
+# Into out/site; nothing is fetched but the packages, once.
+docs: $(DOCS_READY)
+	$(VENV)/bin/python -m mkdocs build
 
 clean:
 	rm -rf $(VENV) out build *.egg-info
