@@ -19,6 +19,8 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
 PACKAGES = ("render", "sdps", "pipelines")
 TOPS = (*PACKAGES, "assets", "tests", "docs")
+NAMES = {path.name for top in (*PACKAGES, "tests") for path in (ROOT / top).rglob("*.py")} | {"run_model.py"}
+"""Python files of the project, and one of SDPS-Net's code."""
 README_WORDS = 900
 ENTRIES = 12
 
@@ -28,6 +30,7 @@ SPAN = re.compile(r"`([^`\n]+)`")
 PATH = re.compile(rf"(?:{'|'.join(TOPS)})/[\w./-]+")
 DOTTED = re.compile(rf"(?<![\w/.-])(?:{'|'.join(PACKAGES)})(?:\.\w+)+")
 SDPS = re.compile(r"(?:^|[\s;`(])(?<!from )(?<!import )sdps ([a-z][a-z-]*)(?: ([a-z][a-z-]*))?")
+FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 MAKE = re.compile(r"(?:^|[\s;`(])make ([a-z][a-z-]*)")
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -74,6 +77,13 @@ def _bound(node: ast.stmt) -> set[str]:
     return {part.id for part in parts if isinstance(part, ast.Name)}
 
 
+@cache
+def flags() -> set[str]:
+    """Return the flags of all commands together."""
+    code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "pipelines").rglob("*.py"))
+    return {*re.findall(r'"(--[a-z][a-z-]*)"', code), "--help"}
+
+
 def resolves(dotted: str) -> bool:
     """Return whether a dotted name is a module, a folder, or something a module defines."""
     parts = dotted.split(".")
@@ -107,6 +117,8 @@ def test_files_and_modules_named_are_there(page):
     for shown in commands_shown(text):
         for path in PATH.findall(shown):
             assert "*" in shown or (ROOT / path.rstrip("./")).exists(), f"{page.name}: {path}"
+        for name in re.findall(r"^\w+\.py$", shown):
+            assert name in NAMES, f"{page.name}: {name}"
         for dotted in DOTTED.findall(shown):
             if dotted.rpartition(".")[2] not in ("safetensors", "md", "json", "toml"):
                 assert resolves(dotted), f"{page.name}: {dotted}"
@@ -127,6 +139,7 @@ def test_commands_shown_are_there(page):
             assert name in COMMANDS, f"{page.name}: sdps {name}"
             if isinstance(COMMANDS[name], Group) and second:
                 assert second in COMMANDS[name].commands, f"{page.name}: sdps {name} {second}"
+            assert set(FLAG.findall(shown)) <= flags(), f"{page.name}: {shown}"
         for name in MAKE.findall(shown):
             assert name in targets, f"{page.name}: make {name}"
 
