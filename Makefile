@@ -170,7 +170,7 @@ bench-surface: $(READY)
 
 # Into out/site; nothing is fetched but the packages, once.
 docs: $(DOCS_READY)
-	$(VENV)/bin/python -m mkdocs build
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

@@ -19,19 +19,28 @@ from sdps.photos.response import display
 from sdps.surface.integration import integrate
 from sdps.surface.views import turned
 
-WIDTH, SIDE, GAP, TOP = 1200, 234, 22, 34
-TILE = 96
+WIDTH, SIDE, TOP, MARGIN = 1200, 234, 34, 14
+TILES, GAP = 12, 6
+TILE = (WIDTH - 2 * MARGIN + GAP) // TILES - GAP
+EXPOSURE = 2.0
 INK, PAPER = (40, 40, 48), (255, 255, 255)
 
 
 def photographs(folder: Path, rows: int, columns: int) -> Image.Image:
     files = sorted(path for path in folder.glob("*.png") if path.stem.isdigit())
     chosen = [files[k] for k in np.linspace(0, len(files) - 1, rows * columns).astype(int)]
+    mask = read_image(folder / "mask.png", channels=None) > 0
+    box = [int(edge) for axis in (1, 0) for edge in np.flatnonzero(mask.any(axis=axis))[[0, -1]]]
+    middle, half = ((box[0] + box[1]) // 2, (box[2] + box[3]) // 2), max(box[1] - box[0], box[3] - box[2]) * 27 // 50
     side = SIDE // rows
     sheet = Image.new("RGB", (columns * side, rows * side))
     for place, file in enumerate(chosen):
-        picture = display(read_image(file).astype(np.float32) / 65535)
-        sheet.paste(Image.fromarray(picture).resize((side, side)), (place % columns * side, place // columns * side))
+        values = read_image(file)[
+            max(middle[0] - half, 0) : middle[0] + half, max(middle[1] - half, 0) : middle[1] + half
+        ]
+        picture = Image.fromarray(display(np.clip(values.astype(np.float32) / 65535 * EXPOSURE, 0, 1)))
+        fitted = picture.resize((side, side), Image.Resampling.LANCZOS)
+        sheet.paste(fitted, (place % columns * side, place // columns * side))
     return sheet
 
 
@@ -90,19 +99,21 @@ def main(infer: Path, data: Path) -> None:
         ("mesh, seen from the side", Image.fromarray(turned(depth, 40.0, SIDE))),
     ]  # fmt: skip
     font = ImageFont.load_default(15)
-    columns = (WIDTH + 8) // (TILE + 8)
-    page = Image.new("RGB", (WIDTH, TOP + SIDE + 2 * TOP + 2 * (TILE + 8)), PAPER)
+    height = MARGIN + TOP + SIDE + TOP + 2 * (TILE + GAP) + MARGIN
+    page = Image.new("RGB", (WIDTH, height), PAPER)
     draw = ImageDraw.Draw(page)
-    spare = WIDTH - sum(panel.width for _, panel in panels)
-    x = 0
+    spare = WIDTH - 2 * MARGIN - sum(panel.width for _, panel in panels)
+    x = MARGIN
     for title, panel in panels:
-        draw.text((x, 8), title, fill=INK, font=font)
-        page.paste(panel, (x, TOP))
+        draw.text((x, MARGIN), title, fill=INK, font=font)
+        page.paste(panel, (x, MARGIN + TOP - 6))
         x += panel.width + spare // (len(panels) - 1)
-    below = TOP + SIDE + TOP
-    draw.text((0, below - 24), "rendered scenes the networks learn from", fill=INK, font=font)
-    for place, tile in enumerate(training_tiles(data, 2 * columns)):
-        page.paste(tile.resize((TILE, TILE)), (place % columns * (TILE + 8), below + place // columns * (TILE + 8)))
+    below = MARGIN + TOP + SIDE + TOP
+    draw.text((MARGIN, below - 26), "rendered scenes the networks learn from", fill=INK, font=font)
+    for place, tile in enumerate(training_tiles(data, 2 * TILES)):
+        row, column = divmod(place, TILES)
+        fitted = tile.resize((TILE, TILE), Image.Resampling.LANCZOS)
+        page.paste(fitted, (MARGIN + column * (TILE + GAP), below + row * (TILE + GAP)))
     page.save(Path(__file__).with_name("hero.jpg"), quality=86, optimize=True)
 
 
