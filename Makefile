@@ -115,7 +115,7 @@ shipped-results: PRESET = ship
 shipped-results: $(ASSETS_READY)
 	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) --set 'test.shipped=[all]' $(SETTINGS)
 	$(if $(DATA),$(SDPS) eval-diligent '$(DATA)' --out $(OUT) --methods '$(or $(METHODS),learned)')
-	$(SDPS) shipped-results --out $(OUT) --readme docs/results.md
+	$(SDPS) shipped-results --out $(OUT) --page docs/results.md
 
 report: $(READY)
 	$(SDPS) report $(OUT)

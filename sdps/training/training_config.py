@@ -44,7 +44,7 @@ class TrainingConfig:
         precision: `auto` (what is faster on this machine, `sdps.core.precision`), `float32`, or `bfloat16`, which
         runs the
             networks under autocast; weights and loss stay float32.
-        channels_last: Keep feature maps channels-last, which is faster on all processors tried (docs/studies/speed.md).
+        channels_last: Keep feature maps channels-last, which is faster on every processor tried (docs/training.md).
         workers: Loader processes; 0 loads in the trainer's own.
         cache: Keep decoded scenes as memory-mapped arrays in `<data>/cache`.
         rescale: Scenes larger than `size` are drawn at a random scale and cropped, instead of being shrunk whole.
