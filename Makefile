@@ -25,14 +25,15 @@ VENV := .venv
 SDPS := $(VENV)/bin/sdps
 READY := $(VENV)/.ready
 ASSETS_READY := $(VENV)/.assets-ready
+DOCS_READY := $(VENV)/.docs-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow test-gpu lint bench bench-train bench-classical bench-infer bench-surface clean
+	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow test-gpu lint bench bench-train bench-classical bench-infer bench-surface docs clean
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo | test | lint | bench | bench-train | models | doctor"
+	@echo "make demo | test | lint | bench | bench-train | models | doctor | docs"
 	@echo "make render-data | train | eval-merltest   PRESET=smoke|demo|small|study|paper OUT=folder SET='section.field=value ...'"
 	@echo "make train MODELS=lcnet,nenet,sdps-plus   also STREAM=1: render while training, store nothing"
 	@echo "make study   every model of the paper on equal data and steps, then tables A and B"
@@ -55,6 +56,10 @@ $(ASSETS_READY): $(READY)
 	$(SDPS) doctor --fix
 	@touch $@
 
+$(DOCS_READY): $(READY)
+	$(VENV)/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[test,docs]'
+	@touch $@
+
 setup: $(ASSETS_READY)
 
 doctor: $(READY)
@@ -69,7 +74,7 @@ train: $(ASSETS_READY)
 models: $(READY)
 	$(SDPS) models
 
-# The ablation study of docs/models.md: every model, the same data and steps.
+# The study of docs/studies/model-comparison.md: every model, the same data and steps.
 study: PRESET = study
 study: $(ASSETS_READY)
 	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
@@ -162,6 +167,10 @@ bench-infer: $(READY)
 bench-surface: OUT = out/bench-surface
 bench-surface: $(READY)
 	$(SDPS) bench-surface $(DATA) --out $(OUT)
+
+# Into out/site; nothing is fetched but the packages, once.
+docs: $(DOCS_READY)
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

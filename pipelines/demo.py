@@ -27,7 +27,7 @@ class Need:
     """What a run of the demo is given.
 
     Attributes:
-        images: Images it should see; with these the pair clearly beats least squares (docs/training.md).
+        images: Images it should see; with these the pair clearly beats least squares (docs/results.md).
         least, most: Limits of its minutes.
     """
 

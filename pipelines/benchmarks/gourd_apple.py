@@ -12,7 +12,7 @@ from render.shared.errors import InputError
 from render.shared.tables import read_names
 
 OBJECTS = ("apple", "gourd1", "gourd2")
-WANT = "give the folder of apple, gourd1 and gourd2, or one of them; see docs/benchmarks.md"
+WANT = "give the folder of apple, gourd1 and gourd2, or one of them; see docs/guides/benchmarks.md"
 
 
 def gourd_apple_objects(root: Path, *, refined: bool = True, longest: int = 0) -> list[TestObject]:

@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 OBJECTS = (
     "helmet_side_left", "plant_left", "knight_fighting", "knight_kneeling", "knight_standing", "helmet_front_left",
 )  # fmt: skip
-WANT = "give the folder with light_directions.txt and the objects' folders, or one of these; see docs/benchmarks.md"
+WANT = "give the folder of light_directions.txt and the objects' folders, or one; see docs/guides/benchmarks.md"
 
 _LIGHTS, _FRONT = 253, 133
 

@@ -1,7 +1,7 @@
 """Published figures for the real benchmarks, to stand beside ours, each with its source.
 
 DiLiGenT's are means over mask pixels or images, of all 96 images, from 8-bit data where the source is known
-(docs/benchmarks.md); averages are over ten objects.
+(docs/guides/benchmarks.md); averages are over ten objects.
 """
 
 from dataclasses import dataclass

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=1, help="processes (default: 1)")
     parser.add_argument("--limit", type=int, default=None, help="check at most this many shards, spread evenly")
     parser.add_argument("--json", action="store_true", help="print the report as JSON instead of the summary")
-    about = "move a threshold, e.g. min_area=0.05 (docs/data.md lists them); may be repeated"
+    about = "move a threshold, e.g. min_area=0.05 (docs/reference/checks.md lists them); may be repeated"
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="LIMIT=VALUE", help=about)
 
 

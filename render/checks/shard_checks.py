@@ -21,7 +21,7 @@ STEEP = 0.3  # n.z below which a pixel's slope changes too fast for differences 
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Thresholds of the checks; docs/data.md says why each is what it is.
+    """Thresholds of the checks; docs/reference/checks.md says why each is what it is.
 
     Attributes:
         unit_error: Largest | |v| - 1 | of normals and light directions.

@@ -1,7 +1,7 @@
 """Checks of an exported tree, or of one somebody else made, against what the loaders of its layout demand.
 
-The rules are those of docs/formats.md. Reading goes through the strict readers of this package; every violation is one
-line that starts with the file it is in.
+The rules are those of docs/reference/formats.md. Reading goes through the strict readers of this package; every
+violation is one line that starts with the file it is in.
 """
 
 from collections.abc import Iterator

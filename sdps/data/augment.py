@@ -31,7 +31,7 @@ class Augmentation:
         mean_level: Mean radiance of the object's pixels over the set after exposure (`mean`).
         mean_jitter: Uniform range of the factor on `mean_level`.
         clip: Sensor saturation. `mean` clips exposed images, `paper` the radiance as it was rendered. Unclipped
-            highlights reach hundreds; a network that sees them learns more slowly (docs/models.md has the figures).
+            highlights reach hundreds; a network that sees them learns more slowly (docs/studies/model-comparison.md).
         intensity_range: Uniform range of the light intensity of each image; the labels of LCNet.
         noise: Full width of the uniform noise added to every pixel, background included.
         biased: Share of the samples whose lights are not all around: those nearest to a random direction, at most half

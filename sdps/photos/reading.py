@@ -94,7 +94,7 @@ def load(
 ) -> Photographs:
     """Look through a folder of photographs of a static object under one distant light each, seen orthographically.
 
-    Every file is decoded once, one at a time, so that a damaged one is found now. docs/capture.md describes the folder.
+    Every file is decoded once, one at a time, so that a damaged one is found now (the folder: docs/guides/capture.md).
 
     Args:
         folder: PNG, TIFF, JPEG or EXR files of one kind and size, and what may lie beside them.

@@ -1,4 +1,4 @@
-"""Other analytic models, fitted or published, measured as the project's own is: the comparison of docs/materials.md.
+"""Other analytic models, fitted or published, measured as the project's own is (docs/studies/material-fits.md).
 
 Each is a function of (N, 3) `wi`, `wo` to the (N, 3) BRDF in 1/sr: a diffuse term with two GGX lobes per channel
 (Walter et al. 2007), Disney's principled model (Burley 2012), ABC (Low et al. 2012) and SGD (Bagher et al. 2012).

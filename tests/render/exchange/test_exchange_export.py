@@ -1,6 +1,6 @@
 """Exported trees: what the loaders of each layout get from them, names, exposure, resuming, and the rule checker.
 
-The readers here are written anew from the description of each loader (docs/formats.md), not with the package's own.
+The readers here are written anew from the description of each loader (docs/reference/formats.md), not the package's.
 """
 
 import errno

@@ -38,7 +38,7 @@ class Case:
     """One scene.
 
     Mirror-like materials need more samples before `path` meets their highlights, and shapes without flat spots: where a
-    highlight falls on one, the values of `path` are so rarely drawn that no t-test holds (docs/rendering.md).
+    highlight falls on one, the values of `path` are so rarely drawn that no t-test holds (docs/studies/renderer.md).
     """
 
     shape: str

@@ -15,7 +15,7 @@ from render.shared.errors import InputError
 
 mi = rgl_bsdf.mi
 NAMES = ("chrome", "red-plastic", "pink-fabric")
-SPREAD = {  # percent of relative RMS error on a sphere, see docs/mitsuba_scenes.md
+SPREAD = {  # percent of relative RMS error on a sphere, see docs/reference/material-model.md
     "chrome": 0.3, "steel": 0.3, "black-obsidian": 0.5, "brass": 0.3, "grease-covered-steel": 0.5, "hematite": 0.3,
     "gold-metallic-paint": 0.3, "specular-black-phenolic": 0.5, "white-marble": 0.5, "red-plastic": 1.0,
     "blue-fabric": 1.0, "pink-felt": 1.0, "polyethylene": 1.5,
@@ -140,7 +140,7 @@ def test_a_brdf_with_bad_values_is_not_written(tmp_path):
 
 @pytest.mark.parametrize("name", SPREAD)
 def test_measured_reproduces_the_material_on_a_sphere(tmp_path, name):
-    """The metric of docs/materials.md, camera as Mitsuba's wi."""
+    """The metric of docs/studies/material-fits.md, camera as Mitsuba's wi."""
     samples = spheres.sphere_image(96, spheres.hemisphere_lights(12, np.random.default_rng(5)))
     written = rgl_bsdf.PackedRgl([rgl.write(tmp_path / "a.bsdf", brdf(name))])
     value = np.array(written.eval(mi.UInt32(0), vector(samples.wo), vector(samples.wi))).T

@@ -1,4 +1,4 @@
-"""Uncalibrated methods side by side on one shadowed Lambertian hill: the figures of docs/classical.md."""
+"""Uncalibrated methods side by side on one shadowed Lambertian hill: figures of docs/studies/classical-methods.md."""
 
 import classical_scenes as scenes
 import numpy as np
