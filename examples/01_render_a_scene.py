@@ -16,7 +16,7 @@ import render
 def vase() -> trimesh.Trimesh:
     """Return a fluted vase with an inside, y up; any watertight mesh will do, and a mesh file too."""
     t = np.linspace(0.0, 1.0, 160)
-    radius = 0.3 + 0.25 * np.sin(np.pi * t) ** 2 + 0.13 * t**6
+    radius = 0.4 + 0.4 * np.sin(np.pi * t) ** 2 + 0.2 * t**6
     outside, inside = np.stack([radius, 2 * t], axis=1), np.stack([radius - 0.05, 2 * t], axis=1)[:4:-1]
     mesh = trimesh.creation.revolve(np.concatenate([[[0, 0]], outside, inside, [[0, 0.06]]]), sections=240)
     x, y, z = mesh.vertices.T
@@ -53,10 +53,10 @@ def main() -> None:
     materials = {
         "clay": "lambertian:0.75/0.6/0.5",
         "lacquer": own,
-        "striped": f"stripes:4:{own}+gold-metallic-paint",
+        "striped": f"stripes:4:{own}+pearl-paint",
     }
     # Light vectors point from the surface to the light: x right, y up, z to the camera.
-    lights = np.array([[0, 0, 1], [-1, 0.3, 1], [1, 0.3, 1], [0, 1, 0.6], [-0.6, -0.6, 1]])
+    lights = np.array([[0, 0, 1], [-1, 0.3, 1], [1, 0.3, 1], [0.2, 1, 0.9], [-0.4, -0.5, 1]])
     tipped = trimesh.transformations.rotation_matrix(np.radians(35), [1, 0, 0])[:3, :3]  # seen from above
     views = render.render_views(
         vase(), list(materials.values()), lights, size=args.size, spp=args.spp, scale=0.95, rotation=tipped

@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/example-2"))
     parser.add_argument("--size", type=int, default=64, help="image side in pixels, a multiple of 4")
     parser.add_argument("--shapes", type=int, default=8)
-    parser.add_argument("--steps", type=int, default=12, help="per network; a real run takes thousands")
+    parser.add_argument("--steps", type=int, default=60, help="per network; a real run takes thousands")
     parser.add_argument("--method", default="sdps", help="pretrained method to compare with")
     args = parser.parse_args()
 
@@ -39,11 +39,14 @@ def main() -> None:
     print(f"{len(scenes)} scenes of 16 images each in {data}, {'sound' if found.sound else found.findings}")
 
     def tell(step: int, values: dict[str, float]) -> None:
-        losses = (f"{name} {value:.3f}" for name, value in values.items() if "second" not in name)
-        print(f"  step {step}: {', '.join(losses)}")
+        shown = (f"{name} {value:.2f}" for name, value in values.items() if name == "loss" or name.endswith("_mae"))
+        print(f"  step {step}: {', '.join(shown)}")
 
-    common = {"steps": args.steps, "batch_scenes": 2, "images": 8, "schedule": "constant", "log_every": 1, "workers": 0}
-    for model, settings in (("lcnet", {"learning_rate": 5e-4}), ("nenet", {"learning_rate": 1e-3, "crop": 32})):
+    common = {
+        "steps": args.steps, "batch_scenes": 2, "images": 8, "optimiser": "muon", "schedule": "cosine", "workers": 0,
+        "log_every": max(1, args.steps // 10),
+    }  # fmt: skip
+    for model, settings in (("lcnet", {"learning_rate": 1e-3}), ("nenet", {"learning_rate": 2e-3, "crop": 32})):
         print(f"{model}:")
         result = sdps.train(model, data, args.out, on_log=tell, **common, **settings)
         print(f"  {result.steps} steps in {result.seconds:.0f} s -> {result.weights[model]}")

@@ -22,8 +22,8 @@ def save(path: Path, linear: np.ndarray) -> None:
 
 
 def photograph(folder: Path, size: int, count: int) -> render.RenderedView:
-    """Make photographs of a figure, the lights of unequal strength, and a mask; return the truth."""
-    view = render.render_view("sculpture:5", "pink-fabric", f"near-uniform:{count}", size=size, spp=32)
+    """Make photographs of a bust, the lights of unequal strength, and a mask; return the truth."""
+    view = render.render_view("sculpture:16", "white-paint", f"near-uniform:{count}", size=size, spp=32)
     strengths = np.random.default_rng(0).uniform(0.6, 1.0, count)
     exposed = view.images * strengths[:, None, None, None] / np.percentile(view.images[:, view.mask], 99.9)
     folder.mkdir(parents=True, exist_ok=True)
@@ -56,7 +56,7 @@ def main() -> None:
 
     surface = sdps.mesh(result.depth, normals=result.normals)
     sdps.write_mesh(surface, args.out / "mesh.ply")
-    lit = sdps.relit(result.normals, result.albedo, np.array([-0.8, 0.5, 0.4]), depth=result.depth)
+    lit = sdps.relit(result.normals, result.albedo, np.array([-0.7, 0.5, 0.7]), depth=result.depth)
     Image.fromarray((255 * (result.normals + 1) / 2).astype(np.uint8)).save(args.out / "normals.png")
     save(args.out / "relit.png", lit / np.percentile(lit[photos.mask], 99))
     print(f"mesh of {len(surface.faces)} triangles; see {args.out / 'relit.png'}")

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
@@ -183,8 +184,13 @@ def train(
 class _Told:
     """A logger that calls a function."""
 
-    def __init__(self, log: Callable[[int, dict[str, float]], None]) -> None:
-        self.log = log
+    def __init__(self, tell: Callable[[int, dict[str, float]], None]) -> None:
+        self.tell = tell
+
+    def log(self, step: int, values: dict[str, float]) -> None:
+        """Pass the values on, out of the way of the progress bar."""
+        with tqdm.external_write_mode():
+            self.tell(step, values)
 
     def close(self) -> None:
         """Nothing is open."""

@@ -48,8 +48,6 @@ def test_importing_loads_neither_torch_nor_mitsuba():
         "assert not {'torch', 'mitsuba', 'drjit'} & set(sys.modules)\n"
         "for name in render.__all__: getattr(render, name)\n"
         "assert not {'torch', 'mitsuba', 'drjit'} & set(sys.modules)\n"
-        "for name in sdps.__all__: getattr(sdps, name)\n"
-        "assert not {'mitsuba', 'drjit'} & set(sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -101,7 +99,7 @@ def test_materials_share_the_rays_of_a_view(tmp_path):
     render.write_shard(tmp_path / "striped.exr", striped.shard("striped"))
     read = render.read_shard(tmp_path / "striped.exr")
     assert read.scene_id == "striped" and read.materials == ("lambertian:0.2", "lambertian:0.6")
-    np.testing.assert_allclose(read.images, striped.images, rtol=1e-3)
+    np.testing.assert_array_equal(read.images, striped.images.astype(np.float16))
     np.testing.assert_array_equal(read.normals, striped.normals)
 
 
@@ -161,7 +159,8 @@ def test_mistakes_are_one_line(call, message):
 
 
 def test_from_images_to_a_mesh(tmp_path):
-    view = render.render_view("sphere", "lambertian:0.7", "near-uniform:8", bounces=0, size=48, spp=16)
+    lights = render.lights("diligent")[::6]  # all within 45 degrees of the camera
+    view = render.render_view("sphere", "lambertian:0.7", lights, bounces=0, size=48, spp=16)
     found = sdps.estimate(view.images, view.mask, "robust-least-squares", light_directions=view.light_directions)
     assert isinstance(found, sdps.Estimate)
     errors = {item.name: item.value for item in sdps.score(found, view.mask, normals=view.normals)}

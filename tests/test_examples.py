@@ -1,5 +1,6 @@
 """Every example runs from the command line and writes what it says."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,12 +12,13 @@ from PIL import Image
 
 import render
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def run(name: str, *flags: object) -> str:
-    command = [sys.executable, str(EXAMPLES / name), *map(str, flags)]
-    done = subprocess.run(command, cwd=EXAMPLES.parent, check=False, capture_output=True, text=True)
+    command = [sys.executable, str(ROOT / "examples" / name), *map(str, flags)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}  # these packages, whichever are installed
+    done = subprocess.run(command, cwd=ROOT, env=environment, check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
 
