@@ -13,6 +13,7 @@ Mitsuba is loaded by the first call that traces rays.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -151,25 +152,39 @@ def render_views(
     Raises:
         InputError: an unusable shape, material or light, an option out of range, or an object outside the frame.
     """
-    from render.kernel.scene import build
-    from render.materials.kernels.packed import PackedSurfaces
+    _check_options(size, spp, bounces, seed)
+    covers = [_material(each) for each in materials]
+    if not covers:
+        raise InputError("materials: at least one is needed")
+    first = SceneSpec(
+        id="view-0",
+        seed=seed,
+        split="test",
+        shape=str(shape) if isinstance(shape, str | Path) else "mesh",
+        material=covers[0].name,
+        view=_view(rotation, scale, offset),
+        lights=tuple(map(tuple, _lights(lights).tolist())),
+        size=size,
+        spp=spp,
+        bounces=bounces,
+    )
+    return _rendered(_shape(shape), covers, first)
 
+
+def _check_options(size: int, spp: int, bounces: int, seed: int) -> None:
+    """Refuse options out of range."""
     if size < 1 or spp < 1 or seed < 0 or not 0 <= bounces <= 16:
         raise InputError(
             f"size and spp must be at least 1, seed 0 and bounces in 0..16, got {size}, {spp}, {seed} and {bounces}"
         )
-    mesh, covers = _shape(shape), [_material(each) for each in materials]
-    common = {
-        "seed": seed,
-        "split": "test",
-        "shape": str(shape) if isinstance(shape, str | Path) else "mesh",
-        "view": _view(rotation, scale, offset),
-        "lights": tuple(map(tuple, _lights(lights).tolist())),
-        "size": size,
-        "spp": spp,
-        "bounces": bounces,
-    }
-    scenes = [SceneSpec(id=f"view-{number}", material=cover.name, **common) for number, cover in enumerate(covers)]
+
+
+def _rendered(mesh: TriangleMesh, covers: Sequence[Surface], first: SceneSpec) -> Iterator[RenderedView]:
+    """Render scenes that differ from the first in their material only."""
+    from render.kernel.scene import build
+    from render.materials.kernels.packed import PackedSurfaces
+
+    scenes = [replace(first, id=f"view-{number}", material=cover.name) for number, cover in enumerate(covers)]
     return rendered_views(build(mesh), scenes, PackedSurfaces(covers, mesh), range(len(covers)))
 
 
