@@ -2,4 +2,59 @@
 
 Frame everywhere: x right, y up, z to the camera; light vectors point from the surface to the light;
 radiance is linear, and a white Lambertian surface facing a light is 1.0.
+
+`__all__` is the public interface. Everything else can be imported too, but may move. Importing this package does not
+load torch; what needs torch loads it when it is first used.
 """
+
+from typing import TYPE_CHECKING
+
+from render.shared.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from render.shared.errors import InputError
+    from sdps.api import available_methods, estimate, infer, train
+    from sdps.core.estimate import Estimate
+    from sdps.core.metrics import score
+    from sdps.inference.estimator import load_estimator
+    from sdps.inference.inference_config import InferenceConfig
+    from sdps.photos.reading import load
+    from sdps.surface.inferred import Inference
+    from sdps.surface.integration import integrate
+    from sdps.surface.meshing import mesh, write_mesh
+    from sdps.surface.relight import relit
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "render.shared.errors": ("InputError",),
+            "sdps.api": ("available_methods", "estimate", "infer", "train"),
+            "sdps.core.estimate": ("Estimate",),
+            "sdps.core.metrics": ("score",),
+            "sdps.inference.estimator": ("load_estimator",),
+            "sdps.inference.inference_config": ("InferenceConfig",),
+            "sdps.surface.inferred": ("Inference",),
+            "sdps.photos.reading": ("load",),
+            "sdps.surface.integration": ("integrate",),
+            "sdps.surface.meshing": ("mesh", "write_mesh"),
+            "sdps.surface.relight": ("relit",),
+        },
+    )
+
+__all__ = [
+    "Estimate",
+    "Inference",
+    "InferenceConfig",
+    "InputError",
+    "available_methods",
+    "estimate",
+    "infer",
+    "integrate",
+    "load",
+    "load_estimator",
+    "mesh",
+    "relit",
+    "score",
+    "train",
+    "write_mesh",
+]

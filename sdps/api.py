@@ -1,218 +1,50 @@
-"""Two verbs for one's own photographs: `load` a folder of them, `infer` normals, lights and a surface.
+"""Photometric stereo from Python: photographs or arrays in, normals and lights out; and training.
 
-from sdps.api import infer, load
+```python
+import sdps
 
-photos = load("photographs")           # linear images on demand, mask, lights if they are known
-result = infer(photos)                 # or infer(photos, method="pf14"), method="lcnet+psfcn", ...
-result.normals                         # (H, W, 3) float32: x right, y up, z to the camera; zero outside the mask
+photos = sdps.load("photographs")  # linear images on demand, mask, lights if they are known
+result = sdps.infer(photos)  # or infer(photos, method="pf14"), method="lcnet+psfcn", ...
+result.normals  # (H, W, 3) float32: x right, y up, z to the camera; zero outside the mask
 result.light_directions, result.intensities
-result.depth.z                         # (H, W) float32, pixels towards the camera
-result.save("out")                     # the files of `sdps infer`, but for its report
+result.depth.z  # (H, W) float32, pixels towards the camera
+result.save("out")  # the files of `sdps infer`, but for its report
+```
 """
 
-import dataclasses
 import logging
-import platform
-import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from tqdm import tqdm
 
-from render.records.shards import write_exr
 from render.shared.errors import InputError
-from render.shared.files import atomic_path, write_json
-from render.shared.images import quantise, write_png
 from sdps.classical import registry as classical
 from sdps.core.estimate import Estimate
+from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
+from sdps.methods.method import Method
 from sdps.methods.parse import parse
 from sdps.methods.runner import Runner
-from sdps.models.registry import TRUE_LIGHTS
-from sdps.photos import Finding, Photographs, check, load, write_lights
-from sdps.photos.response import display
-from sdps.surface.integration import Depth, integrate
-from sdps.surface.meshing import mesh, write_mesh
-from sdps.surface.relight import Residuals, fit_albedo, relit, residuals
+from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
+from sdps.photos import Finding, Photographs, check, load
+from sdps.surface.inferred import Inference, check_out
+from sdps.training.trainer import TrainingResult
 
-__all__ = ["Inference", "infer", "load"]
+__all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "load", "train"]
 
 AUTO = "auto"
 _LEARNED = ("sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
 """Tried in this order; the parts may be trained or shipped one by one."""
 _CALIBRATED = ("psfcn", "robust-least-squares")
 _FALLBACK = "pf14"
-RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
-         "grazing": (-0.85, 0.45, 0.25)}  # fmt: skip
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class Inference:
-    """What was found in a set of photographs.
-
-    Attributes:
-        photos: The photographs.
-        method: Name of the method.
-        estimate: Normals, lights, and what else the method says.
-        findings: What the checks said beforehand.
-        files: The weights used, by name.
-        discontinuities: Depth may jump (`sdps.surface.integrate`).
-        seconds: Time the method took.
-    """
-
-    photos: Photographs
-    method: str
-    estimate: Estimate
-    findings: tuple[Finding, ...]
-    files: dict[str, Path]
-    discontinuities: bool
-    seconds: float
-
-    @property
-    def normals(self) -> np.ndarray:
-        """Unit normals (H, W, 3) float32: x right, y up, z to the camera; zero outside the mask."""
-        return self.estimate.normals
-
-    @property
-    def light_directions(self) -> np.ndarray:
-        """Directions (L, 3) from the surface to the light; (0, 3) of methods that find normals alone."""
-        return self.estimate.light_directions
-
-    @property
-    def intensities(self) -> np.ndarray:
-        """Intensities (L,), known up to one common scale; (0,) of methods that find normals alone."""
-        return self.estimate.intensities
-
-    @cached_property
-    def depth(self) -> Depth:
-        """The surface the normals belong to, by least squares."""
-        return integrate(self.normals, self.photos.mask, discontinuities=self.discontinuities)
-
-    @cached_property
-    def albedo(self) -> np.ndarray | None:  # (H, W, 3)
-        """Lambertian albedo under the lights found, relative; None where no lights were found."""
-        if not len(self.light_directions):
-            return None
-        return fit_albedo(self.photos, self.photos.mask, self.normals, self.light_directions, self.gains)
-
-    @cached_property
-    def residuals(self) -> Residuals | None:
-        """How far the photographs are from Lambert's law on what was found; None where no lights were found."""
-        if self.albedo is None:
-            return None
-        return residuals(self.photos, self.photos.mask, self.normals, self.light_directions, self.gains, self.albedo)
-
-    @property
-    def gains(self) -> np.ndarray:
-        """Intensities (L,) or (L, 3), equal ones where none were found."""
-        return self.intensities if len(self.intensities) else np.ones(len(self.photos), np.float32)
-
-    def relit(self) -> dict[str, np.ndarray]:
-        """Return the object under lights of our choice, by name, (H, W, 3) float32 linear in [0, 1]."""
-        return self._relit
-
-    @cached_property
-    def _relit(self) -> dict[str, np.ndarray]:
-        albedo = self.albedo if self.albedo is not None else np.ones((*self.photos.shape, 3), np.float32)
-        inside = albedo[self.photos.mask]
-        albedo = albedo * (0.9 / max(float(np.percentile(inside, 99)), 1e-9))
-        views = {name: relit(self.normals, albedo, np.array(light), depth=self.depth) for name, light in RELIT.items()}
-        return {name: np.clip(view, 0.0, 1.0) for name, view in views.items()}
-
-    def summary(self) -> dict[str, Any]:
-        """Return what a reader needs to judge the result, JSON ready."""
-        photos = self.photos
-        facts = {
-            "method": self.method,
-            "weights": {name: str(path) for name, path in self.files.items()},
-            "terms": pretrained.terms(self.files.values()),
-            "images": len(photos),
-            "size": list(photos.shape),
-            "bits": photos.bits,
-            "gamma": photos.gamma,
-            "mask": photos.mask_origin,
-            "mask_pixels": int(photos.mask.sum()),
-            "camera": "orthographic, looking along -z",
-            "frame": "x right, y up, z to the camera; lights from the surface to the light",
-            "depth": {"unit": "pixels towards the camera", "components": self.depth.components,
-                      "residual_degrees": round(self.depth.residual, 3)},
-            "seconds": round(self.seconds, 2),
-            "notes": list(photos.notes),
-            "findings": [dataclasses.asdict(finding) for finding in self.findings],
-            "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
-        }  # fmt: skip
-        if "precision" in self.estimate.diagnostics:
-            facts["precision"] = self.estimate.diagnostics["precision"]
-            facts["stray_light"] = round(float(self.estimate.diagnostics["stray_light"].mean()), 6)
-        confidence = self.estimate.diagnostics.get("confidence")
-        if confidence is not None:
-            facts["light_confidence"] = dict(
-                zip(photos.files, np.round(np.asarray(confidence, float), 4).tolist(), strict=True)
-            )
-        if self.residuals is not None:
-            facts["lambertian_residual"] = round(self.residuals.overall, 4)
-        return facts
-
-    def save(self, out: str | Path) -> list[Path]:
-        """Write everything into a folder: normals, lights, depth, meshes, relit views, result.json.
-
-        Every file is written whole; all of them are made before the first is put in place.
-
-        Raises:
-            InputError: the folder of the photographs, or a disk that refuses the files.
-        """
-        out = Path(out)
-        check_out(out, self.photos.folder)
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(prefix=".infer-", dir=out) as temporary:
-                folder = Path(temporary)
-                self._write(folder)
-                made = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-                for name in made:
-                    (out / name).parent.mkdir(exist_ok=True)
-                    (folder / name).replace(out / name)
-        except OSError as error:
-            raise InputError(f"{out}: cannot be written ({error.strerror or error}); choose another --out") from error
-        return [out / name for name in made]
-
-    def _write(self, folder: Path) -> None:
-        mask, normals = self.photos.mask, self.normals
-        _save_array(folder / "normal.npy", normals)
-        channels = {f"normal.{axis}": np.ascontiguousarray(normals[..., k]) for k, axis in enumerate("XYZ")}
-        header = {"ps:frame": "x right, y up, z to the camera", "ps:method": self.method}
-        write_exr(folder / "normal.exr", [("normal", header, {**channels, "mask": mask.astype(np.float32)})])
-        write_png(folder / "normal.png", quantise((normals.astype(np.float64) + 1.0) / 2.0, 16))
-        write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
-        if len(self.light_directions):
-            write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains)
-        _save_array(folder / "depth.npy", self.depth.z)
-        colour = None if self.albedo is None else _display(self.albedo, mask)
-        surface = mesh(self.depth, colour=colour, normals=normals)
-        for suffix in ("ply", "obj", "glb"):
-            write_mesh(surface, folder / f"mesh.{suffix}")
-        (folder / "relit").mkdir()
-        for name, view in self.relit().items():
-            write_png(folder / "relit" / f"{name}.png", display(view))
-        write_json(folder / "result.json", self.summary())
-
-
-def check_out(out: Path, photographs: Path) -> None:
-    """Refuse to write among the photographs.
-
-    Raises:
-        InputError: the two folders are one.
-    """
-    if out.resolve() == photographs.resolve():
-        raise InputError(f"--out {out}: holds the photographs; choose another folder")
 
 
 def infer(
@@ -229,11 +61,15 @@ def infer(
     Args:
         photos: Of `load`. Lights they carry are used; intensities they do not carry are then taken as equal.
         method: A combination (`sdps`), lights and normals (`lcnet+psfcn`), a normal model or a classical method;
-            `auto` for the best there is: a shipped network, or a classical method where there is none.
-        models: Folder of trained runs to take weights from before the shipped ones.
+            `auto` for the best there is: a pretrained network, or a classical method where there is none.
+        models: Folder of trained runs (`out` of `train`) to take weights from before the pretrained ones.
         config: How networks are used; the defaults are those of every command.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
+
+    Returns:
+        Normals (H, W, 3), light directions (L, 3) and intensities (L,), and what follows from them: depth, albedo,
+        relit pictures. Camera frame: x right, y up, z to the camera.
 
     Raises:
         InputError: photographs that cannot be used, or a method that is not there or cannot use them, in one line.
@@ -242,18 +78,138 @@ def infer(
     grave = next((finding for finding in findings if finding.level == "error"), None)
     if grave is not None:
         raise InputError(f"{photos.folder}: {grave.text}")
-    find = partial(pretrained.require, out=None if models is None else Path(models))
-    chosen = _automatic(photos, find) if method == AUTO else method
-    runner = Runner(_told(chosen, photos, find), find, config)
+    runner = _runner(method, photos.light_directions is not None, models, config)
     began = time.perf_counter()
-    estimate = runner.estimate(photos, photos.mask, photos.light_directions, photos.intensities)
+    found = runner.estimate(photos, photos.mask, photos.light_directions, photos.intensities)
     seconds = time.perf_counter() - began
-    return Inference(photos, runner.method.name, estimate, findings, runner.files, discontinuities, seconds)
+    return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
 
 
-def _told(text: str, photos: Photographs, find: Callable[[str], Path]) -> Any:
+def estimate(
+    images: ImageSource,
+    mask: np.ndarray,
+    method: str = AUTO,
+    *,
+    light_directions: np.ndarray | None = None,
+    intensities: np.ndarray | None = None,
+    models: str | Path | None = None,
+    config: InferenceConfig | None = None,
+) -> Estimate:
+    """Estimate normals and lights of images in memory, by any method.
+
+    Args:
+        images: (L, H, W, 3), linear radiance of any overall scale, of a static object under one distant light each; an
+            array, or anything that gives the images of a slice.
+        mask: (H, W) bool, the object's pixels.
+        method: As for `infer`.
+        light_directions: (L, 3) known directions from the surface to the light (x right, y up, z to the camera).
+        intensities: (L,) or (L, 3) known intensities, of any overall scale.
+        models: As for `infer`.
+        config: As for `infer`.
+
+    Returns:
+        Normals (H, W, 3) float32, unit, zero outside the mask; directions (L, 3) and intensities (L,), those given or
+        those found, empty where there are none.
+
+    Raises:
+        InputError: sizes that do not fit, values that are not finite, an empty mask, or a method that is not there or
+            wants lights that are not given.
+    """
+    runner = _runner(method, light_directions is not None, models, config)
+    return runner.estimate(images, mask, light_directions, intensities)
+
+
+def available_methods(models: str | Path | None = None) -> dict[str, str]:
+    """Return the methods that can be used now, with a line about each: combinations, networks, classical methods.
+
+    Two of them may be joined, lights before normals, as in `lcnet+psfcn`.
+
+    Args:
+        models: Folder of trained runs (`out` of `train`) whose weights count beside the pretrained ones.
+    """
+    about = {name: item.summary for items in (COMBINATIONS, MODELS) for name, item in items.items()}
+    about |= {name: f"{entry.summary} ({entry.paper})" for name, entry in classical.METHODS.items()}
+    find = _finder(models)
+
+    def usable(name: str) -> bool:
+        try:
+            parse(name, find)
+        except InputError:
+            return False
+        return True
+
+    return {name: text for name, text in about.items() if usable(name)}
+
+
+def train(
+    model: str,
+    data: str | Path,
+    out: str | Path,
+    *,
+    on_log: Callable[[int, dict[str, float]], None] | None = None,
+    device: str | None = None,
+    **settings: Any,
+) -> TrainingResult:
+    """Train a model on a rendered data folder, resuming what is there.
+
+    Args:
+        model: A name such as `lcnet` (lights) or `nenet` (normals), as `sdps models` lists them.
+        data: Data folder (`render.render_plan`), with scenes of the split `train` and, for validation, `val`.
+        out: Folder of the runs; this one is `models/<model>` in it. What a model is trained on (NENet on LCNet's
+            lights) is taken from there if it was trained there, else the pretrained weights are.
+        on_log: Called with the step and its numbers (`loss`, `learning_rate`, ..., `val_...`) as they are logged.
+        device: Torch device; CUDA when there is one, else CPU.
+        settings: Fields of the model's configuration (`sdps.training.training_config`): `steps`, `batch_scenes`,
+            `images`, `learning_rate`, `log_every`, ...; the others are the paper's.
+
+    Returns:
+        Weights by name (safetensors files; None if it was stopped by a signal), steps, seconds, validation metrics.
+
+    Raises:
+        InputError: an unknown model or setting, unusable data, a folder that holds another run, or a loss that is no
+            longer finite.
+    """
+    from sdps.models.checkpoint import load_weights
+    from sdps.training import recipes, trainer
+    from sdps.training.stage_factory import create_stage
+
+    out = Path(out)
+    run = recipes.run(model, {}, {model: settings})
+    needed = {use: load_weights(pretrained.require(name, out)) for use, name in run.requires.items()}
+    stage = create_stage(run.name, run.model, run.config, needed)
+    loggers = [] if on_log is None else [_Told(on_log)]
+    return trainer.train(stage, data, out / pretrained.MODELS_FOLDER / model, device=device, loggers=loggers)
+
+
+class _Told:
+    """A logger that calls a function."""
+
+    def __init__(self, tell: Callable[[int, dict[str, float]], None]) -> None:
+        self.tell = tell
+
+    def log(self, step: int, values: dict[str, float]) -> None:
+        """Pass the values on, out of the way of the progress bar."""
+        with tqdm.external_write_mode():
+            self.tell(step, values)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def _finder(models: str | Path | None) -> Callable[[str], Path]:
+    return partial(pretrained.require, out=None if models is None else Path(models))
+
+
+def _runner(method: str, lit: bool, models: str | Path | None, config: InferenceConfig | None) -> Runner:
+    """Return the method of an expression with its networks; `lit`: the light directions are known."""
+    find = _finder(models)
+    chosen = _automatic(lit, find) if method == AUTO else method
+    return Runner(_told(chosen, lit, find), find, config)
+
+
+def _told(text: str, lit: bool, find: Callable[[str], Path]) -> Method:
     """Return the method of an expression, told the lights where they are known."""
-    if photos.light_directions is None:
+    if not lit:
         method = parse(text, find)
         if TRUE_LIGHTS in (method.lights, method.intensities):
             raise InputError(
@@ -267,24 +223,13 @@ def _told(text: str, photos: Photographs, find: Callable[[str], Path]) -> Any:
     return parse(text if "+" in text else f"{TRUE_LIGHTS}+{text}", find)
 
 
-def _automatic(photos: Photographs, find: Callable[[str], Path]) -> str:
+def _automatic(lit: bool, find: Callable[[str], Path]) -> str:
     """Return the best method whose weights are there."""
-    names = _LEARNED if photos.light_directions is None else _CALIBRATED
-    for name in names:
+    for name in _CALIBRATED if lit else _LEARNED:
         try:
-            _told(name, photos, find)
+            _told(name, lit, find)
         except InputError:
             continue
         return name
     _log.warning("no trained network is there; using %s, which wants a diffuse object", _FALLBACK)
     return _FALLBACK
-
-
-def _save_array(path: Path, array: np.ndarray) -> None:
-    with atomic_path(path) as temporary, temporary.open("wb") as handle:
-        np.save(handle, np.ascontiguousarray(array, np.float32))
-
-
-def _display(albedo: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
-    """Return colours for a screen, the brightest percent at white."""
-    return display(albedo / max(float(np.percentile(albedo[mask], 99)), 1e-9))

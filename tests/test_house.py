@@ -34,8 +34,8 @@ RANK = {folder: place for place, folder in enumerate(FOLDERS)}
 PACKAGES = ("render", "sdps", "pipelines")
 LIGHT = ("render.shared", "render.records")
 """Folders of `render` that `sdps` may use; they load neither mitsuba nor torch."""
-MAY_RECUR = {"__init__.py", "registry.py"}
-"""A registry is one in every folder that has one."""
+MAY_RECUR = {"__init__.py", "api.py", "registry.py"}
+"""A registry is one in every folder that has one, and `api` is what a package offers from its root."""
 ENTRIES = 12
 LONGER: dict[str, int] = {
     "render.kernel.many_lights.render": 51,

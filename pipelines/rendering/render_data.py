@@ -7,7 +7,8 @@ from pathlib import Path
 
 from pipelines.shared import pictures, presets
 from render.planning import budget
-from render.records.manifest import FAILED, MANIFEST, SceneSpec, read_manifest, write_manifest
+from render.records import manifest
+from render.records.manifest import FAILED, MANIFEST, SceneSpec, read_manifest
 from render.running.supervisor import RunOptions, RunSummary, render_supervised
 from render.shared.config import to_plain
 from render.shared.errors import InputError
@@ -109,11 +110,7 @@ def claim(scenes: list[SceneSpec], folder: Path, preset: presets.Preset | None) 
     Raises:
         InputError: the folder holds another plan.
     """
-    if (folder / MANIFEST).exists():
-        if read_manifest(folder) != scenes:
-            raise InputError(f"{folder / MANIFEST}: holds another plan; remove the folder or choose another --out")
-    else:
-        write_manifest(folder, scenes)
+    manifest.claim(folder, scenes)
     if preset is not None:
         presets.save_resolved(preset, folder)
 

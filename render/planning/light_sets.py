@@ -92,7 +92,7 @@ def load(name: str) -> np.ndarray:  # (L, 3)
         InputError: unknown name, malformed file, no light, or a light below the horizon (named by its line).
     """
     if name in names():
-        return _check(read_yaml(str(resources.files("assets") / "lights" / f"{name}.yaml")).get("directions"), name)
+        return checked(read_yaml(str(resources.files("assets") / "lights" / f"{name}.yaml")).get("directions"), name)
     distribution, colon, count = name.partition(":")
     if colon and distribution in DISTRIBUTIONS:
         if not (count.isascii() and count.isdecimal() and int(count) > 0):
@@ -103,13 +103,17 @@ def load(name: str) -> np.ndarray:  # (L, 3)
         known = [*names(), *(f"{name}:64" for name in DISTRIBUTIONS)]
         raise unknown("light set", name, known, "or give a file of directions")
     if path.suffix in (".yaml", ".yml"):
-        return _check(read_yaml(path).get("directions"), name)
+        return checked(read_yaml(path).get("directions"), name)
     rows = [line.replace(",", " ").split() for line in read_text(path).splitlines() if line.strip()]
-    return _check(rows, name)
+    return checked(rows, name)
 
 
-def _check(rows: object, name: str) -> np.ndarray:
-    """Return the rows as unit vectors, or say which one is wrong."""
+def checked(rows: object, name: str) -> np.ndarray:  # (L, 3)
+    """Return rows of three numbers as unit vectors.
+
+    Raises:
+        InputError: no list, no row, or a row that is no light above the horizon (named by its number).
+    """
     if not isinstance(rows, list) or not rows:
         raise InputError(f"{name}: directions: expected a list of [x, y, z] rows")
     vectors = []

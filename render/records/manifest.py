@@ -99,6 +99,19 @@ def write_manifest(folder: str | Path, scenes: Sequence[SceneSpec]) -> None:
     write_jsonl(Path(folder) / MANIFEST, [to_plain(scene) for scene in scenes])
 
 
+def claim(folder: str | Path, scenes: Sequence[SceneSpec]) -> None:
+    """Write the manifest of a data folder, or make sure that the one there plans the same scenes.
+
+    Raises:
+        InputError: the folder holds another plan.
+    """
+    path = Path(folder) / MANIFEST
+    if not path.exists():
+        write_manifest(folder, scenes)
+    elif read_manifest(folder) != list(scenes):
+        raise InputError(f"{path}: holds another plan; remove the folder or choose another --out")
+
+
 def read_manifest(folder: str | Path, split: str | None = None) -> list[SceneSpec]:
     """Read the scenes planned in `folder`, optionally only those of one split.
 

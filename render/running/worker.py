@@ -7,26 +7,20 @@ pieces run by processes of their own, and goes on after failures.
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from itertools import groupby
 from pathlib import Path
 
 import drjit as dr
 
-from render.backend import variant
-from render.kernel import many_lights
 from render.kernel.scene import Scene, build
-from render.materials import surfaces as surface_names
 from render.materials.kernels.packed import pack
-from render.planning import provenance
 from render.planning.chunks import GROUP_SIZE, view_groups
 from render.records.manifest import SceneSpec
-from render.records.shards import Shard, is_whole, to_half, write_shard
+from render.records.shards import Shard, is_whole, write_shard
+from render.running.rendered import rendered_views
 from render.shapes import load as load_shape
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
-
-mi = variant.load()
 
 
 class Unwritable(InputError):
@@ -146,31 +140,13 @@ def group_shards(
         InputError: an unusable material or an object outside the frame.
     """
     stages.view_traced = False
-    first, only = group[0], [number for number, scene in enumerate(group) if scene.id in missing]
+    only = [number for number, scene in enumerate(group) if scene.id in missing]
     with stages.time("render"):
         surfaces = pack([scene.material for scene in group], built.mesh)
-        truth, images = many_lights.render(
-            built, first.view, surfaces, first.light_directions(), size=first.size, spp=first.spp,
-            bounces=first.bounces, seed=first.seed, only=only,
-        )  # fmt: skip
-    if not truth.mask.any():
-        raise InputError(f"scene {first.id}: {first.shape} is outside the frame; check view.scale and view.offset")
+        views = rendered_views(built, group, surfaces, only)
     stages.spread("view", len(only))
-    for number, stack in stages.each("render", images):
-        scene = group[number]
-        shard = Shard(
-            scene_id=scene.id,
-            images=to_half(stack),
-            normals=truth.normals,
-            depth=truth.depth,
-            mask=truth.mask,
-            coverage=truth.coverage,
-            light_directions=scene.light_directions(),
-            weights=truth.weights[number],
-            materials=surface_names.split(scene.material)[1] if truth.weights[number] is not None else (),
-            provenance=_describe(scene),
-        )
-        yield scene, shard
+    for view in stages.each("render", views):
+        yield view.scene, view.shard()
 
 
 def _write(path: Path, shard: Shard) -> None:
@@ -186,27 +162,3 @@ def _write(path: Path, shard: Shard) -> None:
         if isinstance(error.__cause__, OSError):
             raise Unwritable(str(error)) from error
         raise
-
-
-def _describe(scene: SceneSpec) -> dict[str, str | int | float]:
-    """Describe how the scene was rendered, for the shard's header."""
-    return {
-        "spec": scene.digest(),
-        "seed": scene.seed,
-        "shape": scene.shape,
-        "material": scene.material,
-        "spp": scene.spp,
-        "bounces": scene.bounces,
-        "irradiance": "pi",
-        "frame": "x right, y up, z to the camera",
-        "variant": mi.variant(),
-        **_software(),
-    }
-
-
-@cache
-def _software() -> dict[str, str]:
-    """Return the versions of this package and of those a shard depends on, and the commit in a checkout."""
-    versions = {name: version for name, version in provenance.versions().items() if name in provenance.PACKAGES}
-    commit = provenance.commit()
-    return versions | ({"commit": commit} if commit else {})

@@ -106,7 +106,7 @@ def relit(
     shading = np.maximum(normals @ (direction / length), 0.0)
     if depth is not None:
         shading = shading * lit(depth, direction)
-    return (shading[..., None] * albedo).astype(np.float32)
+    return np.broadcast_to(shading[..., None] * albedo, (*shading.shape, 3)).astype(np.float32)
 
 
 def lit(depth: Depth, direction: np.ndarray) -> np.ndarray:

@@ -54,7 +54,7 @@ def run(name: str, sections: Mapping[str, Mapping[str, Any]], runs: Mapping[str,
     own = dict(runs.get(name, {}))
     model = own.pop("base", name)
     if model != JOINT and model not in MODELS:
-        raise unknown("model", str(model), [*MODELS, JOINT, *runs])
+        raise unknown("model", str(model), [*MODELS, JOINT, *(other for other in runs if other != name)])
     role, recipe = ("joint", {}) if model == JOINT else (entry(model).role, entry(model).recipe)
     values: dict[str, Any] = {}
     where = f"runs.{name}"

@@ -26,7 +26,8 @@ from sdps.api import infer, load
 from sdps.core.metrics import direction_mae, intensity_error, normal_mae
 from sdps.data.augment import Augmentation
 from sdps.inference.inference_config import InferenceConfig, inference_config
-from sdps.methods import methods, pretrained
+from sdps.methods import pretrained
+from sdps.methods.parse import parse
 from sdps.models.checkpoint import TrainedModel, save_weights
 from sdps.models.registry import create
 
@@ -166,11 +167,11 @@ def test_a_method_means_the_same_to_photographs_as_to_benchmarks(
         raise InputError("enough")
 
     monkeypatch.setattr(api, "Runner", runner)
-    monkeypatch.setattr(api.weights, "require", lambda name, out: Path(name))
+    monkeypatch.setattr(api.pretrained, "require", lambda name, out: Path(name))
     with pytest.raises(InputError, match="enough"):
         infer(load(hills[0]), "sdps-plus")
     method, _, config = asked[0]
-    assert method == methods.parse("sdps-plus", Path) and config is None
+    assert method == parse("sdps-plus", Path) and config is None
     flags = build_parser(["infer"]).parse_args(["infer", "photographs"])
     assert inference_config(flags) == InferenceConfig()
 

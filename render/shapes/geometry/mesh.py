@@ -153,8 +153,7 @@ def without_unused(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
 def load_mesh(path: str | Path) -> TriangleMesh:
     """Read any mesh or scene file that trimesh reads, smoothly shaded and as placed in the file.
 
-    The parts of a scene are concatenated and equal positions merged, so that texture seams and the flat
-    facets of STL do not show; normals are area-weighted. A watertight surface is turned outside out.
+    The parts of a scene are concatenated; see `from_trimesh`.
 
     Raises:
         InputError: missing file, unreadable format, no triangles, or non-finite positions.
@@ -171,13 +170,32 @@ def load_mesh(path: str | Path) -> TriangleMesh:
         raise InputError(f"{path}: cannot be read as a mesh ({reason})") from error
     if not sum(len(part.faces) for part in geometry):
         raise InputError(f"{path}: contains no triangles; export it as a surface mesh")
-    mesh = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in geometry])
+    bare = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in geometry]
+    return from_trimesh(trimesh.util.concatenate(bare), str(path))
+
+
+def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh") -> TriangleMesh:
+    """Return the triangles of a mesh as placed, smoothly shaded.
+
+    Equal positions are merged, so that texture seams and the flat facets of STL do not show; normals are
+    area-weighted. A watertight surface is turned outside out.
+
+    Args:
+        mesh: Stays as it is; of its attributes only vertices and faces are used.
+        name: What messages call it.
+
+    Raises:
+        InputError: no triangles, or non-finite positions.
+    """
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    if not len(mesh.faces):
+        raise InputError(f"{name}: contains no triangles; give a surface mesh")
     if not np.isfinite(mesh.vertices).all():
-        raise InputError(f"{path}: contains vertices that are not finite; repair the file")
+        raise InputError(f"{name}: contains vertices that are not finite; repair the file")
     mesh.merge_vertices()
     vertices, faces = without_degenerate(np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64))
     if not len(faces):
-        raise InputError(f"{path}: all of its triangles are degenerate")
+        raise InputError(f"{name}: all of its triangles are degenerate")
     faces = _outward(vertices, faces)
     return TriangleMesh(vertices=vertices, faces=faces, normals=vertex_normals(vertices, faces))
 

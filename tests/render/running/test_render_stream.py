@@ -22,7 +22,7 @@ from pipelines.train.streaming import RenderStream, open_streamed, streamed
 from render.planning.plan import DataConfig, plan
 from render.records.manifest import SceneSpec, View, write_manifest
 from render.records.shards import read_shard
-from render.running import worker
+from render.running import rendered, worker
 from render.running.scene_stream import StreamOrders, _render, rendered_scenes, serve, stream_order
 from render.shared.errors import InputError
 from sdps.data.augment import Augmentation
@@ -141,7 +141,7 @@ def test_batches_are_made_of_what_a_process_renders(simple, shards):
 
 
 def test_images_that_are_not_finite_are_refused(simple, monkeypatch):
-    monkeypatch.setattr(worker, "to_half", lambda stack: np.full(stack.shape, np.nan, np.float16))
+    monkeypatch.setattr(rendered, "to_half", lambda stack: np.full(stack.shape, np.nan, np.float16))
     with pytest.raises(InputError, match=f"scene {ids(simple, 1, seed=0)[0]}: the images have infinite or NaN"):
         next(rendered_scenes(simple, seed=0))
 

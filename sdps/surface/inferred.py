@@ -1,0 +1,198 @@
+"""What `infer` finds in photographs: normals, lights, a surface, pictures under other lights, and their files."""
+
+import dataclasses
+import platform
+import tempfile
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from render.records.shards import write_exr
+from render.shared.errors import InputError
+from render.shared.files import atomic_path, write_json
+from render.shared.images import quantise, write_png
+from sdps.core.estimate import Estimate
+from sdps.methods import pretrained
+from sdps.photos import Finding, Photographs, write_lights
+from sdps.photos.response import display
+from sdps.surface.integration import Depth, integrate
+from sdps.surface.meshing import mesh, write_mesh
+from sdps.surface.relight import Residuals, fit_albedo, relit, residuals
+
+RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
+         "grazing": (-0.85, 0.45, 0.25)}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Inference:
+    """What was found in a set of photographs.
+
+    Attributes:
+        photos: The photographs.
+        method: Name of the method.
+        estimate: Normals, lights, and what else the method says.
+        findings: What the checks said beforehand.
+        files: The weights used, by name.
+        discontinuities: Depth may jump (`sdps.surface.integrate`).
+        seconds: Time the method took.
+    """
+
+    photos: Photographs
+    method: str
+    estimate: Estimate
+    findings: tuple[Finding, ...]
+    files: dict[str, Path]
+    discontinuities: bool
+    seconds: float
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Unit normals (H, W, 3) float32: x right, y up, z to the camera; zero outside the mask."""
+        return self.estimate.normals
+
+    @property
+    def light_directions(self) -> np.ndarray:
+        """Directions (L, 3) from the surface to the light; (0, 3) of methods that find normals alone."""
+        return self.estimate.light_directions
+
+    @property
+    def intensities(self) -> np.ndarray:
+        """Intensities (L,), known up to one common scale; (0,) of methods that find normals alone."""
+        return self.estimate.intensities
+
+    @cached_property
+    def depth(self) -> Depth:
+        """The surface the normals belong to, by least squares."""
+        return integrate(self.normals, self.photos.mask, discontinuities=self.discontinuities)
+
+    @cached_property
+    def albedo(self) -> np.ndarray | None:  # (H, W, 3)
+        """Lambertian albedo under the lights found, relative; None where no lights were found."""
+        if not len(self.light_directions):
+            return None
+        return fit_albedo(self.photos, self.photos.mask, self.normals, self.light_directions, self.gains)
+
+    @cached_property
+    def residuals(self) -> Residuals | None:
+        """How far the photographs are from Lambert's law on what was found; None where no lights were found."""
+        if self.albedo is None:
+            return None
+        return residuals(self.photos, self.photos.mask, self.normals, self.light_directions, self.gains, self.albedo)
+
+    @property
+    def gains(self) -> np.ndarray:
+        """Intensities (L,) or (L, 3), equal ones where none were found."""
+        return self.intensities if len(self.intensities) else np.ones(len(self.photos), np.float32)
+
+    def relit(self) -> dict[str, np.ndarray]:
+        """Return the object under lights of our choice, by name, (H, W, 3) float32 linear in [0, 1]."""
+        return self._relit
+
+    @cached_property
+    def _relit(self) -> dict[str, np.ndarray]:
+        albedo = self.albedo if self.albedo is not None else np.ones((*self.photos.shape, 3), np.float32)
+        inside = albedo[self.photos.mask]
+        albedo = albedo * (0.9 / max(float(np.percentile(inside, 99)), 1e-9))
+        views = {name: relit(self.normals, albedo, np.array(light), depth=self.depth) for name, light in RELIT.items()}
+        return {name: np.clip(view, 0.0, 1.0) for name, view in views.items()}
+
+    def summary(self) -> dict[str, Any]:
+        """Return what a reader needs to judge the result, JSON ready."""
+        photos = self.photos
+        facts = {
+            "method": self.method,
+            "weights": {name: str(path) for name, path in self.files.items()},
+            "terms": pretrained.terms(self.files.values()),
+            "images": len(photos),
+            "size": list(photos.shape),
+            "bits": photos.bits,
+            "gamma": photos.gamma,
+            "mask": photos.mask_origin,
+            "mask_pixels": int(photos.mask.sum()),
+            "camera": "orthographic, looking along -z",
+            "frame": "x right, y up, z to the camera; lights from the surface to the light",
+            "depth": {"unit": "pixels towards the camera", "components": self.depth.components,
+                      "residual_degrees": round(self.depth.residual, 3)},
+            "seconds": round(self.seconds, 2),
+            "notes": list(photos.notes),
+            "findings": [dataclasses.asdict(finding) for finding in self.findings],
+            "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
+        }  # fmt: skip
+        if "precision" in self.estimate.diagnostics:
+            facts["precision"] = self.estimate.diagnostics["precision"]
+            facts["stray_light"] = round(float(self.estimate.diagnostics["stray_light"].mean()), 6)
+        confidence = self.estimate.diagnostics.get("confidence")
+        if confidence is not None:
+            facts["light_confidence"] = dict(
+                zip(photos.files, np.round(np.asarray(confidence, float), 4).tolist(), strict=True)
+            )
+        if self.residuals is not None:
+            facts["lambertian_residual"] = round(self.residuals.overall, 4)
+        return facts
+
+    def save(self, out: str | Path) -> list[Path]:
+        """Write everything into a folder: normals, lights, depth, meshes, relit views, result.json.
+
+        Every file is written whole; all of them are made before the first is put in place.
+
+        Raises:
+            InputError: the folder of the photographs, or a disk that refuses the files.
+        """
+        out = Path(out)
+        check_out(out, self.photos.folder)
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(prefix=".infer-", dir=out) as temporary:
+                folder = Path(temporary)
+                self._write(folder)
+                made = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+                for name in made:
+                    (out / name).parent.mkdir(exist_ok=True)
+                    (folder / name).replace(out / name)
+        except OSError as error:
+            raise InputError(f"{out}: cannot be written ({error.strerror or error}); choose another --out") from error
+        return [out / name for name in made]
+
+    def _write(self, folder: Path) -> None:
+        mask, normals = self.photos.mask, self.normals
+        _save_array(folder / "normal.npy", normals)
+        channels = {f"normal.{axis}": np.ascontiguousarray(normals[..., k]) for k, axis in enumerate("XYZ")}
+        header = {"ps:frame": "x right, y up, z to the camera", "ps:method": self.method}
+        write_exr(folder / "normal.exr", [("normal", header, {**channels, "mask": mask.astype(np.float32)})])
+        write_png(folder / "normal.png", quantise((normals.astype(np.float64) + 1.0) / 2.0, 16))
+        write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
+        if len(self.light_directions):
+            write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains)
+        _save_array(folder / "depth.npy", self.depth.z)
+        colour = None if self.albedo is None else _display(self.albedo, mask)
+        surface = mesh(self.depth, colour=colour, normals=normals)
+        for suffix in ("ply", "obj", "glb"):
+            write_mesh(surface, folder / f"mesh.{suffix}")
+        (folder / "relit").mkdir()
+        for name, view in self.relit().items():
+            write_png(folder / "relit" / f"{name}.png", display(view))
+        write_json(folder / "result.json", self.summary())
+
+
+def check_out(out: Path, photographs: Path) -> None:
+    """Refuse to write among the photographs.
+
+    Raises:
+        InputError: the two folders are one.
+    """
+    if out.resolve() == photographs.resolve():
+        raise InputError(f"--out {out}: holds the photographs; choose another folder")
+
+
+def _save_array(path: Path, array: np.ndarray) -> None:
+    with atomic_path(path) as temporary, temporary.open("wb") as handle:
+        np.save(handle, np.ascontiguousarray(array, np.float32))
+
+
+def _display(albedo: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
+    """Return colours for a screen, the brightest percent at white."""
+    return display(albedo / max(float(np.percentile(albedo[mask], 99)), 1e-9))

@@ -1,0 +1,62 @@
+"""Every example runs from the command line and writes what it says."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import render
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def run(name: str, *flags: object) -> str:
+    command = [sys.executable, str(ROOT / "examples" / name), *map(str, flags)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}  # these packages, whichever are installed
+    done = subprocess.run(command, cwd=ROOT, env=environment, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def size_of(path: Path) -> tuple[int, int]:
+    with Image.open(path) as picture:
+        assert np.asarray(picture.convert("RGB")).std() > 1
+        return picture.size
+
+
+def test_render_a_scene(tmp_path):
+    said = run("01_render_a_scene.py", "--out", tmp_path, "--size", 32, "--spp", 4)
+    assert said.count("images (5, 32, 32, 3)") == 3
+    assert size_of(tmp_path / "images.png") == (6 * 32, 3 * 32)
+    for name in ("clay", "lacquer", "striped"):
+        shard = render.read_shard(tmp_path / f"{name}.exr")
+        assert shard.scene_id == name and shard.mask.mean() > 0.2
+        from_left, from_right = shard.images[1:3].astype(np.float32)
+        assert (from_left[:, :16] - from_right[:, :16]).mean() > 0 > (from_left[:, 16:] - from_right[:, 16:]).mean()
+    assert (tmp_path / "lacquer.yaml").is_file()
+
+
+def test_train(tmp_path):
+    flags = ("--out", tmp_path, "--size", 32, "--shapes", 2, "--steps", 2, "--method", "pf14")
+    said = run("02_train.py", *flags)
+    assert said.count("step 2: loss") == 2
+    for name in ("lcnet", "nenet"):
+        assert (tmp_path / "models" / name / f"{name}.safetensors").is_file()
+    assert "trained here: normal_mae" in said and "pf14, pretrained: normal_mae" in said
+    assert size_of(tmp_path / "normals.png") == (4 * 32, 32)
+
+
+@pytest.mark.parametrize("method", ["pf14", pytest.param("auto", marks=pytest.mark.slow)])
+def test_photographs_to_mesh(tmp_path, method):
+    said = run("03_photographs_to_mesh.py", "--out", tmp_path, "--size", 64, "--count", 12, "--method", method)
+    assert "normal_mae" in said and len(list((tmp_path / "photographs").glob("0*.png"))) == 12
+    assert size_of(tmp_path / "relit.png") == size_of(tmp_path / "normals.png") == (64, 64)
+    faces = len(trimesh.load(tmp_path / "mesh.ply").faces)
+    assert f"mesh of {faces} triangles" in said and faces > 300
+    again = run("03_photographs_to_mesh.py", tmp_path / "photographs", "--out", tmp_path / "own", "--method", method)
+    assert "normal_mae" not in again and (tmp_path / "own" / "mesh.ply").is_file()
