@@ -77,17 +77,18 @@ def render(
               seed=seed, first=first, probe=probe)
         for first in range(0, spp, per_pass)
     )  # fmt: skip
-    first_pass = next(passes)
     if per_pass >= spp:  # shaded one by one as they are asked for, so that a hundred materials need no more memory
-        images = ((index, _averaged(stack, spp)) for index, stack in shade(first_pass, surfaces, wanted))
-        return _ground_truth([first_pass], size, spp), images
-    stacks = dict(shade(first_pass, surfaces, wanted))
-    truths = [_without_paths(first_pass)]
-    del first_pass
+        (only_pass,) = passes
+        images = ((index, _averaged(stack, spp)) for index, stack in shade(only_pass, surfaces, wanted))
+        return _ground_truth([only_pass], size, spp), images
+    truths, stacks = [], {}
     for paths in passes:
-        truths.append(_without_paths(paths))
+        truths.append(replace(paths, depths=(), glints=None))  # its vertices can be freed
         for index, stack in shade(paths, surfaces, wanted):
-            stacks[index] += stack
+            if index in stacks:
+                stacks[index] += stack
+            else:
+                stacks[index] = stack
     images = ((index, _averaged(stacks.pop(index), spp)) for index in wanted)
     return _ground_truth(truths, size, spp), images
 
@@ -96,11 +97,6 @@ def _averaged(image: np.ndarray, spp: int) -> np.ndarray:
     """Divide by the samples in place: the stack is the largest array there is."""
     image /= spp
     return image
-
-
-def _without_paths(paths: Paths) -> Paths:
-    """Keep only the ground truth of a pass, so that its vertices can be freed."""
-    return replace(paths, depths=(), glints=None)
 
 
 def _ground_truth(passes: list[Paths], size: int, spp: int) -> GroundTruth:

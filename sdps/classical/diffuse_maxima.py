@@ -91,13 +91,12 @@ def diffuse_maxima(
     found = np.full(int(prepared.mask.sum()), -1)
     found[maxima.pixels] = maxima.images
     diagnostics = {
-        "gbr": (gbr.mu, gbr.nu, gbr.lam),
         "gbr_spread": tuple(float(value) for value in spread),
         "candidates": len(maxima.pixels),
         "intersections": len(crossings),
         "candidate_map": prepared.observations.to_map(found, -1).astype(np.int16),
     }
-    return conclude(prepared, prepared.factors.transformed(gbr), diagnostics)
+    return conclude(prepared, gbr, diagnostics)
 
 
 def find_maxima(profiles: np.ndarray, mask: np.ndarray, *, smoothing: float = 2.0) -> Maxima:

@@ -73,19 +73,20 @@ def grouping(
     """
     if min(normal_groups, albedo_groups, draws) < 1:
         raise InputError("normal_groups, albedo_groups and draws must be at least 1")
-    images = np.asarray(images)
-    if images.ndim != 4 or images.shape[-1] != 3:
-        raise InputError(
-            f"grouping by colour needs images (L, H, W, 3), got {images.shape}; use `entropy` for grey ones"
-        )
+    if np.ndim(images) != 4 or np.shape(images)[-1] != 3:
+        raise InputError(f"grouping by colour needs images (L, H, W, 3), got {np.shape(images)}; use `entropy` instead")
     prepared = prepare(images, mask, front=front)
     rng = generator(seed, "grouping")
     pixels, albedo, normal = _groups(prepared, normal_groups, albedo_groups, rng)
-    count = int(albedo.max()) + 1
-    if count == 1:
-        _log.warning("the object has a single chromaticity; one albedo is assumed for all of it")
     standard = standard_form(prepared.factors)
-    surface = prepared.factors.transformed(standard).surface[pixels]
+    best, found = _best_draw(prepared.factors.transformed(standard).surface[pixels], albedo, normal, draws, rng)
+    return conclude(prepared, standard.then(best), found)
+
+
+def _best_draw(
+    surface: np.ndarray, albedo: np.ndarray, normal: np.ndarray, draws: int, rng: np.random.Generator
+) -> tuple[Gbr, dict[str, float]]:
+    """Solve draws of one pixel per pair of groups; return the transformation of least residual, and diagnostics."""
     best, residual, valid = None, np.inf, 0
     for _ in range(draws):
         chosen = _one_per_cell(albedo, normal, rng)
@@ -101,16 +102,8 @@ def grouping(
             f"none of {draws} draws gives a real bas-relief transformation; the albedos of one colour differ "
             "too much or too few normals share one (small object, shadows, highlights); use another method"
         )
-    gbr = standard.then(best)
     cells = len(np.unique(albedo * (normal.max() + 1) + normal))
-    diagnostics = {
-        "gbr": (gbr.mu, gbr.nu, gbr.lam),
-        "albedo_groups": count,
-        "cells": cells,
-        "valid_draws": valid,
-        "residual": residual,
-    }
-    return conclude(prepared, prepared.factors.transformed(gbr), diagnostics)
+    return best, {"albedo_groups": int(albedo.max()) + 1, "cells": cells, "valid_draws": valid, "residual": residual}
 
 
 def solve_groups(surface: np.ndarray, groups: np.ndarray) -> Gbr | None:
@@ -155,6 +148,8 @@ def _groups(
     if spread > _TIGHT:
         labels = _k_means(chromaticity, albedo_groups, rng)
     keep, labels = _tight_groups(chromaticity, labels)
+    if labels.max() == 0:
+        _log.warning("the object has a single chromaticity; one albedo is assumed for all of it")
     profiles = prepared.cleaned[pixels[keep]]
     profiles = profiles - profiles.mean(1, keepdims=True)
     profiles /= np.maximum(np.linalg.norm(profiles, axis=1, keepdims=True), 1e-12)  # Euclid is now correlation

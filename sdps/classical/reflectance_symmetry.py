@@ -71,7 +71,7 @@ def reflectance_symmetry(
     if samples < 2 * _FEW or views < 1 or prior < 0.0:
         raise InputError(f"need samples >= {2 * _FEW}, views >= 1 and prior >= 0, got {samples}, {views}, {prior}")
     prepared = prepare(images, mask, front=front, minimum=6, seed=seed)
-    start = equal_intensity(prepared.factors)
+    start = gbr = equal_intensity(prepared.factors)
     share, chosen = highlight_images(prepared, views)
     diagnostics = {"specular_share": share, "views": len(chosen), "highlights": share >= _GLOSS and len(chosen) >= 3}
     if not diagnostics["highlights"]:
@@ -79,7 +79,6 @@ def reflectance_symmetry(
             "the specular part is %.1f %% of the light, seen in %d images: no highlights to go by; taking equal light "
             "intensities for granted", 100.0 * share, len(chosen),
         )  # fmt: skip
-        gbr = start
     else:
         pixels = generator(seed, "reflectance_symmetry").permutation(len(prepared.profiles))[:samples]
         energy = symmetry_energy(prepared, pixels, chosen, prior)
@@ -87,8 +86,7 @@ def reflectance_symmetry(
         if lowest > _POOR:
             _log.warning("the highlights keep an energy of %.2f: they are not symmetric, expect large errors", lowest)
         diagnostics |= {"energy": lowest, "energy_of_equal_intensities": energy(start), "evaluations": count}
-    diagnostics["gbr"] = (gbr.mu, gbr.nu, gbr.lam)
-    return conclude(prepared, prepared.factors.transformed(gbr), diagnostics)
+    return conclude(prepared, gbr, diagnostics)
 
 
 def highlight_images(prepared: Prepared, views: int) -> tuple[float, np.ndarray]:

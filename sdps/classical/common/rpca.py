@@ -48,30 +48,46 @@ def robust_low_rank(
     dual = data / max(spectral, float(np.abs(data).max()) / gamma)
     penalty, growth, largest = 1.25 / spectral, 1.5, 1e7 * 1.25 / spectral
     low, work = np.zeros_like(data), np.empty_like(data)
-    parts = [slice(start, start + _BLOCK) for start in range(0, rows, _BLOCK)]
     for _ in progress_bar(range(limit), desc="robust low rank", unit="step", disable=not progress):
-        gram = np.zeros((columns, columns))
-        for part in parts:
-            scaled = dual[part] / penalty
-            sparse = data[part] - low[part] + scaled
-            sparse -= np.clip(sparse, -gamma / penalty, gamma / penalty)  # soft threshold
-            work[part] = data[part] - sparse + scaled
-            block = work[part].astype(np.float64)  # squares of small singular values do not survive float32
-            gram += block.T @ block
-        shrink = _shrinkage(gram, 1.0 / penalty).astype(np.float32)
-        missed = 0.0
-        for part in parts:
-            low[part] = work[part] @ shrink
-            # The multiplier's update, dual + penalty (data - low - sparse), in the terms at hand.
-            updated = (work[part] - low[part]) * penalty
-            missed += float(np.square(updated - dual[part]).sum()) / penalty**2
-            dual[part] = updated
+        gram = _without_sparse(data, low, dual, work, gamma, penalty)
+        missed = _update(work, _shrinkage(gram, 1.0 / penalty).astype(np.float32), low, dual, penalty)
         penalty = min(penalty * growth, largest)
         if missed < (tolerance * norm) ** 2:
             break
     else:
         _log.warning("the robust low-rank split did not settle in %d steps; its result is approximate", limit)
     return low.astype(np.float64)
+
+
+def _blocks(rows: int) -> list[slice]:
+    return [slice(start, start + _BLOCK) for start in range(0, rows, _BLOCK)]
+
+
+def _without_sparse(
+    data: np.ndarray, low: np.ndarray, dual: np.ndarray, work: np.ndarray, gamma: float, penalty: float
+) -> np.ndarray:  # (L, L) float64
+    """Write into `work` (P, L) what the low-rank part is to be fitted to; return work^T work."""
+    gram = np.zeros((data.shape[1], data.shape[1]))
+    for part in _blocks(len(data)):
+        scaled = dual[part] / penalty
+        sparse = data[part] - low[part] + scaled
+        sparse -= np.clip(sparse, -gamma / penalty, gamma / penalty)  # soft threshold
+        work[part] = data[part] - sparse + scaled
+        block = work[part].astype(np.float64)  # squares of small singular values do not survive float32
+        gram += block.T @ block
+    return gram
+
+
+def _update(work: np.ndarray, shrink: np.ndarray, low: np.ndarray, dual: np.ndarray, penalty: float) -> float:
+    """Renew the low-rank part and the multiplier, both in place; return |data - low - sparse|^2."""
+    missed = 0.0
+    for part in _blocks(len(work)):
+        low[part] = work[part] @ shrink
+        # The multiplier's update, dual + penalty (data - low - sparse), in the terms at hand.
+        updated = (work[part] - low[part]) * penalty
+        missed += float(np.square(updated - dual[part]).sum()) / penalty**2
+        dual[part] = updated
+    return missed
 
 
 def _shrinkage(gram: np.ndarray, threshold: float) -> np.ndarray:
