@@ -14,7 +14,7 @@ heuristic, Veach 1997, eq. 9.15), and narrow highlights sampled from the lights'
 (`render.kernel.highlights`). The slow counterpart is `render.kernel.reference`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,16 +81,22 @@ def render(
         (only_pass,) = passes
         images = ((index, _averaged(stack, spp)) for index, stack in shade(only_pass, surfaces, wanted))
         return _ground_truth([only_pass], size, spp), images
+    truths, stacks = _summed(passes, surfaces, wanted)
+    images = ((index, _averaged(stacks.pop(index), spp)) for index in wanted)
+    return _ground_truth(truths, size, spp), images
+
+
+def _summed(passes: Iterable[Paths], surfaces: PackedSurfaces, wanted: Sequence[int]) -> tuple[list[Paths], dict]:
+    """Return the passes without their vertices, whose memory is freed one by one, and the sums of their images."""
     truths, stacks = [], {}
     for paths in passes:
-        truths.append(replace(paths, depths=(), glints=None))  # its vertices can be freed
+        truths.append(replace(paths, depths=(), glints=None))
         for index, stack in shade(paths, surfaces, wanted):
             if index in stacks:
                 stacks[index] += stack
             else:
                 stacks[index] = stack
-    images = ((index, _averaged(stacks.pop(index), spp)) for index in wanted)
-    return _ground_truth(truths, size, spp), images
+    return truths, stacks
 
 
 def _averaged(image: np.ndarray, spp: int) -> np.ndarray:

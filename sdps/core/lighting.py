@@ -20,21 +20,21 @@ Array = np.ndarray | torch.Tensor
 ReadOut = Literal["centre", "expectation", "peak"]
 
 
-def _library(array: Array) -> ModuleType:
+def library(array: Array) -> ModuleType:
     """Return the module (numpy or torch) that computes on `array`; the names used here exist in both."""
     return torch if isinstance(array, torch.Tensor) else np
 
 
 def azimuth_elevation(directions: Array) -> tuple[Array, Array]:
     """Return azimuth and elevation in degrees, each (...), of directions (..., 3) of any length."""
-    xp = _library(directions)
+    xp = library(directions)
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     return xp.rad2deg(xp.arctan2(x, z)), xp.rad2deg(xp.arctan2(y, xp.hypot(x, z)))
 
 
 def unit_direction(azimuth: Array, elevation: Array) -> Array:
     """Return unit directions (..., 3) of azimuth and elevation in degrees, each (...)."""
-    xp = _library(azimuth)
+    xp = library(azimuth)
     azimuth, elevation = xp.deg2rad(azimuth), xp.deg2rad(elevation)
     horizontal = xp.cos(elevation)
     return xp.stack([horizontal * xp.sin(azimuth), xp.sin(elevation), horizontal * xp.cos(azimuth)], axis=-1)
@@ -45,7 +45,7 @@ def bin_index(values: Array, low: float, high: float, count: int) -> Array:
 
     A value outside the range takes the nearest bin.
     """
-    xp = _library(values)
+    xp = library(values)
     index = xp.clip(xp.floor((values - low) / (high - low) * count), 0, count - 1)
     return index.long() if isinstance(index, torch.Tensor) else index.astype(np.int64)
 

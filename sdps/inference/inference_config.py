@@ -10,7 +10,7 @@ from sdps.core.precision import Precision, check_precision
 from sdps.models.lcnet import INPUT_SIZE
 
 VIEWS = (1, 2, 4, 8)
-"""Numbers of turned and mirrored views that are a group each (`sdps.inference.symmetry`)."""
+"""Numbers of turned and mirrored views that are a group each (`sdps.core.symmetry`)."""
 
 Margin = int | Literal["auto"] | None
 _BOX_MARGIN = 15
@@ -29,8 +29,8 @@ class InferenceConfig:
             networks' 128x128, and the lights they find depend on its size.
         stray_light: Take off what the images show where the object is in shadow (`sdps.inference.stray_light`).
         rotations: Rotations about the view axis that pixel networks average over.
-        light_views: Lights are the mean over so many turned and mirrored views of the object, 1, 2, 4 or 8; null for
-            what the method says, which is 1 but for `sdps-plus`.
+        light_views: Test-time augmentation: lights are the mean over so many turned and mirrored views of the object,
+            1, 2, 4 or 8; null for what the method says, which is 1 but for `sdps-plus`.
         normal_views: The same for normals; every view costs as much again.
 
     Raises:

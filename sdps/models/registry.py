@@ -134,10 +134,6 @@ MODELS: dict[str, ModelEntry] = {
     ),
 }  # fmt: skip
 
-PUBLISHED_PARAMETERS = {  # the paper's table "Normal estimation", in millions; pairs count both networks
-    "psfcn": 2.2, "upsfcn-deep-mask": 6.1, "upsfcn-deep": 6.1, "upsfcn-wide": 6.4, "upsfcn-light": 5.7, "upsfcn": 2.2,
-}  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Combination:
