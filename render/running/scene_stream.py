@@ -6,7 +6,7 @@ every pass over the plan. The number of a scene in this order determines the sce
 would hold, to the bit; so a reader may start anywhere, and a renderer may be replaced by another.
 
 `serve` is what a process of its own runs; `pipelines.train.streaming` is its parent. The pipe between them carries
-tuples: `("scene", id, RenderedScene)`, `("failed", reason)`, and `("end",)` after as many scenes as were ordered.
+tuples: `("scene", id, RenderedScene)`, `("failed", reason)`, and `("end",)` after as many scenes as were asked for.
 """
 
 import os
@@ -37,7 +37,7 @@ class RenderedScene(NamedTuple):
 
 
 @dataclass(frozen=True)
-class StreamOrders:
+class StreamWorkerConfig:
     """What a streaming process is told at its start.
 
     Attributes:
@@ -115,30 +115,30 @@ def rendered_scenes(
         dr.flush_malloc_cache()
 
 
-def serve(connection: Connection, orders: StreamOrders) -> None:
-    """Render as ordered, sending each scene through `connection`; end with the parent, whatever it ends by."""
+def serve(connection: Connection, config: StreamWorkerConfig) -> None:
+    """Render as configured, sending each scene through `connection`; end with the parent, whatever it ends by."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    outbox: queue.Queue[tuple | None] = queue.Queue(orders.depth)
+    outbox: queue.Queue[tuple | None] = queue.Queue(config.depth)
     sender = threading.Thread(target=_send, args=(connection, outbox), daemon=True)
     sender.start()
-    outbox.put(_render(orders, outbox))
+    outbox.put(_render(config, outbox))
     outbox.put(None)
     sender.join()
 
 
-def _render(orders: StreamOrders, outbox: queue.Queue) -> tuple:
-    """Put the ordered scenes into the outbox; return the last message."""
+def _render(config: StreamWorkerConfig, outbox: queue.Queue) -> tuple:
+    """Put the scenes into the outbox; return the last message."""
     try:
         import drjit as dr
 
         from render.backend import variant
 
         variant.load()  # before Dr.Jit starts its threads: it names the libLLVM
-        dr.set_thread_count(orders.threads)
-        rendered = rendered_scenes(orders.scenes, seed=orders.seed, start=orders.start)
-        for scene, arrays in islice(rendered, orders.count):
+        dr.set_thread_count(config.threads)
+        rendered = rendered_scenes(config.scenes, seed=config.seed, start=config.start)
+        for scene, arrays in islice(rendered, config.count):
             outbox.put(("scene", scene.id, arrays))
     except InputError as error:
         return "failed", str(error)
