@@ -120,9 +120,9 @@ class LightClasses:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Turn class logits into unit directions (..., 3) and intensities (...), float32.
 
-        `centre` is the paper's read-out, the middle of the most probable class; `expectation` the mean over the
-        softmax, which has no quantisation floor; `peak` the top of the parabola through the log-probabilities of the
-        most probable class and its two neighbours.
+        `centre` (argmax) is the paper's, the middle of the most probable class; `expectation` (soft-argmax) the mean
+        over the softmax, which has no quantisation floor; `peak` (parabolic) the top of the parabola through the
+        log-probabilities of the most probable class and its two neighbours.
         """
         logits = [values.float() for values in (azimuth, elevation, intensity)]
         if how == "centre":

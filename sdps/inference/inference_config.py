@@ -22,7 +22,8 @@ class InferenceConfig:
     """How networks are used.
 
     Attributes:
-        read_out: How light classes become lights: `expectation`, `centre` (the paper's) or `peak`.
+        read_out: How light classes become lights: `expectation` (soft-argmax), `centre` (argmax, the paper's) or `peak`
+            (parabolic).
         precision: Arithmetic of the networks: `auto` (what is faster on this machine), `float32` or `bfloat16`.
         margin: Pixels kept around the mask's bounding box; null keeps the whole frame. `auto`: frames of 128x128, as
             training renders them, are kept whole, others cut with 15 pixels of margin. A box is brought to the lighting

@@ -145,7 +145,7 @@ class Combination:
         second: Second lighting pass, or empty.
         summary: One line.
         paper: Row of the paper's table, if any.
-        light_views: Turned views that lights are averaged over; None for what the caller wants.
+        light_views: Test-time augmentation of lights: turned views averaged over; None for what the caller wants.
         normal_views: The same for normals.
     """
 
