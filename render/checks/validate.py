@@ -123,12 +123,13 @@ def validate(
                 pixels[result.pixels].append(result.scene)
             bar.update()
     findings += find_duplicates(pixels)
+    order = list(CHECKS)
     return Validation(
         folder=folder,
         planned=len(scenes),
         left=sum(scene.id not in present for scene in scenes),
         checked=len(chosen),
-        findings=tuple(_ordered(findings)),
+        findings=tuple(sorted(findings, key=lambda one: (order.index(one.check), -one.severity, one.where))),
         statistics=_spread(statistics),
         limits=limits,
         manifest=file_hash(folder / MANIFEST),
@@ -178,12 +179,6 @@ def _results(tasks: Sequence[tuple], workers: int) -> Iterator[ShardResult]:
             yield from pool.map(check_one, tasks, chunksize=max(1, min(16, len(tasks) // (4 * workers))))
         except BrokenProcessPool as error:
             raise InputError("a checking process died, likely for want of memory; use fewer --workers") from error
-
-
-def _ordered(findings: Sequence[Finding]) -> list[Finding]:
-    """Sort by check, then by severity, the worst first."""
-    order = {name: number for number, name in enumerate(CHECKS)}
-    return sorted(findings, key=lambda finding: (order[finding.check], -finding.severity, finding.where))
 
 
 def _spread(statistics: Sequence[SceneStatistics]) -> dict[str, dict[str, float]]:
