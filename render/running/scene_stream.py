@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.planning.chunks import GROUP_SIZE, view_groups
+from render.planning.chunks import view_groups
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from render.shared.seeds import generator
@@ -57,21 +57,18 @@ class StreamWorkerConfig:
     threads: int
 
 
-def stream_order(
-    scenes: Sequence[SceneSpec], *, seed: int, start: int = 0, group_size: int = GROUP_SIZE
-) -> Iterator[tuple[list[SceneSpec], int]]:
+def stream_order(scenes: Sequence[SceneSpec], *, seed: int, start: int = 0) -> Iterator[tuple[list[SceneSpec], int]]:
     """Yield the views of a plan endlessly, in the order of the stream, from scene number `start` on.
 
     Args:
         scenes: The plan, views whole and the views of a shape together.
         seed: Seed of the order.
         start: Number of the first scene; a pass has `len(scenes)`.
-        group_size: Most materials that share rays; the bytes of a scene depend on it.
 
     Yields:
         The scenes of a view, and how many of them lie before `start` (0 but for the first view).
     """
-    groups = view_groups(scenes, group_size)
+    groups = view_groups(scenes)
     shapes = [list(run) for _, run in groupby(groups, key=lambda group: group[0].shape)]
     number, skip = divmod(start, len(scenes))
     while True:
@@ -86,7 +83,7 @@ def stream_order(
 
 
 def rendered_scenes(
-    scenes: Sequence[SceneSpec], *, seed: int, start: int = 0, group_size: int = GROUP_SIZE
+    scenes: Sequence[SceneSpec], *, seed: int, start: int = 0
 ) -> Iterator[tuple[SceneSpec, RenderedScene]]:
     """Render the scenes of `stream_order` in this process, one by one as they are asked for.
 
@@ -94,7 +91,6 @@ def rendered_scenes(
         scenes: The plan, views whole and the views of a shape together.
         seed: Seed of the order.
         start: Number of the first scene.
-        group_size: Most materials that share rays; the bytes of a scene depend on it.
 
     Raises:
         InputError: an unusable shape or material, an object outside the frame, or images that are not finite.
@@ -103,7 +99,7 @@ def rendered_scenes(
 
     from render.running import worker
 
-    order = stream_order(scenes, seed=seed, start=start, group_size=group_size)
+    order = stream_order(scenes, seed=seed, start=start)
     for shape, run in groupby(order, key=lambda item: item[0][0].shape):
         built, stages = worker.build(worker.load_shape(shape)), worker.Stages()
         for group, skip in run:

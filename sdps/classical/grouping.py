@@ -21,6 +21,9 @@ _log = logging.getLogger(__name__)
 _SAMPLES = 20000
 """Most pixels that are grouped; the rest has no say in three numbers."""
 
+_NORMAL_GROUPS, _ALBEDO_GROUPS = 200, 20
+"""K of the profiles, and of the chromaticities."""
+
 _STEPS = 15
 """Iterations of k-means."""
 
@@ -36,8 +39,6 @@ def grouping(
     mask: np.ndarray,
     *,
     front: Front = "low-rank",
-    normal_groups: int = 200,
-    albedo_groups: int = 20,
     draws: int = 50,
     seed: int = 0,
 ) -> Estimate:
@@ -57,8 +58,6 @@ def grouping(
         images: (L, H, W, 3), linear radiance; white lights, or lights of one colour.
         mask: (H, W) bool.
         front: How highlights and shadows are kept out of the factorisation; see `prepare`.
-        normal_groups: K of the profiles.
-        albedo_groups: K of the chromaticities.
         draws: Random choices of pixels.
         seed: Root seed of the groups and choices.
 
@@ -71,13 +70,13 @@ def grouping(
         InputError: grey images, parameters out of range, no draw that gives a real transformation, or degenerate
             input; see `prepare`.
     """
-    if min(normal_groups, albedo_groups, draws) < 1:
-        raise InputError("normal_groups, albedo_groups and draws must be at least 1")
+    if draws < 1:
+        raise InputError(f"draws must be at least 1, got {draws}")
     if np.ndim(images) != 4 or np.shape(images)[-1] != 3:
         raise InputError(f"grouping by colour needs images (L, H, W, 3), got {np.shape(images)}; use `entropy` instead")
     prepared = prepare(images, mask, front=front)
     rng = generator(seed, "grouping")
-    pixels, albedo, normal = _groups(prepared, normal_groups, albedo_groups, rng)
+    pixels, albedo, normal = _groups(prepared, rng)
     standard = standard_form(prepared.factors)
     best, found = _best_draw(prepared.factors.transformed(standard).surface[pixels], albedo, normal, draws, rng)
     return conclude(prepared, standard.then(best), found)
@@ -135,9 +134,7 @@ def solve_groups(surface: np.ndarray, groups: np.ndarray) -> Gbr | None:
     return Gbr(float(found[0]), float(found[1]), float(np.sqrt(squared)))
 
 
-def _groups(
-    prepared: Prepared, normal_groups: int, albedo_groups: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _groups(prepared: Prepared, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pixels (N,) worth using, and the albedo and the normal group of each, (N,) int."""
     brightness = prepared.profiles.mean(1)
     pixels = rng.permutation(np.flatnonzero(brightness > _DARK * np.median(brightness)))[:_SAMPLES]
@@ -146,14 +143,14 @@ def _groups(
     spread = np.sqrt(chromaticity.var(0).sum())
     labels = np.zeros(len(pixels), int)
     if spread > _TIGHT:
-        labels = _k_means(chromaticity, albedo_groups, rng)
+        labels = _k_means(chromaticity, _ALBEDO_GROUPS, rng)
     keep, labels = _tight_groups(chromaticity, labels)
     if labels.max() == 0:
         _log.warning("the object has a single chromaticity; one albedo is assumed for all of it")
     profiles = prepared.cleaned[pixels[keep]]
     profiles = profiles - profiles.mean(1, keepdims=True)
     profiles /= np.maximum(np.linalg.norm(profiles, axis=1, keepdims=True), 1e-12)  # Euclid is now correlation
-    return pixels[keep], labels, _k_means(profiles, normal_groups, rng)
+    return pixels[keep], labels, _k_means(profiles, _NORMAL_GROUPS, rng)
 
 
 def _k_means(points: np.ndarray, groups: int, rng: np.random.Generator) -> np.ndarray:  # (N,) int

@@ -79,12 +79,8 @@ class LightClasses:
 
     def encode(self, directions: Array, intensities: Array) -> tuple[Array, Array, Array]:
         """Return azimuth, elevation and intensity classes, each (...) int64, of (..., 3) and (...)."""
-        azimuth, elevation = azimuth_elevation(directions)
-        return (
-            bin_index(azimuth, -90.0, 90.0, self.directions),
-            bin_index(elevation, -90.0, 90.0, self.directions),
-            bin_index(intensities, self.low, self.high, self.intensities),
-        )
+        values = (*azimuth_elevation(directions), intensities)
+        return tuple(bin_index(part, *span) for part, span in zip(values, self._spans(), strict=True))
 
     def encode_soft(
         self, directions: torch.Tensor, intensities: torch.Tensor
@@ -107,9 +103,9 @@ class LightClasses:
 
     def decode(self, azimuth: Array, elevation: Array, intensity: Array) -> tuple[Array, Array]:
         """Return the unit direction (..., 3) and intensity (...) at the centre of each class."""
-        azimuth = bin_centre(azimuth, -90.0, 90.0, self.directions)
-        elevation = bin_centre(elevation, -90.0, 90.0, self.directions)
-        return unit_direction(azimuth, elevation), bin_centre(intensity, self.low, self.high, self.intensities)
+        pairs = zip((azimuth, elevation, intensity), self._spans(), strict=True)
+        azimuth, elevation, intensity = (bin_centre(part, *span) for part, span in pairs)
+        return unit_direction(azimuth, elevation), intensity
 
     def read_out(
         self,

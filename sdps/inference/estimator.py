@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,7 +50,6 @@ class Estimator(InferenceConfig):
         second: Trained second lighting pass. It sees the normals that `normals` finds at 128x128 under the first
             lights; `normals` then works again, under the second lights.
         device: Where all networks are.
-        antialias: Average when the lighting networks' input is shrunk to 128x128 (the authors' code only interpolates).
         chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images. None: what
             suits the device.
 
@@ -63,7 +61,6 @@ class Estimator(InferenceConfig):
     normals: TrainedModel | None
     second: TrainedModel | None = None
     device: torch.device
-    antialias: bool = True
     chunk_pixels: int | None = None
 
     def __post_init__(self) -> None:
@@ -192,7 +189,7 @@ class Estimator(InferenceConfig):
         lights = self._lighting_pass("lighting", scene, read_out, diagnostics)
         if self.second is not None:
             first = self._merged(known, lights)
-            small = self._view(scene, "normals", known.balance, self._shrink, INPUT_SIZE**2, diagnostics)
+            small = self._view(scene, "normals", known.balance, resize_input, INPUT_SIZE**2, diagnostics)
             normals, mask = self._normals(small, first), small.mask
 
             def context(part: slice) -> Tensor:
@@ -216,7 +213,7 @@ class Estimator(InferenceConfig):
     ) -> Lights:
         """Return the lights (1, L, ...) that the lighting network in `place` finds, with test-time augmentation."""
         network = getattr(self, place).network
-        view = self._view(scene, place, None, self._shrink, INPUT_SIZE**2, diagnostics)
+        view = self._view(scene, place, None, resize_input, INPUT_SIZE**2, diagnostics)
         views = self.light_views or 1
         if views > 1:
             view = KeptView(view)
@@ -253,10 +250,6 @@ class Estimator(InferenceConfig):
         diagnostics["exposure"][place] = exposure.scale
         chunk = self.chunk_pixels or _CHUNK_PIXELS.get(self.device.type, 2**19)
         return View(scene, exposure, balance, fit, max(1, chunk // pixels), self.device)
-
-    @property
-    def _shrink(self) -> Any:
-        return partial(resize_input, antialias=self.antialias)
 
     def _mean_intensity(self) -> float:
         model = self.lighting if self.normals is None else self.normals

@@ -17,21 +17,18 @@ _BLOCK = 8192
 """Rows handled at a time, so that intermediate results stay in the processor's cache."""
 
 
-def robust_low_rank(
-    matrix: np.ndarray,
-    *,
-    sparsity: float | None = None,
-    tolerance: float = 1e-5,
-    limit: int = 200,
-    progress: bool = False,
-) -> np.ndarray:
+_TOLERANCE = 1e-5
+"""Share of |matrix| that |matrix - A - E| may be in the end."""
+
+
+def robust_low_rank(matrix: np.ndarray, *, limit: int = 200, progress: bool = False) -> np.ndarray:
     """Return the low-rank part A of `matrix` = A + E that minimises |A|_* + gamma |E|_1.
+
+    gamma is k / sqrt(P) with the k of Favaro & Papadhimitri (CVPR 2012): 1.7 from 12 images up, 3 for 5, linear in
+    between.
 
     Args:
         matrix: (P, L), one intensity profile per row; many more rows than columns.
-        sparsity: k in gamma = k / sqrt(P). None for the value of Favaro & Papadhimitri (CVPR 2012): 1.7 from 12 images
-            up, 3 for 5, linear in between.
-        tolerance: Stop when |matrix - A - E| is this share of |matrix|.
         limit: Most iterations; a warning says when they did not suffice.
         progress: Show a progress bar.
 
@@ -40,8 +37,7 @@ def robust_low_rank(
     """
     data = np.asarray(matrix, np.float32)
     rows, columns = data.shape
-    k = float(np.interp(columns, [5, 12], [3.0, 1.7])) if sparsity is None else sparsity
-    gamma = k / np.sqrt(max(rows, columns))
+    gamma = float(np.interp(columns, [5, 12], [3.0, 1.7])) / np.sqrt(max(rows, columns))
     norm, spectral = float(np.linalg.norm(data)), float(np.sqrt(np.linalg.eigvalsh(data.T @ data)[-1]))
     if norm == 0.0:
         return data.astype(np.float64)
@@ -52,7 +48,7 @@ def robust_low_rank(
         gram = _without_sparse(data, low, dual, work, gamma, penalty)
         missed = _update(work, _shrinkage(gram, 1.0 / penalty).astype(np.float32), low, dual, penalty)
         penalty = min(penalty * growth, largest)
-        if missed < (tolerance * norm) ** 2:
+        if missed < (_TOLERANCE * norm) ** 2:
             break
     else:
         _log.warning("the robust low-rank split did not settle in %d steps; its result is approximate", limit)

@@ -89,12 +89,13 @@ def test_shard_holds_what_the_manifest_says(scenes, whole, tmp_path):
     json.dumps(shard.provenance)
 
 
-def test_groups_share_rays_only_within_a_view(scenes):
-    groups = list(view_groups(scenes, 2))
+def test_groups_share_rays_only_within_a_view(scenes, monkeypatch):
+    monkeypatch.setattr("render.planning.chunks.GROUP_SIZE", 2)
+    groups = list(view_groups(scenes))
     assert [len(group) for group in groups] == [2, 1] * 4
     assert [scene for group in groups for scene in group] == scenes
     other = replace(scenes[1], spp=8)
-    assert len(list(view_groups([scenes[0], other], 16))) == 2
+    assert len(list(view_groups([scenes[0], other]))) == 2
 
 
 def test_lights_brighten_the_side_they_stand_on(tmp_path):
