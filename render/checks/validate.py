@@ -123,13 +123,12 @@ def validate(
                 pixels[result.pixels].append(result.scene)
             bar.update()
     findings += find_duplicates(pixels)
-    order = list(CHECKS)
     return Validation(
         folder=folder,
         planned=len(scenes),
         left=sum(scene.id not in present for scene in scenes),
         checked=len(chosen),
-        findings=tuple(sorted(findings, key=lambda one: (order.index(one.check), -one.severity, one.where))),
+        findings=tuple(sorted(findings, key=_rank)),
         statistics=_spread(statistics),
         limits=limits,
         manifest=file_hash(folder / MANIFEST),
@@ -179,6 +178,11 @@ def _results(tasks: Sequence[tuple], workers: int) -> Iterator[ShardResult]:
             yield from pool.map(check_one, tasks, chunksize=max(1, min(16, len(tasks) // (4 * workers))))
         except BrokenProcessPool as error:
             raise InputError("a checking process died, likely for want of memory; use fewer --workers") from error
+
+
+def _rank(finding: Finding) -> tuple[int, float, str]:
+    """Return what findings are sorted by: check, then severity, the worst first."""
+    return list(CHECKS).index(finding.check), -finding.severity, finding.where
 
 
 def _spread(statistics: Sequence[SceneStatistics]) -> dict[str, dict[str, float]]:
