@@ -238,9 +238,9 @@ def test_a_disk_that_refuses_concerns_the_whole_run(scenes, tmp_path):
 
 def test_shapes_and_views_that_fail_take_their_scenes_along(scenes, tmp_path):
     sound, told = work([replace(scene, shape="gone.obj") for scene in scenes[:3]], tmp_path)
-    assert sound and told[-1][1] == [scene.id for scene in scenes[:3]] and "gone.obj" in told[-1][2]
+    assert sound and told[-1].ids == tuple(scene.id for scene in scenes[:3]) and "gone.obj" in told[-1].reason
     lost = View(scale=0.05, offset=(4.0, 0.0))
     sound, told = work([replace(scenes[0], view=lost, id="a"), scenes[3]], tmp_path)
-    failed = [message for message in told if message[0] == "failed"]
-    assert sound and [message[1] for message in failed] == [["a"]] and "outside the frame" in failed[0][2]
+    (failed,) = [message for message in told if isinstance(message, Failed)]
+    assert sound and failed.ids == ("a",) and "outside the frame" in failed.reason
     assert (tmp_path / scenes[3].file).is_file()
