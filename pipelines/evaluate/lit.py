@@ -53,6 +53,6 @@ def lit_object(scene: SceneSpec, folder: Path, config: TestConfig, repeat: int =
         load=lambda: photographs(shard, gains),
         mask=shard.mask,
         normals=shard.normals,
-        light_directions=shard.light_directions,
+        light_directions=scene.light_directions(),
         intensities=gains,
     )

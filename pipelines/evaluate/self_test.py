@@ -49,7 +49,7 @@ def photograph_bunny(folder: Path, material: str = "red-phenolic") -> Path:
         write_png(folder / "mask.png", shard.mask.astype(np.uint8) * 255)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another --out") from error
-    truth = {"shard": scene.file, "intensities": gains.tolist(), "directions": shard.light_directions.tolist()}
+    truth = {"shard": scene.file, "intensities": gains.tolist(), "directions": scene.light_directions().tolist()}
     write_json(rendered / "lights.json", truth)
     return folder
 

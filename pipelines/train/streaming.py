@@ -14,7 +14,7 @@ from pipelines.shared.presets import Preset
 from pipelines.shared.stream_config import StreamConfig
 from render.planning import budget
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
-from render.running.scene_stream import StreamOrders, serve
+from render.running.scene_stream import StreamWorkerConfig, serve
 from render.running.supervisor import render_supervised
 from render.shared.errors import InputError
 from sdps.data.dataset import SampleOptions
@@ -49,7 +49,7 @@ class RenderStream:
     def _start(self) -> None:
         """Start a process at the next scene, unless the stream has been closed meanwhile."""
         config = self._config
-        orders = StreamOrders(
+        worker = StreamWorkerConfig(
             scenes=self._scenes,
             seed=self._seed,
             start=self._number,
@@ -62,7 +62,7 @@ class RenderStream:
             if self._closed:
                 raise InputError("the stream of rendered scenes is closed")
             self._connection, theirs = context.Pipe(duplex=False)
-            self._process = context.Process(target=self._serve, args=(theirs, orders), daemon=True)
+            self._process = context.Process(target=self._serve, args=(theirs, worker), daemon=True)
             self._process.start()
             theirs.close()  # so that the pipe ends when the process does
 

@@ -2,27 +2,18 @@
 
 import os
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 from render.checks.known_checks import Finding
 from render.planning.composition import IMPORTED, family
+from render.records.ledger import SHARDS
 from render.records.manifest import MANIFEST, SceneSpec
 from render.records.shards import file_hash
 from render.shared.files import read_text
 
 CHECKSUMS = "checksums.txt"
-
-
-def present_files(folder: Path) -> set[str]:
-    """List the names of the shard files, finished ones only."""
-    shards = folder / "shards"
-    if not shards.is_dir():
-        return set()
-    return {
-        entry.name for entry in os.scandir(shards) if entry.name.endswith(".exr") and not entry.name.startswith(".")
-    }
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
@@ -34,13 +25,15 @@ def read_checksums(folder: Path) -> dict[str, str]:
     return {row[1].lstrip("*"): row[0] for row in rows if len(row) == 2}
 
 
-def check_folder(folder: Path, scenes: Sequence[SceneSpec], present: set[str], sums: dict[str, str]) -> list[Finding]:
+def check_folder(
+    folder: Path, scenes: Sequence[SceneSpec], present: Collection[str], sums: dict[str, str]
+) -> list[Finding]:
     """Check the manifest against itself, its checksum and the files.
 
     Args:
         folder: Data folder.
         scenes: The manifest.
-        present: Names of the shard files, see `present_files`.
+        present: Ids of the scenes that have a shard file.
         sums: Checksums by relative path, see `read_checksums`.
     """
     findings = []
@@ -57,9 +50,9 @@ def check_folder(folder: Path, scenes: Sequence[SceneSpec], present: set[str], s
         first, *others = (ids[number - 1] for number in numbers)
         message = f"same shape, material, view and lights as {', '.join(others[:5])}"
         findings.append(Finding("twins", first, message, len(numbers)))
-    planned = {Path(scene.file).name for scene in scenes}
-    findings += [Finding("unplanned", f"shards/{name}", "no manifest line") for name in sorted(present - planned)]
-    for place in (folder, folder / "shards"):
+    unplanned = sorted(f"{SHARDS}/{id}.exr" for id in set(present) - set(ids))
+    findings += [Finding("unplanned", name, "no manifest line") for name in unplanned]
+    for place in (folder, folder / SHARDS):
         if place.is_dir():
             names = sorted(entry.name for entry in os.scandir(place) if _is_temporary(entry.name))
             findings += [Finding("temporary", str((place / name).relative_to(folder)), "left behind") for name in names]

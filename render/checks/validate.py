@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from render.checks.folder_checks import CHECKSUMS, check_folder, find_duplicates, present_files, read_checksums
+from render.checks.folder_checks import CHECKSUMS, check_folder, find_duplicates, read_checksums
 from render.checks.known_checks import CHECKS, ERROR, WARNING, Finding, check_shard
 from render.checks.shard_checks import Limits
 from render.checks.statistics import SceneStatistics, measure, summarise
+from render.records.ledger import shard_sizes
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
 from render.records.shards import file_hash, read_shard
 from render.shared.config import to_plain
@@ -101,9 +102,9 @@ def validate(
     if workers < 1 or (limit is not None and limit < 1):
         raise InputError("--workers and --limit must be at least 1")
     scenes = read_manifest(folder)
-    present = present_files(folder)
+    present = shard_sizes(folder)
     # An id that stands twice in the manifest is one file.
-    once = {scene.id: scene for scene in reversed(scenes) if Path(scene.file).name in present}
+    once = {scene.id: scene for scene in reversed(scenes) if scene.id in present}
     there = [scene for scene in scenes if once.get(scene.id) is scene]
     chosen = there
     if limit is not None and limit < len(there):
@@ -125,9 +126,9 @@ def validate(
     return Validation(
         folder=folder,
         planned=len(scenes),
-        left=sum(Path(scene.file).name not in present for scene in scenes),
+        left=sum(scene.id not in present for scene in scenes),
         checked=len(chosen),
-        findings=tuple(_ordered(findings)),
+        findings=tuple(sorted(findings, key=_rank)),
         statistics=_spread(statistics),
         limits=limits,
         manifest=file_hash(folder / MANIFEST),
@@ -179,10 +180,9 @@ def _results(tasks: Sequence[tuple], workers: int) -> Iterator[ShardResult]:
             raise InputError("a checking process died, likely for want of memory; use fewer --workers") from error
 
 
-def _ordered(findings: Sequence[Finding]) -> list[Finding]:
-    """Sort by check, then by severity, the worst first."""
-    order = {name: number for number, name in enumerate(CHECKS)}
-    return sorted(findings, key=lambda finding: (order[finding.check], -finding.severity, finding.where))
+def _rank(finding: Finding) -> tuple[int, float, str]:
+    """Return what findings are sorted by: check, then severity, the worst first."""
+    return list(CHECKS).index(finding.check), -finding.severity, finding.where
 
 
 def _spread(statistics: Sequence[SceneStatistics]) -> dict[str, dict[str, float]]:

@@ -52,7 +52,8 @@ def export(folder: str | Path, out: str | Path, options: ExportOptions, scenes: 
     folder, root, layout = Path(folder), Path(out), LAYOUTS[options.layout]
     planned = read_manifest(folder)
     _check_shards(folder, scenes)
-    record = options.settings() | {"manifest": file_hash(folder / MANIFEST), "versions": _versions()}
+    versions = {"sdps": metadata.version("sdps"), "numpy": np.__version__, "opencv": cv2.__version__}
+    record = options.settings() | {"manifest": file_hash(folder / MANIFEST), "versions": versions}
     places = layout.places(planned)
     chosen = {scene.id for scene in scenes}
     there = [scene for scene in planned if scene.id in chosen or _marker(root, layout, places[scene.id], scene)]
@@ -153,8 +154,3 @@ def _entry(layout: Layout, place: Place, marker: dict[str, Any]) -> dict[str, An
     folder = f"{layout.base}/{layout.folder(place)}".lstrip("/")
     kept = ("shape", "material", "split", "exposure", "clipped", "black", "sha256", "spec")
     return {"folder": folder} | {key: marker[key] for key in kept}
-
-
-def _versions() -> dict[str, str]:
-    """Return the versions of what wrote the tree."""
-    return {"sdps": metadata.version("sdps"), "numpy": np.__version__, "opencv": cv2.__version__}

@@ -1,7 +1,8 @@
 """Samples of foreign trees: what the readers of each layout list, with the pixels of one read at a time."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,8 @@ import numpy as np
 from render.exchange.folders import MARKER, read_record
 from render.shared.errors import InputError
 from render.shared.images import bit_depth, read_image, to_unit
+
+Note = Callable[[str], None]
 
 
 class Truth(NamedTuple):
@@ -65,19 +68,7 @@ class Source:
         Raises:
             InputError: a missing or damaged picture, or one of another size or depth than the others.
         """
-        result, bits = np.empty((len(self.images), *size, 3), np.float32), None
-        for index, name in enumerate(self.images):
-            pixels = read_image(self.folder / name)
-            if pixels.shape[:2] != size:
-                raise InputError(
-                    f"{self.folder / name}: is {size_text(pixels.shape)}, the mask or normal map is {size_text(size)} "
-                    "(height x width); give all pictures of a sample one size"
-                )
-            bits = bits or bit_depth(pixels)
-            if bit_depth(pixels) != bits:
-                raise InputError(f"{self.folder / name}: {bit_depth(pixels)} bits, the others {bits}; save all alike")
-            result[index] = to_unit(pixels) / self.intensities[index].astype(np.float32)
-        return result, bits
+        return read_stack([self.folder / name for name in self.images], size, self.intensities)
 
     def digest(self) -> str:
         """Return the SHA-256 of all image files and the file of the normals, in order."""
@@ -85,6 +76,40 @@ class Source:
         for path in [*(self.folder / name for name in self.images), self.truth().origin]:
             digest.update(path.read_bytes())
         return digest.hexdigest()
+
+
+def read_stack(paths: Sequence[Path], size: tuple[int, int], intensities: np.ndarray) -> tuple[np.ndarray, int]:
+    """Read pictures of a size (H, W) under lights of intensities (L, 3); see `Source.stack`."""
+    result, bits = np.empty((len(paths), *size, 3), np.float32), None
+    for image, path, intensity in zip(result, paths, intensities, strict=True):
+        pixels = read_image(path)
+        if pixels.shape[:2] != size:
+            raise InputError(
+                f"{path}: is {size_text(pixels.shape)}, the mask or normal map is {size_text(size)} (height x width); "
+                "give all pictures of a sample one size"
+            )
+        bits = bits or bit_depth(pixels)
+        if bit_depth(pixels) != bits:
+            raise InputError(f"{path}: {bit_depth(pixels)} bits, the others {bits}; save all alike")
+        image[:] = to_unit(pixels) / intensity.astype(np.float32)
+    return result, bits
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Read a picture as a mask (H, W) bool: above half brightness."""
+    pixels = read_image(path, channels=None)
+    return pixels > np.iinfo(pixels.dtype).max // 2
+
+
+@contextmanager
+def noted(note: Note | None) -> Iterator[None]:
+    """Give the complaint of an InputError to `note`; without one it is raised."""
+    try:
+        yield
+    except InputError as error:
+        if note is None:
+            raise
+        note(str(error))
 
 
 def checked_truth(normals: np.ndarray, mask: np.ndarray, origin: Path) -> Truth:

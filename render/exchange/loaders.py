@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.exchange.folders import MARKER, read_record
-from render.exchange.foreign_samples import Source
+from render.exchange.foreign_samples import Note, Source, read_mask, read_stack
 from render.exchange.read_diligent import diligent_sources
 from render.exchange.read_psfcn import psfcn_sources
 from render.shared.errors import InputError
@@ -15,8 +15,6 @@ from render.shared.images import MASK_THRESHOLD, bit_depth, decode_normals, read
 from render.shared.tables import check_directions, natural_key, read_names, read_numbers
 
 _LENGTH_TOLERANCE = 0.03  # 8-bit normals deviate from unit length by at most sqrt(3) / 255 = 0.007
-
-Note = Callable[[str], None]
 
 
 class Pictures(NamedTuple):
@@ -142,14 +140,8 @@ def _object_pictures(
     note: Note,
 ) -> Pictures:  # fmt: skip
     """Read images, mask and, if it is there, the normal map of an object with a mask of its own."""
-    mask = read_image(folder / "mask.png", channels=None)
-    mask = mask > (255 if mask.dtype == np.uint8 else 65535) // 2
-    images = []
-    for index, name in enumerate(names):
-        pixels = read_image(folder / name)
-        if pixels.shape[:2] != mask.shape:
-            raise InputError(f"{folder / name}: is {pixels.shape[:2]}, mask.png is {mask.shape}; give both one size")
-        images.append(to_unit(pixels) / intensities[index].astype(np.float32))
+    mask = read_mask(folder / "mask.png")
+    images, _ = read_stack([folder / name for name in names], mask.shape, intensities)
     normals = np.zeros((*mask.shape, 3), np.float32)
     path = folder / normal_name
     if path.is_file():
@@ -159,7 +151,7 @@ def _object_pictures(
         normals, found = decode_normals(coded)
         if (mask & ~found).any():
             note(f"{path}: {int((mask & ~found).sum())} pixels of mask.png have no normal; shrink it")
-    return Pictures(folder, np.stack(images), normals, mask, directions)
+    return Pictures(folder, images, normals, mask, directions)
 
 
 SAMPLES: Mapping[str, Callable[[Path, Note], Samples]] = {

@@ -1,20 +1,28 @@
 """Reading DiLiGenT folders (Shi et al. 2016)."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
-from render.exchange.foreign_samples import Source, Truth, checked_truth, refuse_several, size_text
+from render.exchange.foreign_samples import (
+    Note,
+    Source,
+    Truth,
+    checked_truth,
+    noted,
+    read_mask,
+    refuse_several,
+    size_text,
+)  # fmt: skip
 from render.shared.errors import InputError
 from render.shared.files import read_text
 from render.shared.images import decode_normals, read_image
 from render.shared.tables import check_directions, natural_key, read_names, read_numbers
 
 
-def diligent_sources(tree: str | Path, note: Callable[[str], None] | None = None) -> list[Source]:
+def diligent_sources(tree: str | Path, note: Note | None = None) -> list[Source]:
     """List the objects of a DiLiGenT folder: its root, the folder above `pmsData`, or one object's folder.
 
     Args:
@@ -39,12 +47,8 @@ def diligent_sources(tree: str | Path, note: Callable[[str], None] | None = None
         raise InputError(f"{root}: no folder with light_directions.txt; give DiLiGenT's pmsData or one <object>PNG")
     sources = []
     for folder in folders:
-        try:
+        with noted(note):
             sources.append(_diligent_source(folder, root))
-        except InputError as error:
-            if note is None:
-                raise
-            note(str(error))
     return sources
 
 
@@ -75,8 +79,7 @@ def _diligent_truth(folder: Path) -> Truth:
 
     The .mat comes first, because harvest's normal.txt is upside down in the published archive.
     """
-    mask = read_image(folder / "mask.png", channels=None)
-    mask = mask > (255 if mask.dtype == np.uint8 else 65535) // 2
+    mask = read_mask(folder / "mask.png")
     origins = [folder / name for name in ("Normal_gt.mat", "normal.txt", "Normal_gt.png")]
     origin = next((path for path in origins if path.is_file()), None)
     if origin is None:

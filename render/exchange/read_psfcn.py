@@ -1,11 +1,10 @@
 """Reading PS-FCN / SDPS-Net training trees, as strictly as their loaders."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from render.exchange.foreign_samples import Source, Truth, checked_truth, refuse_several
+from render.exchange.foreign_samples import Note, Source, Truth, checked_truth, noted, refuse_several
 from render.shared.errors import InputError
 from render.shared.files import read_text
 from render.shared.images import decode_normals, read_image
@@ -14,7 +13,7 @@ from render.shared.tables import read_light_list, read_names
 SPLIT_LISTS = ("train", "val", "test")
 
 
-def psfcn_sources(tree: str | Path, note: Callable[[str], None] | None = None) -> list[Source]:
+def psfcn_sources(tree: str | Path, note: Note | None = None) -> list[Source]:
     """List the samples of a PS-FCN / SDPS-Net training tree, by its train, val and test lists.
 
     Args:
@@ -34,15 +33,11 @@ def psfcn_sources(tree: str | Path, note: Callable[[str], None] | None = None) -
         if not path.is_file() or not read_text(path).strip():
             continue
         for entry in read_names(path):
-            try:
+            with noted(note):
                 if entry in seen:
                     raise InputError(f"{path}: {entry!r} is in {seen[entry].name} too; keep it in one list")
                 seen[entry] = path
                 sources.append(_psfcn_source(root, entry, split, path))
-            except InputError as error:
-                if note is None:
-                    raise
-                note(str(error))
     if not sources:
         raise InputError(f"{root}: its lists name no sample; write '<shape>/<material>' lines into train_mtrl.txt")
     return sources

@@ -4,8 +4,6 @@ The rules are those of docs/reference/formats.md. Reading goes through the stric
 violation is one line that starts with the file it is in.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,8 +11,9 @@ import numpy as np
 
 from render.exchange import frame
 from render.exchange.folders import MARKER, read_record
+from render.exchange.foreign_samples import Note, noted
 from render.exchange.layouts import LAYOUTS
-from render.exchange.loaders import SAMPLES, Note, Pictures, Samples
+from render.exchange.loaders import SAMPLES, Pictures, Samples
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import read_shard
 from render.shared.errors import InputError, unknown
@@ -54,14 +53,14 @@ def check_tree(
     planned = {scene.id: scene for scene in read_manifest(source)} if source is not None else {}
     samples: Samples = []
     note = report.violations.append
-    with _collect(note):
+    with noted(note):
         samples = SAMPLES[layout](root, note)
     report.samples = len(samples)
     if limit is not None and limit < len(samples):
         samples = [samples[place] for place in np.linspace(0, len(samples) - 1, limit).round().astype(int)]
     counts = set()
     for load in progress_bar(samples, unit="sample", desc=f"check {layout}"):
-        with _collect(note):
+        with noted(note):
             pictures = load()
             counts.add(len(pictures.images))
             _check_pictures(pictures, note)
@@ -69,15 +68,6 @@ def check_tree(
                 _compare(pictures, Path(source), planned, note)
     report.lights = (min(counts, default=0), max(counts, default=0))
     return report
-
-
-@contextmanager
-def _collect(note: Note) -> Iterator[None]:
-    """Note an InputError as a violation."""
-    try:
-        yield
-    except InputError as error:
-        note(str(error))
 
 
 def _check_pictures(pictures: Pictures, note: Note) -> None:

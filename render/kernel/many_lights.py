@@ -14,7 +14,7 @@ heuristic, Veach 1997, eq. 9.15), and narrow highlights sampled from the lights'
 (`render.kernel.highlights`). The slow counterpart is `render.kernel.reference`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,30 +77,32 @@ def render(
               seed=seed, first=first, probe=probe)
         for first in range(0, spp, per_pass)
     )  # fmt: skip
-    first_pass = next(passes)
     if per_pass >= spp:  # shaded one by one as they are asked for, so that a hundred materials need no more memory
-        images = ((index, _averaged(stack, spp)) for index, stack in shade(first_pass, surfaces, wanted))
-        return _ground_truth([first_pass], size, spp), images
-    stacks = dict(shade(first_pass, surfaces, wanted))
-    truths = [_without_paths(first_pass)]
-    del first_pass
-    for paths in passes:
-        truths.append(_without_paths(paths))
-        for index, stack in shade(paths, surfaces, wanted):
-            stacks[index] += stack
+        (only_pass,) = passes
+        images = ((index, _averaged(stack, spp)) for index, stack in shade(only_pass, surfaces, wanted))
+        return _ground_truth([only_pass], size, spp), images
+    truths, stacks = _summed(passes, surfaces, wanted)
     images = ((index, _averaged(stacks.pop(index), spp)) for index in wanted)
     return _ground_truth(truths, size, spp), images
+
+
+def _summed(passes: Iterable[Paths], surfaces: PackedSurfaces, wanted: Sequence[int]) -> tuple[list[Paths], dict]:
+    """Return the passes without their vertices, whose memory is freed one by one, and the sums of their images."""
+    truths, stacks = [], {}
+    for paths in passes:
+        truths.append(replace(paths, depths=(), glints=None))
+        for index, stack in shade(paths, surfaces, wanted):
+            if index in stacks:
+                stacks[index] += stack
+            else:
+                stacks[index] = stack
+    return truths, stacks
 
 
 def _averaged(image: np.ndarray, spp: int) -> np.ndarray:
     """Divide by the samples in place: the stack is the largest array there is."""
     image /= spp
     return image
-
-
-def _without_paths(paths: Paths) -> Paths:
-    """Keep only the ground truth of a pass, so that its vertices can be freed."""
-    return replace(paths, depths=(), glints=None)
 
 
 def _ground_truth(passes: list[Paths], size: int, spp: int) -> GroundTruth:

@@ -22,7 +22,7 @@ mi = variant.load()
 class Vertices:
     """Path vertices of one depth, sorted by pixel; all arrays are Dr.Jit, in the object frame.
 
-    `words` holds the visibility bits: bit b of entry `w * N + i` tells whether vertex i sees light 32 w + b.
+    `bitmask` is the visibility bitmask: bit b of entry `w * N + i` tells whether vertex i sees light 32 w + b.
     """
 
     count: int
@@ -30,7 +30,7 @@ class Vertices:
     normal: Any  # Vector3f (N), shading normal
     wi: Any  # Vector3f (N, or 1 at the camera hits), to the previous vertex
     sample: Any  # UInt32 (N), number of the camera sample
-    words: Any  # UInt32 (ceil(L / 32) * N)
+    bitmask: Any  # UInt32 (ceil(L / 32) * N)
     throughput: tuple  # K Color3f (N, or 1 at the camera hits): f cos / density along the path so far
     weights: tuple  # K tuples of Float (N), weights of each surface's materials; None for a single material
     spread: Any  # Float (N), d(solid angle of normals) / d(image area), or None where no highlight needs it
@@ -134,12 +134,12 @@ def trace(
         rays = (scene, position, normal, facet, directions, len(lights))
         if depth == 0 and probe:
             probes = sample % opaque(mi.UInt32(spp)) < opaque(mi.UInt32(probe_count(spp)))
-            words = probed_visibility(*rays, probes, segments[1:])
+            seen = probed_visibility(*rays, probes, segments[1:])
         else:
-            words = visibility(*rays, coherent=depth == 0)
+            seen = visibility(*rays, coherent=depth == 0)
         spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and glossy else None
         weights = surfaces.weights(position, prim)
-        depths.append(Vertices(len(kept), position, normal, wi, sample, words, throughput, weights, spread, *segments))
+        depths.append(Vertices(len(kept), position, normal, wi, sample, seen, throughput, weights, spread, *segments))
         if depth < bounces:
             ray, factors = _bounce(depths[-1], facet, surfaces, seed, depth + 1, first, spp)
             throughput = tuple(value * factor for value, factor in zip(throughput, factors, strict=True))

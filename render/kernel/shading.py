@@ -71,7 +71,7 @@ class _Lanes(NamedTuple):
     start: Any
     length: Any
     direction: Any
-    words: Any  # first entry of the light's words
+    entry: Any  # first of the light's in the visibility bitmask
     bit: Any
     target: Any  # of the red channel
 
@@ -86,7 +86,7 @@ def _lanes(paths: Paths, vertices: Vertices) -> _Lanes:
         start=dr.gather(mi.UInt32, vertices.start, pixel),
         length=dr.gather(mi.UInt32, vertices.length, pixel),
         direction=dr.gather(mi.Vector3f, paths.directions, light),
-        words=(light // WORD) * count,
+        entry=(light // WORD) * count,
         bit=light % WORD,
         target=3 * (light * opaque(mi.UInt32(paths.size**2)) + dr.gather(mi.UInt32, vertices.pixels, pixel)),
     )
@@ -97,7 +97,7 @@ def _accumulate(images: list, vertices: Vertices, lanes: _Lanes, reflect: Any) -
 
     def per_vertex(i: Any, *totals: Any) -> tuple:
         at = lanes.start + i
-        lit = ((dr.gather(mi.UInt32, vertices.words, lanes.words + at) >> lanes.bit) & 1) != 0
+        lit = ((dr.gather(mi.UInt32, vertices.bitmask, lanes.entry + at) >> lanes.bit) & 1) != 0
         values = dr.if_stmt((at,), lit, reflect, lambda at: tuple(mi.Color3f(0) for _ in images))
         return i + 1, *(total + value for total, value in zip(totals, values, strict=True))
 

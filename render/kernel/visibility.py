@@ -14,7 +14,7 @@ from render.backend.arrays import opaque
 
 mi = variant.load()
 
-WORD = 32  # lights per word
+WORD = 32  # lights per entry of a bitmask
 _LEAST_PROBES = 8
 _PROBED = 4  # one sample in so many probes, where there are more than the least
 
@@ -40,7 +40,8 @@ def visibility(scene: Any, position: Any, normal: Any, facet: Any, directions: A
         coherent: Whether neighbouring vertices are close to each other.
 
     Returns:
-        UInt32 (ceil(L / 32) * N): bit b of entry `w * N + i` tells whether vertex i sees light 32 w + b.
+        The visibility bitmask, UInt32 (ceil(L / 32) * N): bit b of entry `w * N + i` tells whether vertex i sees light
+        32 w + b.
     """
     return _cast(scene, position, normal, facet, directions, lights, coherent)[0]
 
@@ -62,21 +63,21 @@ def probed_visibility(
     at = [dr.gather(type(value), value, tested) for value in (position, normal, facet)]
     lit, facing = _cast(scene, *at, directions, lights, True)
     groups, total = -(-lights // WORD), opaque(mi.UInt32(count))
-    words = dr.zeros(mi.UInt32, count * groups)
+    bitmask = dr.zeros(mi.UInt32, count * groups)
     lane = dr.arange(mi.UInt32, len(tested) * groups)
     width = opaque(mi.UInt32(len(tested)))
     group = lane // width
     target = dr.fma(group, total, dr.gather(mi.UInt32, tested, lane - group * width))
     known = dr.zeros(mi.UInt32, count * groups)  # facing bits of the probes
-    dr.scatter(words, lit, target)
+    dr.scatter(bitmask, lit, target)
     dr.scatter(known, facing, target)
-    dr.eval(words, known)
-    agreed = _agreement(words, known, segments, total, groups)
-    return _complete(scene, (position, normal, facet), directions, words, probes, agreed, segments, lights)
+    dr.eval(bitmask, known)
+    agreed = _agreement(bitmask, known, segments, total, groups)
+    return _complete(scene, (position, normal, facet), directions, bitmask, probes, agreed, segments, lights)
 
 
 def _cast(scene: Any, position: Any, normal: Any, facet: Any, directions: Any, lights: int, coherent: bool) -> tuple:
-    """Return the words of lights seen, and of lights faced."""
+    """Return the bitmasks of lights seen, and of lights faced."""
     count, groups = dr.width(position), -(-lights // WORD)
     width, total = opaque(mi.UInt32(count)), opaque(mi.UInt32(lights))
     lane = dr.arange(mi.UInt32, count * groups)
@@ -95,8 +96,8 @@ def _cast(scene: Any, position: Any, normal: Any, facet: Any, directions: Any, l
     return seen, faced
 
 
-def _agreement(words: Any, faced: Any, segments: tuple, count: Any, groups: int) -> tuple:
-    """Return, per pixel, the words of lights that all facing probes see, and that none of them sees (groups * Q)."""
+def _agreement(bitmask: Any, faced: Any, segments: tuple, count: Any, groups: int) -> tuple:
+    """Return, per pixel, the bitmasks of lights that all facing probes see, and that none of them sees (groups * Q)."""
     start, length = segments
     width = opaque(mi.UInt32(dr.width(start)))
     lane = dr.arange(mi.UInt32, dr.width(start) * groups)
@@ -106,7 +107,7 @@ def _agreement(words: Any, faced: Any, segments: tuple, count: Any, groups: int)
 
     def per_vertex(i: Any, some: Any, missing: Any) -> tuple:
         at = dr.fma(group, count, first + i)
-        lit, facing = dr.gather(mi.UInt32, words, at), dr.gather(mi.UInt32, faced, at)
+        lit, facing = dr.gather(mi.UInt32, bitmask, at), dr.gather(mi.UInt32, faced, at)
         return i + 1, some | lit, missing | (facing & ~lit)
 
     state = (mi.UInt32(0), mi.UInt32(0), mi.UInt32(0))
@@ -117,9 +118,9 @@ def _agreement(words: Any, faced: Any, segments: tuple, count: Any, groups: int)
 
 
 def _complete(
-    scene: Any, at: tuple, directions: Any, words: Any, probes: Any, agreed: tuple, segments: tuple, lights: int
+    scene: Any, at: tuple, directions: Any, bitmask: Any, probes: Any, agreed: tuple, segments: tuple, lights: int
 ) -> Any:
-    """Fill in the words of the other vertices: what their pixel agrees on, and rays for the rest."""
+    """Fill in the bitmask of the other vertices: what their pixel agrees on, and rays for the rest."""
     count, groups = dr.width(probes), -(-lights // WORD)
     others = dr.compress(~probes)
     pixel = _pixel_of_vertex(segments, count)
@@ -129,15 +130,15 @@ def _complete(
     group = lane // width
     vertex = dr.gather(mi.UInt32, others, lane - group * width)
     entry = dr.fma(group, pixels, dr.gather(mi.UInt32, pixel, vertex))
-    seen, hidden = (dr.gather(mi.UInt32, word, entry) for word in agreed)
+    seen, hidden = (dr.gather(mi.UInt32, bits, entry) for bits in agreed)
     remaining = dr.minimum(total - group * WORD, WORD)
     used = dr.select(remaining == WORD, mi.UInt32(0xFFFFFFFF), (mi.UInt32(1) << remaining) - 1)
     asked, target = ~(seen | hidden) & used, dr.fma(group, opaque(mi.UInt32(count)), vertex)
-    dr.scatter(words, seen, target)
-    dr.eval(words, asked, target, group, vertex)
+    dr.scatter(bitmask, seen, target)
+    dr.eval(bitmask, asked, target, group, vertex)
     kept = dr.compress(asked != 0)
     if len(kept) == 0:
-        return words
+        return bitmask
     asked, target, first, vertex = (dr.gather(mi.UInt32, value, kept) for value in (asked, target, group, vertex))
     first *= WORD
     start, shading = _start(*at, vertex)
@@ -149,10 +150,10 @@ def _complete(
         lit = facing & ~scene.ray_test(start.spawn_ray(direction), True, facing)
         return left & (left - 1), bits | (mi.UInt32(lit) << b)
 
-    _, bits = dr.while_loop((asked, dr.gather(mi.UInt32, words, target)), lambda left, _: left != 0, per_bit)
-    dr.scatter(words, bits, target)
-    dr.eval(words)
-    return words
+    _, bits = dr.while_loop((asked, dr.gather(mi.UInt32, bitmask, target)), lambda left, _: left != 0, per_bit)
+    dr.scatter(bitmask, bits, target)
+    dr.eval(bitmask)
+    return bitmask
 
 
 def _start(position: Any, normal: Any, facet: Any, index: Any) -> tuple:

@@ -213,28 +213,24 @@ def write(
         InputError: a BRDF that returns values that are not finite or are negative, or a file that cannot be written.
     """
     theta = np.linspace(0, _STEEPEST, slices)
-    density = _warp_density(np.linspace(0, 1, _WARP_KNOTS))
-    tables = [_slice(brdf, angle, side) for angle in theta]
-    rgb, luminance = (np.stack(part) for part in zip(*tables, strict=True))
+    density, one = _warp_density(np.linspace(0, 1, _WARP_KNOTS)), np.ones((2, 2), np.float32)
+    rgb, luminance = (np.stack(part) for part in zip(*(_slice(brdf, angle, side) for angle in theta), strict=True))
     if not np.isfinite(rgb).all() or (rgb < 0).any():
         raise InputError(f"{path}: rgb: the BRDF has values that are negative or not finite; repair its table")
     # Nowhere zero, or light just above the horizon between two dark entries would never be sampled.
     luminance += 1e-4 * luminance.mean((1, 2), keepdims=True) + 1e-12
-    text = description.encode() or b"written by sdps"
-    write_fields(
-        path,
-        {
-            "description": np.frombuffer(text, np.uint8),
-            "jacobian": np.zeros(1, np.uint8),
-            "phi_i": np.zeros(1, np.float32),
-            "theta_i": theta.astype(np.float32),
-            "ndf": np.ones((2, 2), np.float32),
-            "sigma": np.ones((2, 2), np.float32),
-            "vndf": np.broadcast_to(density, (1, slices, 2, len(density))).astype(np.float32),
-            "luminance": luminance[None].astype(np.float32),
-            "rgb": rgb[None].astype(np.float32),
-        },
-    )
+    fields = {
+        "description": np.frombuffer(description.encode() or b"written by sdps", np.uint8),
+        "jacobian": np.zeros(1, np.uint8),
+        "phi_i": np.zeros(1, np.float32),
+        "theta_i": theta.astype(np.float32),
+        "ndf": one,
+        "sigma": one,
+        "vndf": np.broadcast_to(density, (1, slices, 2, len(density))).astype(np.float32),
+        "luminance": luminance[None].astype(np.float32),
+        "rgb": rgb[None].astype(np.float32),
+    }
+    write_fields(path, fields)
     return load(path)
 
 

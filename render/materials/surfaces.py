@@ -44,11 +44,6 @@ class Surface:
     components: tuple[Any, ...]
     pattern: Pattern | None = None
 
-    @property
-    def component_names(self) -> tuple[str, ...]:
-        """Names of the components, as `library.load` takes them."""
-        return split(self.name)[1]
-
 
 def split(name: str) -> tuple[Pattern | None, tuple[str, ...]]:
     """Split a name into its pattern, if it has one, and the names of its materials; nothing is loaded.

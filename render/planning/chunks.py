@@ -6,7 +6,7 @@ from itertools import groupby
 
 from render.records.manifest import SceneSpec
 
-GROUP_SIZE = 16  # most materials that share rays; the bytes of a shard depend on it
+GROUP_SIZE = 16  # most materials that share rays, and the mixture of bounce directions: it decides the bytes of shards
 VIEWS_PER_CHUNK = 16  # few enough that the end of a run keeps all workers busy, and a lost worker costs little
 
 
@@ -35,12 +35,12 @@ class Chunk:
         return replace(self, groups=groups, wanted=wanted) if groups else None
 
 
-def view_groups(scenes: Sequence[SceneSpec], group_size: int = GROUP_SIZE) -> Iterator[list[SceneSpec]]:
+def view_groups(scenes: Sequence[SceneSpec]) -> Iterator[list[SceneSpec]]:
     """Split the manifest into runs of scenes that differ only in id, split and material."""
     for _, run in groupby(scenes, key=_ray_key):
         group = list(run)
-        for first in range(0, len(group), group_size):
-            yield group[first : first + group_size]
+        for first in range(0, len(group), GROUP_SIZE):
+            yield group[first : first + GROUP_SIZE]
 
 
 def _ray_key(scene: SceneSpec) -> tuple:

@@ -42,8 +42,7 @@ class DataConfig:
             in), and one of these tiles, drawn at random, is the view. The published recipe has 4.
         min_foreground: Least share of the frame the shape must cover, by family; other views are drawn anew.
         min_normal_spread: Least degrees between the normals of a view and their mean (`render.planning.framing`), by
-        family;
-            views of flat facets are drawn anew.
+            family; views of flat facets are drawn anew.
     """
 
     seed: int = 0

@@ -56,6 +56,32 @@ Light k from Python:
 """
 
 
+# Lights have z > 0, so their `up` is never parallel to one. An emitter shines along its local +z.
+_SCENE = """<scene version="3.0.0">
+<default name="lx" value="{x}"/><default name="ly" value="{y}"/><default name="lz" value="{z}"/>
+<default name="irradiance" value="{irradiance}"/><default name="size" value="{size}"/>
+<default name="spp" value="{spp}"/><default name="seed" value="0"/>
+<integrator type="path"><integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="1000"/></integrator>
+<sensor type="orthographic">
+  <transform name="to_world"><lookat origin="0, 0, {distance}" target="0, 0, 0" up="0, 1, 0"/></transform>
+  <float name="near_clip" value="0.001"/><float name="far_clip" value="{far}"/>
+  <film type="hdrfilm">
+    <integer name="width" value="$size"/><integer name="height" value="$size"/><rfilter type="box"/>
+    <string name="pixel_format" value="rgb"/><string name="component_format" value="float32"/>
+  </film>
+  <sampler type="independent">
+    <integer name="sample_count" value="$spp"/><integer name="seed" value="$seed"/>
+  </sampler>
+</sensor>
+<emitter type="directional" id="light">
+  <transform name="to_world"><lookat origin="$lx, $ly, $lz" target="0, 0, 0" up="0, 1, 0"/></transform>
+  <rgb name="irradiance" value="$irradiance"/>
+</emitter>
+<shape type="ply" id="object"><string name="filename" value="{mesh}"/></shape>
+</scene>
+"""
+
+
 def save(folder: str | Path, spec: SceneSpec, mesh: TriangleMesh | None = None) -> Path:
     """Write one scene: `scene.xml`, `object.ply`, `lights.txt`, `README.txt`, and tables of its materials.
 
@@ -166,48 +192,16 @@ def _write_mesh(path: Path, mesh: TriangleMesh, shares: np.ndarray) -> None:
 
 def _scene(spec: SceneSpec, bsdf: ET.Element) -> ET.Element:
     """Return the scene of `render.kernel.reference.scene_dict` as XML, with parameters."""
-    scene = ET.Element("scene", version="3.0.0")
-    defaults = dict(zip(("lx", "ly", "lz"), (f"{value:.9g}" for value in spec.lights[0]), strict=True))
-    defaults |= {"irradiance": f"{np.pi:.9g}", "size": str(spec.size), "spp": str(spec.spp), "seed": "0"}
-    for name, value in defaults.items():
-        ET.SubElement(scene, "default", name=name, value=value)
-    integrator = ET.SubElement(scene, "integrator", type="path")
-    _integers(integrator, max_depth=spec.bounces + 2, rr_depth=1000)
-    scene.append(_sensor(4 * spec.view.scale))
-    # Lights have z > 0, so this `up` is never parallel to one. An emitter shines along its local +z.
-    emitter = ET.SubElement(scene, "emitter", type="directional", id="light")
-    _look_at(emitter, "$lx, $ly, $lz", "0, 0, 0")
-    ET.SubElement(emitter, "rgb", name="irradiance", value="$irradiance")
-    shape = ET.SubElement(scene, "shape", type="ply", id="object")
-    ET.SubElement(shape, "string", name="filename", value=MESH)
-    shape.append(bsdf)
+    x, y, z = (f"{value:.9g}" for value in spec.lights[0])
+    distance = 4 * spec.view.scale
+    scene = ET.fromstring(
+        _SCENE.format(
+            x=x, y=y, z=z, irradiance=f"{np.pi:.9g}", size=spec.size, spp=spec.spp, depth=spec.bounces + 2,
+            distance=f"{distance:.9g}", far=f"{2 * distance:.9g}", mesh=MESH,
+        )
+    )  # fmt: skip
+    scene.find("shape").append(bsdf)
     return scene
-
-
-def _sensor(depth: float) -> ET.Element:
-    """Return the orthographic camera at z = depth, which sees [-1, 1] in x and y."""
-    sensor = ET.Element("sensor", type="orthographic")
-    _look_at(sensor, f"0, 0, {depth:.9g}", "0, 0, 0")
-    ET.SubElement(sensor, "float", name="near_clip", value="0.001")
-    ET.SubElement(sensor, "float", name="far_clip", value=f"{2 * depth:.9g}")
-    film = ET.SubElement(sensor, "film", type="hdrfilm")
-    _integers(film, width="$size", height="$size")
-    ET.SubElement(film, "rfilter", type="box")
-    ET.SubElement(film, "string", name="pixel_format", value="rgb")
-    ET.SubElement(film, "string", name="component_format", value="float32")
-    sampler = ET.SubElement(sensor, "sampler", type="independent")
-    _integers(sampler, sample_count="$spp", seed="$seed")
-    return sensor
-
-
-def _integers(parent: ET.Element, **values: object) -> None:
-    for name, value in values.items():
-        ET.SubElement(parent, "integer", name=name, value=str(value))
-
-
-def _look_at(parent: ET.Element, origin: str, target: str) -> None:
-    transform = ET.SubElement(parent, "transform", name="to_world")
-    ET.SubElement(transform, "lookat", origin=origin, target=target, up="0, 1, 0")
 
 
 def _readme(spec: SceneSpec, materials: Sequence[Any]) -> str:

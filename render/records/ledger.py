@@ -7,7 +7,8 @@ readers skip. Every run writes a ledger of its own; several machines may fill on
 import json
 import os
 import socket
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -52,24 +53,28 @@ class Ledger:
 
     def add(self, line: dict) -> None:
         """Append the line of a finished shard: id, spec, bytes, seconds, stages, time, worker."""
-        try:
+        with _writing(self.path):
             if self._handle is None:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._handle = open(self.path, "a", encoding="utf-8")  # noqa: SIM115 - open for the whole run
             self._handle.write(json.dumps(line) + "\n")
             self._handle.flush()
-        except OSError as error:
-            raise InputError(f"{self.path}: cannot be written ({error.strerror or error}); free space") from error
 
     def fail(self, line: dict) -> None:
         """Append the line of a failure: id, seed, shape, material, reason, traceback, seconds, attempt, time."""
         path = self.folder / FAILED
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with open(path, "a", encoding="utf-8") as handle:  # one write each: several machines append to this file
-                handle.write(json.dumps(line) + "\n")
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror or error}); free space") from error
+        # One write each: several machines append to this file.
+        with _writing(path), open(path, "a", encoding="utf-8") as handle:
+            handle.write(json.dumps(line) + "\n")
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Make the folder of a file, and tell in one line that it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); free space") from error
 
 
 def read_runs(folder: Path) -> list[list[dict]]:

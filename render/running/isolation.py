@@ -1,9 +1,7 @@
 """A renderer in a process of its own, which may fail, hang or die without taking the run along.
 
-The parent (`render.running.supervisor`) never imports mitsuba. It sends chunks through a pipe and receives tuples:
-`ready`;
-`begin` with the ids at work; `done` with a ledger line; `failed` with ids, reason, traceback and seconds; `end` of the
-chunk, with whether the process is still sound; `fatal` with a message that concerns the whole run.
+The parent (`render.running.supervisor`) never imports mitsuba. It sends chunks through a pipe and receives the messages
+of `render.running.messages`.
 """
 
 import faulthandler
@@ -14,63 +12,41 @@ import time
 import traceback
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 from render.planning.chunks import Chunk
 from render.records.ledger import now
+from render.running.messages import Begun, Done, Ended, Failed, Fatal, Message, Ready, WorkerConfig
 from render.shared.errors import InputError
 
 TAIL = 12  # lines of a traceback that are kept
 
 
-@dataclass(frozen=True)
-class Orders:
-    """What a rendering process is told at its start.
-
-    Attributes:
-        folder: The data folder.
-        number: Number of the worker, for the ledger.
-        threads: Threads it may use.
-        variant: Mitsuba variant, chosen by the parent.
-        llvm: Path of libLLVM, chosen by the parent.
-        errors: File that takes its standard error.
-    """
-
-    folder: Path
-    number: int
-    threads: int
-    variant: str
-    llvm: str | None
-    errors: Path
-
-
-def serve(connection: Connection, orders: Orders) -> None:
+def serve(connection: Connection, config: WorkerConfig) -> None:
     """Render chunks until told to stop (None) or the parent is gone."""
-    settle(orders)
+    settle(config)
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         try:
             import drjit as dr
 
             from render.running import worker
         except InputError as error:
-            connection.send(("fatal", str(error)))
+            connection.send(Fatal(str(error)))
             return
-        dr.set_thread_count(orders.threads)
-        connection.send(("ready",))
+        dr.set_thread_count(config.threads)
+        connection.send(Ready())
         while (chunk := connection.recv()) is not None:
             try:
-                sound = Work(connection.send, chunk, orders).run()
+                sound = Work(connection.send, chunk, config).run()
             except worker.Unwritable as error:
-                connection.send(("fatal", str(error)))
+                connection.send(Fatal(str(error)))
                 return
             dr.flush_malloc_cache()
-            connection.send(("end", sound))
+            connection.send(Ended(sound))
 
 
-def settle(orders: Orders) -> None:
+def settle(config: WorkerConfig) -> None:
     """Prepare the process: signals, standard error, core dumps, and the parent's choice of variant."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # unwinds, so that a half-written shard is removed
@@ -78,22 +54,22 @@ def settle(orders: Orders) -> None:
         import resource
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    descriptor = os.open(orders.errors, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    descriptor = os.open(config.errors, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     os.dup2(descriptor, 2)
     os.close(descriptor)
     faulthandler.enable(file=2)
-    os.environ["SDPS_VARIANT"] = orders.variant
-    if orders.llvm:
-        os.environ["DRJIT_LIBLLVM_PATH"] = orders.llvm
+    os.environ["SDPS_VARIANT"] = config.variant
+    if config.llvm:
+        os.environ["DRJIT_LIBLLVM_PATH"] = config.llvm
 
 
 class Work:
     """Rendering one chunk, scene by scene, telling the parent what happens."""
 
-    def __init__(self, send: Callable[[tuple], Any], chunk: Chunk, orders: Orders) -> None:
+    def __init__(self, send: Callable[[Message], Any], chunk: Chunk, config: WorkerConfig) -> None:
         from render.running import worker
 
-        self.send, self.chunk, self.orders = send, chunk, orders
+        self.send, self.chunk, self.config = send, chunk, config
         self.worker, self.stages = worker, worker.Stages()
         self.sound = True
         self.start = time.perf_counter()
@@ -123,7 +99,7 @@ class Work:
         while left and self.sound:
             self._begin(left)
             try:
-                for scene in self.worker.render_group(built, list(group), self.orders.folder, set(left), self.stages):
+                for scene in self.worker.render_group(built, list(group), self.config.folder, set(left), self.stages):
                     self._done(scene)
                     left.remove(scene.id)
                 left = []
@@ -136,20 +112,20 @@ class Work:
 
     def _begin(self, ids: Collection[str]) -> None:
         self.start = time.perf_counter()
-        self.send(("begin", list(ids)))
+        self.send(Begun(tuple(ids)))
 
     def _done(self, scene: Any) -> None:
         stages = self.stages.lap()
         line = {
             "id": scene.id,
             "spec": scene.digest(),
-            "bytes": (self.orders.folder / scene.file).stat().st_size,
+            "bytes": (self.config.folder / scene.file).stat().st_size,
             "seconds": round(sum(stages.values()), 4),
             "stages": {name: round(seconds, 4) for name, seconds in stages.items()},
             "time": now(),
-            "worker": self.orders.number,
+            "worker": self.config.number,
         }
-        self.send(("done", line))
+        self.send(Done(line))
         self.start = time.perf_counter()
 
     def _failed(self, ids: Collection[str], error: Exception) -> None:
@@ -160,4 +136,4 @@ class Work:
         trace = "" if mistake else "".join(traceback.format_exception(error))
         tail = "\n".join(trace.splitlines()[-TAIL:])
         self.stages.lap()
-        self.send(("failed", list(ids), reason, tail, round(time.perf_counter() - self.start, 3)))
+        self.send(Failed(tuple(ids), reason, tail, round(time.perf_counter() - self.start, 3)))

@@ -8,22 +8,23 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from render.planning.chunks import Chunk
-from render.running.isolation import TAIL, Orders
+from render.running.isolation import TAIL
+from render.running.messages import WorkerConfig
 
 
 class Worker:
     """A rendering process and what it is working on."""
 
-    def __init__(self, serve: Callable, orders: Orders) -> None:
+    def __init__(self, serve: Callable, config: WorkerConfig) -> None:
         context = multiprocessing.get_context("spawn")  # forking would copy the state of a started backend
         self.connection, theirs = context.Pipe()
-        self.errors = orders.errors
-        self.process = context.Process(target=serve, args=(theirs, orders), daemon=True)
+        self.errors = config.errors
+        self.process = context.Process(target=serve, args=(theirs, config), daemon=True)
         self.process.start()
         theirs.close()
         self.ready, self.busy, self.rendered = False, False, 0
         self.left: Chunk | None = None  # of the chunk it works on
-        self.current: list[str] = []
+        self.current: tuple[str, ...] = ()
         self.since = self.view_start = time.monotonic()
 
     def take(self, chunk: Chunk) -> None:
@@ -35,7 +36,7 @@ class Worker:
     def finished(self, id: str) -> None:
         """Note that a scene is done or failed."""
         self.left = self.left.without([id]) if self.left else None
-        self.current = [other for other in self.current if other != id]
+        self.current = tuple(other for other in self.current if other != id)
 
     def dismiss(self) -> None:
         """Let an idle process end."""
@@ -59,13 +60,13 @@ class Worker:
             self.process.join()
         self.connection.close()
 
-    def obituary(self) -> str:
+    def exit_reason(self) -> str:
         """Tell how the process ended."""
         self.process.join()
         code = self.process.exitcode or 0
         return f"worker died, signal {-code}" if code < 0 else f"worker died, exit code {code}"
 
-    def last_words(self) -> str:
+    def stderr_tail(self) -> str:
         """Return the tail of its standard error."""
         with suppress(OSError):
             return "\n".join(self.errors.read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL:])

@@ -6,7 +6,7 @@ every pass over the plan. The number of a scene in this order determines the sce
 would hold, to the bit; so a reader may start anywhere, and a renderer may be replaced by another.
 
 `serve` is what a process of its own runs; `pipelines.train.streaming` is its parent. The pipe between them carries
-tuples: `("scene", id, RenderedScene)`, `("failed", reason)`, and `("end",)` after as many scenes as were ordered.
+tuples: `("scene", id, RenderedScene)`, `("failed", reason)`, and `("end",)` after as many scenes as were asked for.
 """
 
 import os
@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.planning.chunks import GROUP_SIZE, view_groups
+from render.planning.chunks import view_groups
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from render.shared.seeds import generator
@@ -37,7 +37,7 @@ class RenderedScene(NamedTuple):
 
 
 @dataclass(frozen=True)
-class StreamOrders:
+class StreamWorkerConfig:
     """What a streaming process is told at its start.
 
     Attributes:
@@ -57,21 +57,18 @@ class StreamOrders:
     threads: int
 
 
-def stream_order(
-    scenes: Sequence[SceneSpec], *, seed: int, start: int = 0, group_size: int = GROUP_SIZE
-) -> Iterator[tuple[list[SceneSpec], int]]:
+def stream_order(scenes: Sequence[SceneSpec], *, seed: int, start: int = 0) -> Iterator[tuple[list[SceneSpec], int]]:
     """Yield the views of a plan endlessly, in the order of the stream, from scene number `start` on.
 
     Args:
         scenes: The plan, views whole and the views of a shape together.
         seed: Seed of the order.
         start: Number of the first scene; a pass has `len(scenes)`.
-        group_size: Most materials that share rays; the bytes of a scene depend on it.
 
     Yields:
         The scenes of a view, and how many of them lie before `start` (0 but for the first view).
     """
-    groups = view_groups(scenes, group_size)
+    groups = view_groups(scenes)
     shapes = [list(run) for _, run in groupby(groups, key=lambda group: group[0].shape)]
     number, skip = divmod(start, len(scenes))
     while True:
@@ -86,7 +83,7 @@ def stream_order(
 
 
 def rendered_scenes(
-    scenes: Sequence[SceneSpec], *, seed: int, start: int = 0, group_size: int = GROUP_SIZE
+    scenes: Sequence[SceneSpec], *, seed: int, start: int = 0
 ) -> Iterator[tuple[SceneSpec, RenderedScene]]:
     """Render the scenes of `stream_order` in this process, one by one as they are asked for.
 
@@ -94,7 +91,6 @@ def rendered_scenes(
         scenes: The plan, views whole and the views of a shape together.
         seed: Seed of the order.
         start: Number of the first scene.
-        group_size: Most materials that share rays; the bytes of a scene depend on it.
 
     Raises:
         InputError: an unusable shape or material, an object outside the frame, or images that are not finite.
@@ -103,7 +99,7 @@ def rendered_scenes(
 
     from render.running import worker
 
-    order = stream_order(scenes, seed=seed, start=start, group_size=group_size)
+    order = stream_order(scenes, seed=seed, start=start)
     for shape, run in groupby(order, key=lambda item: item[0][0].shape):
         built, stages = worker.build(worker.load_shape(shape)), worker.Stages()
         for group, skip in run:
@@ -115,30 +111,30 @@ def rendered_scenes(
         dr.flush_malloc_cache()
 
 
-def serve(connection: Connection, orders: StreamOrders) -> None:
-    """Render as ordered, sending each scene through `connection`; end with the parent, whatever it ends by."""
+def serve(connection: Connection, config: StreamWorkerConfig) -> None:
+    """Render as configured, sending each scene through `connection`; end with the parent, whatever it ends by."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    outbox: queue.Queue[tuple | None] = queue.Queue(orders.depth)
+    outbox: queue.Queue[tuple | None] = queue.Queue(config.depth)
     sender = threading.Thread(target=_send, args=(connection, outbox), daemon=True)
     sender.start()
-    outbox.put(_render(orders, outbox))
+    outbox.put(_render(config, outbox))
     outbox.put(None)
     sender.join()
 
 
-def _render(orders: StreamOrders, outbox: queue.Queue) -> tuple:
-    """Put the ordered scenes into the outbox; return the last message."""
+def _render(config: StreamWorkerConfig, outbox: queue.Queue) -> tuple:
+    """Put the scenes into the outbox; return the last message."""
     try:
         import drjit as dr
 
         from render.backend import variant
 
         variant.load()  # before Dr.Jit starts its threads: it names the libLLVM
-        dr.set_thread_count(orders.threads)
-        rendered = rendered_scenes(orders.scenes, seed=orders.seed, start=orders.start)
-        for scene, arrays in islice(rendered, orders.count):
+        dr.set_thread_count(config.threads)
+        rendered = rendered_scenes(config.scenes, seed=config.seed, start=config.start)
+        for scene, arrays in islice(rendered, config.count):
             outbox.put(("scene", scene.id, arrays))
     except InputError as error:
         return "failed", str(error)

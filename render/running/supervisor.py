@@ -20,7 +20,8 @@ from render.planning import budget
 from render.planning.chunks import cut, share
 from render.records.ledger import Ledger, Survey, now, survey, sweep
 from render.records.manifest import SceneSpec
-from render.running.isolation import Orders, serve
+from render.running.isolation import serve
+from render.running.messages import Begun, Done, Ended, Failed, Fatal, Message, Ready, WorkerConfig
 from render.running.process import Worker
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
@@ -200,7 +201,7 @@ class _Run:
             elif self.queue:
                 worker.take(self.queue.popleft())
         while self.queue and len(self.workers) < self.count:
-            orders = Orders(
+            config = WorkerConfig(
                 folder=self.folder,
                 number=self.started,
                 threads=max(1, budget.cores() // self.count),
@@ -208,7 +209,7 @@ class _Run:
                 llvm=str(self.llvm) if self.llvm else None,
                 errors=self.errors / f"{self.started}.txt",
             )
-            self.workers.append(Worker(self.serve, orders))
+            self.workers.append(Worker(self.serve, config))
             self.started += 1
             self.workers[-1].take(self.queue.popleft())
 
@@ -219,10 +220,10 @@ class _Run:
             try:
                 message = worker.connection.recv()
             except (EOFError, OSError):
-                self._lost(worker, worker.obituary())
+                self._lost(worker, worker.exit_reason())
                 continue
             worker.since = time.monotonic()
-            getattr(self, f"_on_{message[0]}")(worker, *message[1:])
+            self._take(worker, message)
         for worker in list(self.workers):
             limit = self._limit(worker)
             if limit and worker.busy and time.monotonic() - worker.since > limit:
@@ -237,15 +238,25 @@ class _Run:
         ends = [worker.since + limit for worker in self.workers if worker.busy and (limit := self._limit(worker))]
         return min(max(min(ends, default=1e9) - time.monotonic(), 0.0) + 0.01, 1.0)
 
-    # ---- News from the processes; the names are those of the messages ----
+    # ---- Messages from the processes ----
 
-    def _on_ready(self, worker: Worker) -> None:
-        worker.ready = True
+    def _take(self, worker: Worker, message: Message) -> None:
+        """Act on a message of a process."""
+        match message:
+            case Ready():
+                worker.ready = True
+            case Begun(ids):
+                worker.current, worker.view_start = ids, worker.since
+            case Done(line):
+                self._done(worker, line)
+            case Failed():
+                self._failed(worker, message)
+            case Ended(sound):
+                self._ended(worker, sound)
+            case Fatal(reason):
+                raise InputError(f"{reason} ({self._kept()})" if self.lines else reason)
 
-    def _on_begin(self, worker: Worker, ids: list[str]) -> None:
-        worker.current, worker.view_start = list(ids), worker.since
-
-    def _on_done(self, worker: Worker, line: dict) -> None:
+    def _done(self, worker: Worker, line: dict) -> None:
         worker.finished(line["id"])
         worker.rendered += 1
         self.lines.append(line)
@@ -259,8 +270,8 @@ class _Run:
                 f"{self._kept()}; free space and run it again to go on"
             )
 
-    def _on_failed(self, worker: Worker, ids: list[str], reason: str, trace: str, seconds: float) -> None:
-        for id in ids:
+    def _failed(self, worker: Worker, failure: Failed) -> None:
+        for id in failure.ids:
             worker.finished(id)
             scene = self.wanted[id]
             self.attempts[id] = self.attempts.get(id, 0) + 1
@@ -269,42 +280,39 @@ class _Run:
                 "seed": scene.seed,
                 "shape": scene.shape,
                 "material": scene.material,
-                "reason": reason,
-                "traceback": trace,
-                "seconds": round(seconds, 3),
+                "reason": failure.reason,
+                "traceback": failure.traceback,
+                "seconds": round(failure.seconds, 3),
                 "attempt": self.attempts[id],
                 "time": now(),
             }
             self.failed.append(line)
             self.ledger.fail(line)
-        self._tick(len(ids))
+        self._tick(len(failure.ids))
         if not self.lines and len(self.failed) >= HOPELESS:
             raise InputError(
-                f"{self.folder}: the first {len(self.failed)} scenes all failed, the last one thus: {reason}; "
+                f"{self.folder}: the first {len(self.failed)} scenes all failed, the last one thus: {failure.reason}; "
                 "mend that, then run it again with --retry-failed"
             )
 
-    def _on_end(self, worker: Worker, sound: bool) -> None:
-        worker.busy, worker.current = False, []
+    def _ended(self, worker: Worker, sound: bool) -> None:
+        worker.busy, worker.current = False, ()
         if worker.left:  # a process that is no longer sound leaves the rest to another one
             self.queue.appendleft(worker.left)
         if not sound:
             self._retire(worker)
-
-    def _on_fatal(self, worker: Worker, message: str) -> None:
-        raise InputError(f"{message} ({self._kept()})" if self.lines else message)
 
     # ---- Losing processes ----
 
     def _lost(self, worker: Worker, reason: str) -> None:
         """Record what a dead or stopped process was working on, and give the rest of its chunk to another."""
         worker.process.join()
-        tail = worker.last_words()
+        tail = worker.stderr_tail()
         if not worker.ready:
             said = f": {tail.splitlines()[-1]}" if tail else ""
             raise InputError(f"a rendering process did not start ({reason}){said}; run `sdps doctor`")
         if worker.current:
-            self._on_failed(worker, worker.current, reason, tail, time.monotonic() - worker.view_start)
+            self._failed(worker, Failed(worker.current, reason, tail, time.monotonic() - worker.view_start))
         if worker.left:
             self.queue.appendleft(worker.left)
         self.workers.remove(worker)

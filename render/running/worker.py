@@ -14,7 +14,7 @@ import drjit as dr
 
 from render.kernel.scene import Scene, build
 from render.materials.kernels.packed import pack
-from render.planning.chunks import GROUP_SIZE, view_groups
+from render.planning.chunks import view_groups
 from render.records.manifest import SceneSpec
 from render.records.shards import Shard, is_whole, write_shard
 from render.running.rendered import rendered_views
@@ -77,19 +77,13 @@ class Stages:
 
 
 def render_scenes(
-    scenes: Sequence[SceneSpec],
-    folder: str | Path,
-    *,
-    group_size: int = GROUP_SIZE,
-    on_shard: Callable[[SceneSpec], None] | None = None,
+    scenes: Sequence[SceneSpec], folder: str | Path, *, on_shard: Callable[[SceneSpec], None] | None = None
 ) -> int:
     """Render every scene that has no whole shard yet in `folder`, with a progress bar and ETA.
 
     Args:
         scenes: The manifest, whole; consecutive scenes that differ only in material share their rays.
         folder: Data folder; shards go to its `shards/`.
-        group_size: Most materials that share rays (they share the bounce directions' mixture too, so the bytes of a
-            shard depend on it and on the manifest alone).
         on_shard: Called after each shard is written.
 
     Returns:
@@ -102,7 +96,7 @@ def render_scenes(
     missing = {scene.id for scene in scenes if not is_whole(folder / scene.file, scene)}
     with progress_bar(total=len(scenes), initial=len(scenes) - len(missing), unit="scene", desc="render") as bar:
         # Consecutive views of one shape share its mesh and acceleration structure.
-        for shape, run in groupby(view_groups(scenes, group_size), key=lambda group: group[0].shape):
+        for shape, run in groupby(view_groups(scenes), key=lambda group: group[0].shape):
             groups = [group for group in run if any(scene.id in missing for scene in group)]
             if not groups:
                 continue

@@ -36,6 +36,9 @@ _BLOCK = 256
 _PARALLEL = 1e-6
 """Sine of the angle between segments below which their crossing is not defined."""
 
+_INTEGRABILITY = 2.5
+"""Standard deviation in pixels of the Gaussian before integrability is imposed."""
+
 _FEW = 50
 """Crossings below which the median is not to be trusted."""
 
@@ -59,7 +62,6 @@ def diffuse_maxima(
     *,
     front: Front = "low-rank",
     smoothing: float = 2.0,
-    integrability_smoothing: float = 2.5,
     limit: int = 5000,
     seed: int = 0,
 ) -> Estimate:
@@ -70,7 +72,6 @@ def diffuse_maxima(
         mask: (H, W) bool.
         front: How highlights and shadows are kept out of the factorisation; see `prepare`.
         smoothing: Standard deviation in pixels of the Gaussian before the search for maxima.
-        integrability_smoothing: That of the Gaussian before integrability is imposed.
         limit: Most maxima to intersect; more are thinned at random.
         seed: Seed of that choice.
 
@@ -82,7 +83,7 @@ def diffuse_maxima(
     Raises:
         InputError: degenerate input (see `prepare`), no maximum, or no two maxima that agree on any transformation.
     """
-    prepared = prepare(images, mask, front=front, smoothing=integrability_smoothing)
+    prepared = prepare(images, mask, front=front, smoothing=_INTEGRABILITY)
     maxima = find_maxima(prepared.cleaned, prepared.mask, smoothing=smoothing)
     crossings, lambdas = intersect(prepared.factors, maxima, limit=limit, seed=seed)
     gbr = median_gbr(crossings, lambdas)
@@ -91,13 +92,12 @@ def diffuse_maxima(
     found = np.full(int(prepared.mask.sum()), -1)
     found[maxima.pixels] = maxima.images
     diagnostics = {
-        "gbr": (gbr.mu, gbr.nu, gbr.lam),
         "gbr_spread": tuple(float(value) for value in spread),
         "candidates": len(maxima.pixels),
         "intersections": len(crossings),
         "candidate_map": prepared.observations.to_map(found, -1).astype(np.int16),
     }
-    return conclude(prepared, prepared.factors.transformed(gbr), diagnostics)
+    return conclude(prepared, gbr, diagnostics)
 
 
 def find_maxima(profiles: np.ndarray, mask: np.ndarray, *, smoothing: float = 2.0) -> Maxima:

@@ -80,14 +80,8 @@ def entropy(
     best = Gbr(*minima[0, 1:])
     if max(abs(best.mu), abs(best.nu)) > 0.99 * _BOX or abs(np.log(best.lam)) > 0.99 * np.log(_BOX):
         _log.warning("the lowest entropy lies on the edge of the search (%s); expect large errors", best)
-    gbr = standard.then(best)
-    diagnostics = {
-        "gbr": (gbr.mu, gbr.nu, gbr.lam),
-        "entropy": float(minima[0, 0]),
-        "evaluations": evaluations,
-        "minima": minima,
-    }
-    return conclude(prepared, prepared.factors.transformed(gbr), diagnostics)
+    diagnostics = {"entropy": float(minima[0, 0]), "evaluations": evaluations, "minima": minima}
+    return conclude(prepared, standard.then(best), diagnostics)
 
 
 def standard_form(factors: Factors) -> Gbr:

@@ -21,6 +21,9 @@ _log = logging.getLogger(__name__)
 _SAMPLES = 20000
 """Most pixels that are grouped; the rest has no say in three numbers."""
 
+_NORMAL_GROUPS, _ALBEDO_GROUPS = 200, 20
+"""K of the profiles, and of the chromaticities."""
+
 _STEPS = 15
 """Iterations of k-means."""
 
@@ -36,8 +39,6 @@ def grouping(
     mask: np.ndarray,
     *,
     front: Front = "low-rank",
-    normal_groups: int = 200,
-    albedo_groups: int = 20,
     draws: int = 50,
     seed: int = 0,
 ) -> Estimate:
@@ -57,8 +58,6 @@ def grouping(
         images: (L, H, W, 3), linear radiance; white lights, or lights of one colour.
         mask: (H, W) bool.
         front: How highlights and shadows are kept out of the factorisation; see `prepare`.
-        normal_groups: K of the profiles.
-        albedo_groups: K of the chromaticities.
         draws: Random choices of pixels.
         seed: Root seed of the groups and choices.
 
@@ -71,21 +70,22 @@ def grouping(
         InputError: grey images, parameters out of range, no draw that gives a real transformation, or degenerate
             input; see `prepare`.
     """
-    if min(normal_groups, albedo_groups, draws) < 1:
-        raise InputError("normal_groups, albedo_groups and draws must be at least 1")
-    images = np.asarray(images)
-    if images.ndim != 4 or images.shape[-1] != 3:
-        raise InputError(
-            f"grouping by colour needs images (L, H, W, 3), got {images.shape}; use `entropy` for grey ones"
-        )
+    if draws < 1:
+        raise InputError(f"draws must be at least 1, got {draws}")
+    if np.ndim(images) != 4 or np.shape(images)[-1] != 3:
+        raise InputError(f"grouping by colour needs images (L, H, W, 3), got {np.shape(images)}; use `entropy` instead")
     prepared = prepare(images, mask, front=front)
     rng = generator(seed, "grouping")
-    pixels, albedo, normal = _groups(prepared, normal_groups, albedo_groups, rng)
-    count = int(albedo.max()) + 1
-    if count == 1:
-        _log.warning("the object has a single chromaticity; one albedo is assumed for all of it")
+    pixels, albedo, normal = _groups(prepared, rng)
     standard = standard_form(prepared.factors)
-    surface = prepared.factors.transformed(standard).surface[pixels]
+    best, found = _best_draw(prepared.factors.transformed(standard).surface[pixels], albedo, normal, draws, rng)
+    return conclude(prepared, standard.then(best), found)
+
+
+def _best_draw(
+    surface: np.ndarray, albedo: np.ndarray, normal: np.ndarray, draws: int, rng: np.random.Generator
+) -> tuple[Gbr, dict[str, float]]:
+    """Solve draws of one pixel per pair of groups; return the transformation of least residual, and diagnostics."""
     best, residual, valid = None, np.inf, 0
     for _ in range(draws):
         chosen = _one_per_cell(albedo, normal, rng)
@@ -101,16 +101,8 @@ def grouping(
             f"none of {draws} draws gives a real bas-relief transformation; the albedos of one colour differ "
             "too much or too few normals share one (small object, shadows, highlights); use another method"
         )
-    gbr = standard.then(best)
     cells = len(np.unique(albedo * (normal.max() + 1) + normal))
-    diagnostics = {
-        "gbr": (gbr.mu, gbr.nu, gbr.lam),
-        "albedo_groups": count,
-        "cells": cells,
-        "valid_draws": valid,
-        "residual": residual,
-    }
-    return conclude(prepared, prepared.factors.transformed(gbr), diagnostics)
+    return best, {"albedo_groups": int(albedo.max()) + 1, "cells": cells, "valid_draws": valid, "residual": residual}
 
 
 def solve_groups(surface: np.ndarray, groups: np.ndarray) -> Gbr | None:
@@ -142,9 +134,7 @@ def solve_groups(surface: np.ndarray, groups: np.ndarray) -> Gbr | None:
     return Gbr(float(found[0]), float(found[1]), float(np.sqrt(squared)))
 
 
-def _groups(
-    prepared: Prepared, normal_groups: int, albedo_groups: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _groups(prepared: Prepared, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pixels (N,) worth using, and the albedo and the normal group of each, (N,) int."""
     brightness = prepared.profiles.mean(1)
     pixels = rng.permutation(np.flatnonzero(brightness > _DARK * np.median(brightness)))[:_SAMPLES]
@@ -153,12 +143,14 @@ def _groups(
     spread = np.sqrt(chromaticity.var(0).sum())
     labels = np.zeros(len(pixels), int)
     if spread > _TIGHT:
-        labels = _k_means(chromaticity, albedo_groups, rng)
+        labels = _k_means(chromaticity, _ALBEDO_GROUPS, rng)
     keep, labels = _tight_groups(chromaticity, labels)
+    if labels.max() == 0:
+        _log.warning("the object has a single chromaticity; one albedo is assumed for all of it")
     profiles = prepared.cleaned[pixels[keep]]
     profiles = profiles - profiles.mean(1, keepdims=True)
     profiles /= np.maximum(np.linalg.norm(profiles, axis=1, keepdims=True), 1e-12)  # Euclid is now correlation
-    return pixels[keep], labels, _k_means(profiles, normal_groups, rng)
+    return pixels[keep], labels, _k_means(profiles, _NORMAL_GROUPS, rng)
 
 
 def _k_means(points: np.ndarray, groups: int, rng: np.random.Generator) -> np.ndarray:  # (N,) int

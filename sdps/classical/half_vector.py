@@ -69,38 +69,37 @@ def half_vector(
     Raises:
         InputError: fewer than 10 images, lights that do not fit them, or degenerate input; see `prepare`.
     """
+    given = intensities is not None
     if samples < 100 or updates < 0 or prior < 0.0:
         raise InputError(f"need samples >= 100, updates >= 0 and prior >= 0, got {samples}, {updates}, {prior}")
-    if intensities is not None and light_directions is None:
+    if given and light_directions is None:
         raise InputError("intensities were given without light_directions; give both, or neither")
     if _FEWEST <= len(images) < _ENOUGH:
         _log.warning("half-vector symmetry wants %d images or more, got %d; expect rough normals", _ENOUGH, len(images))
     if light_directions is None:
-        prepared = prepare(images, mask, front="diffuse", minimum=_FEWEST, seed=seed)
-        found = _find_lights(prepared, prior, seed)
-        scene = _Scene(prepared.observations, prepared.profiles, found.light_directions, found.intensities)
-        start, info = found.normals[scene.observations.mask], found.diagnostics
+        scene, start, info = _uncalibrated(images, mask, prior, seed)
     else:
         known = calibrate(images, mask, light_directions, intensities, weights=MEAN, minimum=_FEWEST)
         lights = known.directions / np.linalg.norm(known.directions, axis=1, keepdims=True)
         scene = _Scene(known.observations, known.profiles, lights, np.ones(len(lights)))
         start, info = diffuse_surface(scene.profiles, scene.lights), {}
-        updates = updates if intensities is None else 0
-    normals, gains, more = _normals(scene, _visible(start), samples, updates, seed)
-    if intensities is not None:
-        gains = known.gains.mean(1)
-    relative = (gains / gains.mean()).astype(np.float32)
-    return Estimate(scene.observations.to_map(normals), scene.lights.astype(np.float32), relative, info | more)
+    normals, strengths, more = _normals(scene, _visible(start), samples, 0 if given else updates, seed)
+    return scene.estimate(normals, known.intensities.mean(1) if given else strengths, info | more)
 
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """Grey profiles (P, L), unit lights (L, 3), and by what to divide the profiles still, (L,)."""
+    """Grey profiles (P, L), unit lights (L, 3), and the intensities that the profiles still hold, (L,)."""
 
     observations: Observations
     profiles: np.ndarray
     lights: np.ndarray
-    gains: np.ndarray
+    intensities: np.ndarray
+
+    def estimate(self, normals: np.ndarray, intensities: np.ndarray, diagnostics: dict[str, Any]) -> Estimate:
+        """Return normals (P, 3), the lights and intensities (L,) of mean 1 as an estimate."""
+        relative = (intensities / intensities.mean()).astype(np.float32)
+        return Estimate(self.observations.to_map(normals), self.lights.astype(np.float32), relative, diagnostics)
 
 
 def _normals(
@@ -109,18 +108,25 @@ def _normals(
     """Solve some pixels, carry the outcome to all and keep it where it is better; also returns intensities."""
     lights = np.asarray(scene.lights, np.float64)
     chosen = np.sort(generator(seed, "half_vector").permutation(len(start))[:samples])
-    solved, gains = _solve(scene.profiles[chosen], start[chosen], lights, scene.gains.astype(np.float64), updates)
-    values = log_values(scene.profiles, gains)
+    first = scene.intensities.astype(np.float64)
+    solved, intensities = _solve(scene.profiles[chosen], start[chosen], lights, first, updates)
+    values = log_values(scene.profiles, intensities)
     carried = _carry(start, chosen, solved, scene.observations.mask)
     before, after = asymmetries(values, start, lights), asymmetries(values, carried, lights)
     better = after < before
     energy = scene.observations.to_map(np.where(better, after, before))
     info = {"energy": energy, "solved": len(chosen), "carried": float(better.mean())}
-    return np.where(better[:, None], carried, start), gains, info
+    return np.where(better[:, None], carried, start), intensities, info
 
 
-def _find_lights(prepared: Prepared, prior: float, seed: int) -> Estimate:
-    """Choose the bas-relief transformation by the asymmetry of some pixels."""
+def _uncalibrated(
+    images: np.ndarray, mask: np.ndarray, prior: float, seed: int
+) -> tuple[_Scene, np.ndarray, dict[str, Any]]:
+    """Choose the bas-relief transformation by the asymmetry of some pixels; return its lights, normals and diagnostics.
+
+    Its lights are in the scene, its normals (P, 3).
+    """
+    prepared = prepare(images, mask, front="diffuse", minimum=_FEWEST, seed=seed)
     start = equal_intensity(prepared.factors)
     glossy = np.flatnonzero(prepared.specular().sum(1) > 0.05 * prepared.profiles.sum(1))
     gbr, info = start, {"highlights": len(glossy) >= 30}
@@ -131,7 +137,9 @@ def _find_lights(prepared: Prepared, prior: float, seed: int) -> Estimate:
         info |= {"bas_relief_energy": lowest, "energy_of_equal_intensities": energy(start), "evaluations": count}
     else:
         _log.warning("only %d pixels show highlights; taking equal light intensities for granted", len(glossy))
-    return conclude(prepared, prepared.factors.transformed(gbr), info | {"gbr": (gbr.mu, gbr.nu, gbr.lam)})
+    found = conclude(prepared, gbr, info)
+    scene = _Scene(prepared.observations, prepared.profiles, found.light_directions, found.intensities)
+    return scene, found.normals[prepared.mask], found.diagnostics
 
 
 def _bas_relief_energy(prepared: Prepared, pixels: np.ndarray, prior: float) -> Callable[[Gbr], float]:
@@ -150,10 +158,10 @@ def _bas_relief_energy(prepared: Prepared, pixels: np.ndarray, prior: float) -> 
 
 
 def _solve(
-    profiles: np.ndarray, start: np.ndarray, lights: np.ndarray, gains: np.ndarray, updates: int
+    profiles: np.ndarray, start: np.ndarray, lights: np.ndarray, intensities: np.ndarray, updates: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve pixels (P', L) on their own; returns normals (P', 3) and intensities (L,)."""
-    values = log_values(profiles, gains)
+    values = log_values(profiles, intensities)
     azimuth = azimuths(values, lights)
     flat = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
     best, energy = start, asymmetry(values, start, lights)
@@ -162,10 +170,10 @@ def _solve(
         best, energy = _keep_better(values, lights, best, energy, trial)
     best, energy = _refine(values, lights, best, energy, (4.0, 2.0, 1.0, 0.5, 0.25))
     for _ in range(updates):
-        gains = gains * intensity_corrections(values, best, lights)
-        values = log_values(profiles, gains)
+        intensities = intensities * intensity_corrections(values, best, lights)
+        values = log_values(profiles, intensities)
         best, energy = _refine(values, lights, best, asymmetry(values, best, lights), (0.5, 0.25))
-    return best, gains
+    return best, intensities
 
 
 def _keep_better(

@@ -64,13 +64,13 @@ class Calibrated:
         observations: The images at the object's pixels.
         profiles: (P, L) float64, grey under lights of intensity 1.
         directions: (L, 3) float64, unit.
-        gains: (L, 1) or (L, 3) float64, the intensities.
+        intensities: (L, 1) or (L, 3) float64.
     """
 
     observations: Observations
     profiles: np.ndarray
     directions: np.ndarray
-    gains: np.ndarray
+    intensities: np.ndarray
 
     def chunks(self) -> Iterator[slice]:
         """Yield ranges of pixels that bound the memory of per-pixel work."""
@@ -89,7 +89,7 @@ class Calibrated:
         return Estimate(
             normals=to_map(unit_normals(vectors)),
             light_directions=self.directions.astype(np.float32),
-            intensities=self.gains.mean(1).astype(np.float32),
+            intensities=self.intensities.mean(1).astype(np.float32),
             diagnostics={"albedo": to_map(albedo)} | (diagnostics or {}),
         )
 
@@ -116,24 +116,24 @@ def calibrate(
     observations = observe(images, mask, minimum=minimum)
     count, channels = observations.count, observations.values.shape[-1]
     directions = np.asarray(light_directions, np.float64)
-    gains = np.ones(count) if intensities is None else np.asarray(intensities, np.float64)
-    if directions.shape != (count, 3) or len(gains) != count:
+    intensities = np.ones(count) if intensities is None else np.asarray(intensities, np.float64)
+    if directions.shape != (count, 3) or len(intensities) != count:
         raise InputError(f"{count} images need {count} light directions and intensities, got {directions.shape}")
-    gains = gains[:, None] if gains.ndim == 1 else gains  # (L, 1 or 3)
-    if gains.shape not in ((count, 1), (count, channels)):
-        raise InputError(f"intensities of shape {gains.shape} do not fit images of {channels} channel(s)")
-    if not (np.isfinite(directions).all() and np.isfinite(gains).all()):
+    intensities = intensities[:, None] if intensities.ndim == 1 else intensities  # (L, 1 or 3)
+    if intensities.shape not in ((count, 1), (count, channels)):
+        raise InputError(f"intensities of shape {intensities.shape} do not fit images of {channels} channel(s)")
+    if not (np.isfinite(directions).all() and np.isfinite(intensities).all()):
         raise InputError("light directions or intensities hold NaN or infinite values; repair them first")
-    if (gains <= 0.0).any():
+    if (intensities <= 0.0).any():
         raise InputError("light intensities must be positive")
     if not directions.any(axis=1).all():
         raise InputError("a light direction is (0, 0, 0); give vectors from the surface to the light")
     singular = np.linalg.svd(directions, compute_uv=False)
     if singular[2] < MIN_CONDITION * singular[0]:
         raise InputError("the light directions are coplanar; three that are not are needed")
-    shares = np.array(weights if channels == 3 else (1.0,)) / gains  # (L, C)
+    shares = np.array(weights if channels == 3 else (1.0,)) / intensities  # (L, C)
     profiles = np.einsum("lpc,lc->pl", observations.values, shares, optimize=True)
-    return Calibrated(observations, np.ascontiguousarray(profiles), directions, gains)
+    return Calibrated(observations, np.ascontiguousarray(profiles), directions, intensities)
 
 
 def solve_plain(directions: np.ndarray, profiles: np.ndarray) -> np.ndarray:  # (P, 3)

@@ -25,8 +25,7 @@ def factorisation(images: np.ndarray, mask: np.ndarray, *, front: Front = "low-r
         InputError: degenerate input; see `prepare`.
     """
     prepared = prepare(images, mask, front=front)
-    gbr = equal_intensity(prepared.factors)
-    return conclude(prepared, prepared.factors.transformed(gbr), {"gbr": (gbr.mu, gbr.nu, gbr.lam)})
+    return conclude(prepared, equal_intensity(prepared.factors))
 
 
 def equal_intensity(factors: Factors) -> Gbr:

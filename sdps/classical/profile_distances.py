@@ -22,7 +22,7 @@ from render.shared.seeds import generator
 from sdps.classical.common.geometry import outward_gradient
 from sdps.classical.common.observations import observe
 from sdps.classical.common.weighted import normal_equations
-from sdps.classical.profile_lights import CLIP, POWER, fibonacci, find_lights
+from sdps.classical.profile_lights import CLIP, POWER, Lights, fibonacci, find_lights
 from sdps.core.estimate import Estimate
 
 _log = logging.getLogger(__name__)
@@ -71,33 +71,44 @@ def profile_distances(
         InputError: fewer than 10 images, bad options, no contour, profiles that vary along one direction only
             (coplanar lights, a planar or cylindrical object), or that have nothing to do with the contour.
     """
-    if slope not in ("contour", "distribution"):
-        raise InputError(f"slope must be 'contour' or 'distribution', got {slope!r}")
-    if samples < 100 or not 3 <= neighbours < 100 or rounds < 1:
-        raise InputError("profile distances need samples >= 100, 3 <= neighbours < 100 and rounds >= 1")
+    _check(len(images), samples, neighbours, slope, rounds)
     observations = observe(images, mask, minimum=_MINIMUM)
-    if observations.count < _FEW:
-        _log.warning("%d images are few for profile distances; 100 or more are wanted", observations.count)
     profiles = np.maximum(observations.grey(), 0.0).astype(np.float32)
-    rng = generator(seed, "profile_distances")
-    gains = _first_gains(profiles)
+    rng, inverse = generator(seed, "profile_distances"), _first_inverse(profiles)
     for _ in progress_bar(range(rounds), desc="profile distances", unit="round", disable=rounds < 2):
-        shapes = compressed(profiles * gains)
+        shapes = compressed(profiles * inverse)
         rows, normals, diagnostics = _embed_samples(shapes, observations.mask, samples, neighbours, slope, rng)
         lights = find_lights(profiles[rows], shapes[rows], normals)
-        gains = np.where(lights.intensities > 0.0, 1.0 / np.maximum(lights.intensities, 1e-3), 1.0).astype(np.float32)
+        inverse = _inverse(lights.intensities)
+    mean = _mean_direction(lights)
+    directions, intensities = lights.directions.astype(np.float32), lights.intensities.astype(np.float32)
+    maps = observations.to_map(_spread(normalised(shapes), rows, normals))
+    return Estimate(maps, directions, intensities, diagnostics | {"light_mean": mean, "curve": lights.curve})
+
+
+def _inverse(intensities: np.ndarray) -> np.ndarray:  # (L,) float32
+    return np.where(intensities > 0.0, 1.0 / np.maximum(intensities, 1e-3), 1.0).astype(np.float32)
+
+
+def _mean_direction(lights: Lights) -> float:
+    """Return the length of the mean light direction, with a warning where it says that lights are on one side."""
     mean = float(np.linalg.norm(lights.directions[lights.intensities > 0.0].mean(0)))
     if mean > 0.35:
         _log.warning(
             "the lights found do not surround the object (mean direction of length %.2f; 0 is all around, 0.5 a "
             "hemisphere); profile distances are then no measure of angle: expect a distorted shape", mean,
         )  # fmt: skip
-    return Estimate(
-        normals=observations.to_map(_spread(normalised(shapes), rows, normals)),
-        light_directions=lights.directions.astype(np.float32),
-        intensities=lights.intensities.astype(np.float32),
-        diagnostics=diagnostics | {"light_mean": mean, "curve": lights.curve},
-    )
+    return mean
+
+
+def _check(images: int, samples: int, neighbours: int, slope: str, rounds: int) -> None:
+    """Refuse options that make no sense, and warn of few images."""
+    if slope not in ("contour", "distribution"):
+        raise InputError(f"slope must be 'contour' or 'distribution', got {slope!r}")
+    if samples < 100 or not 3 <= neighbours < 100 or rounds < 1:
+        raise InputError("profile distances need samples >= 100, 3 <= neighbours < 100 and rounds >= 1")
+    if _MINIMUM <= images < _FEW:
+        _log.warning("%d images are few for profile distances; 100 or more are wanted", images)
 
 
 def compressed(profiles: np.ndarray) -> np.ndarray:  # (P, L)
@@ -188,7 +199,7 @@ def _scaled(cosines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return _unit(vectors[:, :3] * np.sqrt(values[:3])), values / values[0]
 
 
-def _first_gains(profiles: np.ndarray) -> np.ndarray:  # (L,)
+def _first_inverse(profiles: np.ndarray) -> np.ndarray:  # (L,)
     """Return rough inverse light intensities: a high quantile over pixels of equalised albedo.
 
     Light from behind leaves only a dim rim, so no image is raised by more than a factor of two over the median.

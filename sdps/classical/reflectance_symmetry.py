@@ -33,6 +33,12 @@ _LIT = 0.1
 _POOR = 0.3
 """Energy above which the symmetry does not hold, or was not found; 0.001 to 0.1 is usual where it does."""
 
+_MOST = 32
+"""Images the energy is computed from at most, those with the strongest highlights."""
+
+_PRIOR = 0.02
+"""Weight of the variance of the log intensities of the lights, which decides where the energy is flat."""
+
 _FEW = 30
 """Pixels an image needs for its highlight to count."""
 
@@ -43,8 +49,6 @@ def reflectance_symmetry(
     *,
     front: Front = "diffuse",
     samples: int = 1200,
-    views: int = 32,
-    prior: float = 0.02,
     seed: int = 0,
 ) -> Estimate:
     """Find the bas-relief transformation under which every image's highlight is round about its half vector.
@@ -57,8 +61,6 @@ def reflectance_symmetry(
         mask: (H, W) bool.
         front: How highlights and shadows are kept out of the factorisation; see `prepare`.
         samples: Most pixels per image the energy is computed from.
-        views: Most images it is computed from, those with the strongest highlights.
-        prior: Weight of the variance of the log intensities of the lights, which decides where the energy is flat.
         seed: Root seed of the draw of pixels.
 
     Returns:
@@ -68,36 +70,34 @@ def reflectance_symmetry(
     Raises:
         InputError: degenerate input; see `prepare`.
     """
-    if samples < 2 * _FEW or views < 1 or prior < 0.0:
-        raise InputError(f"need samples >= {2 * _FEW}, views >= 1 and prior >= 0, got {samples}, {views}, {prior}")
+    if samples < 2 * _FEW:
+        raise InputError(f"samples must be at least {2 * _FEW}, got {samples}")
     prepared = prepare(images, mask, front=front, minimum=6, seed=seed)
-    start = equal_intensity(prepared.factors)
-    share, chosen = highlight_images(prepared, views)
+    start = gbr = equal_intensity(prepared.factors)
+    share, chosen = highlight_images(prepared)
     diagnostics = {"specular_share": share, "views": len(chosen), "highlights": share >= _GLOSS and len(chosen) >= 3}
     if not diagnostics["highlights"]:
         _log.warning(
             "the specular part is %.1f %% of the light, seen in %d images: no highlights to go by; taking equal light "
             "intensities for granted", 100.0 * share, len(chosen),
         )  # fmt: skip
-        gbr = start
     else:
         pixels = generator(seed, "reflectance_symmetry").permutation(len(prepared.profiles))[:samples]
-        energy = symmetry_energy(prepared, pixels, chosen, prior)
+        energy = symmetry_energy(prepared, pixels, chosen, _PRIOR)
         gbr, lowest, count = minimise_over_bas_reliefs(energy, [start, Gbr()])
         if lowest > _POOR:
             _log.warning("the highlights keep an energy of %.2f: they are not symmetric, expect large errors", lowest)
         diagnostics |= {"energy": lowest, "energy_of_equal_intensities": energy(start), "evaluations": count}
-    diagnostics["gbr"] = (gbr.mu, gbr.nu, gbr.lam)
-    return conclude(prepared, prepared.factors.transformed(gbr), diagnostics)
+    return conclude(prepared, gbr, diagnostics)
 
 
-def highlight_images(prepared: Prepared, views: int) -> tuple[float, np.ndarray]:
-    """Return the specular share of all light, and the images with the strongest highlights, (<= views,) int."""
+def highlight_images(prepared: Prepared) -> tuple[float, np.ndarray]:
+    """Return the specular share of all light, and the images with the strongest highlights, (<= 32,) int."""
     total = np.maximum(prepared.profiles.sum(0), 1e-300)
     residual = prepared.specular()
     bright = (residual > 0.2 * prepared.cleaned.mean(0)).sum(0)
     shares = np.where(bright >= _FEW, residual.sum(0) / total, 0.0)
-    order = np.argsort(-shares)[:views]
+    order = np.argsort(-shares)[:_MOST]
     return float(residual.sum() / total.sum()), order[shares[order] > _GLOSS]
 
 

@@ -71,7 +71,6 @@ def robust_least_squares(
     light_directions: np.ndarray,
     intensities: np.ndarray | None = None,
     *,
-    shadow_threshold: float = 0.0,
     iterations: int = 30,
     floor: float = 1e-3,
 ) -> Estimate:
@@ -85,8 +84,6 @@ def robust_least_squares(
         mask: (H, W) bool.
         light_directions: (L, 3), unit, from the surface to the light.
         intensities: (L,) or (L, 3) known intensities; equal ones when absent.
-        shadow_threshold: Observations below this share of the pixel's brightest are dropped beforehand, which helps
-            where most are shadowed (0: keep all).
         iterations: Most reweighting steps; pixels that have settled leave earlier.
         floor: Residual, as a share of the pixel's brightest intensity, below which the weight grows no more.
 
@@ -97,30 +94,29 @@ def robust_least_squares(
     Raises:
         InputError: parameters out of range, or degenerate input as in `least_squares`.
     """
-    if not (iterations >= 1 and floor > 0.0 and 0.0 <= shadow_threshold < 1.0):
-        raise InputError("robust least squares needs iterations >= 1, floor > 0 and shadow_threshold in [0, 1)")
+    if not (iterations >= 1 and floor > 0.0):
+        raise InputError(f"robust least squares needs iterations >= 1 and floor > 0, got {iterations} and {floor}")
     known = calibrate(images, mask, light_directions, intensities)
 
     def solve(profiles: np.ndarray, start: np.ndarray) -> np.ndarray:
-        return _least_absolute(known.directions, profiles, start, shadow_threshold, iterations, floor)
+        return _least_absolute(known.directions, profiles, start, iterations, floor)
 
     return _conclude(known, known.in_chunks(solve, np.full((len(known.profiles), 3), np.nan)), {})
 
 
 def _least_absolute(
-    directions: np.ndarray, profiles: np.ndarray, start: np.ndarray, threshold: float, iterations: int, floor: float
+    directions: np.ndarray, profiles: np.ndarray, start: np.ndarray, iterations: int, floor: float
 ) -> np.ndarray:  # (P, 3)
     """Reweight until the vectors change by less than a hundredth of a degree."""
     peak = profiles.max(1, keepdims=True)
-    lit = (profiles >= threshold * peak) if threshold > 0.0 else np.ones(profiles.shape, bool)
-    result = solve_weighted(directions, profiles, lit, start)
+    result = solve_weighted(directions, profiles, np.ones(profiles.shape), start)
     active = np.flatnonzero(np.isfinite(result[:, 0]) & (peak[:, 0] > 0.0))
     for _ in range(iterations):
         if not len(active):
             break
         old, values = result[active], profiles[active]
         residual = np.abs(values - old @ directions.T)
-        weights = lit[active] / np.maximum(residual / peak[active], floor)
+        weights = 1.0 / np.maximum(residual / peak[active], floor)
         new = solve_weighted(directions, values, weights, old)
         result[active] = new
         change = np.linalg.norm(new - old, axis=1)
@@ -133,9 +129,6 @@ def low_rank_least_squares(
     mask: np.ndarray,
     light_directions: np.ndarray,
     intensities: np.ndarray | None = None,
-    *,
-    sparsity: float | None = None,
-    progress: bool = False,
 ) -> Estimate:
     """Split highlights and shadows off as a sparse part, then solve Lambert's law with the low-rank rest.
 
@@ -146,8 +139,6 @@ def low_rank_least_squares(
         mask: (H, W) bool.
         light_directions: (L, 3), unit, from the surface to the light.
         intensities: (L,) or (L, 3) known intensities; equal ones when absent.
-        sparsity: See `robust_low_rank`.
-        progress: Show a progress bar.
 
     Returns:
         As `least_squares`; diagnostics `rank` of the low-rank part, and `sparse`, the mean absolute sparse part over
@@ -157,11 +148,11 @@ def low_rank_least_squares(
         InputError: degenerate input, as in `least_squares`.
     """
     known = calibrate(images, mask, light_directions, intensities)
-    low = robust_low_rank(known.profiles, sparsity=sparsity, progress=progress)
+    low = robust_low_rank(known.profiles)
     spectrum = np.sqrt(np.maximum(np.linalg.eigvalsh(low.T @ low), 0.0))
     rank = int((spectrum > 1e-3 * spectrum[-1]).sum())
     if rank < 3:
-        _log.warning("the low-rank part has rank %d of 3: it lost shading with the highlights; raise sparsity", rank)
+        _log.warning("the low-rank part has rank %d of 3: it lost shading with the highlights", rank)
     sparse = float(np.abs(known.profiles - low).mean() / max(float(known.profiles.mean()), 1e-300))
     return known.conclude(solve_plain(known.directions, low), {"rank": rank, "sparse": sparse})
 

@@ -20,21 +20,21 @@ Array = np.ndarray | torch.Tensor
 ReadOut = Literal["centre", "expectation", "peak"]
 
 
-def _library(array: Array) -> ModuleType:
+def library(array: Array) -> ModuleType:
     """Return the module (numpy or torch) that computes on `array`; the names used here exist in both."""
     return torch if isinstance(array, torch.Tensor) else np
 
 
 def azimuth_elevation(directions: Array) -> tuple[Array, Array]:
     """Return azimuth and elevation in degrees, each (...), of directions (..., 3) of any length."""
-    xp = _library(directions)
+    xp = library(directions)
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     return xp.rad2deg(xp.arctan2(x, z)), xp.rad2deg(xp.arctan2(y, xp.hypot(x, z)))
 
 
 def unit_direction(azimuth: Array, elevation: Array) -> Array:
     """Return unit directions (..., 3) of azimuth and elevation in degrees, each (...)."""
-    xp = _library(azimuth)
+    xp = library(azimuth)
     azimuth, elevation = xp.deg2rad(azimuth), xp.deg2rad(elevation)
     horizontal = xp.cos(elevation)
     return xp.stack([horizontal * xp.sin(azimuth), xp.sin(elevation), horizontal * xp.cos(azimuth)], axis=-1)
@@ -45,7 +45,7 @@ def bin_index(values: Array, low: float, high: float, count: int) -> Array:
 
     A value outside the range takes the nearest bin.
     """
-    xp = _library(values)
+    xp = library(values)
     index = xp.clip(xp.floor((values - low) / (high - low) * count), 0, count - 1)
     return index.long() if isinstance(index, torch.Tensor) else index.astype(np.int64)
 
@@ -79,12 +79,8 @@ class LightClasses:
 
     def encode(self, directions: Array, intensities: Array) -> tuple[Array, Array, Array]:
         """Return azimuth, elevation and intensity classes, each (...) int64, of (..., 3) and (...)."""
-        azimuth, elevation = azimuth_elevation(directions)
-        return (
-            bin_index(azimuth, -90.0, 90.0, self.directions),
-            bin_index(elevation, -90.0, 90.0, self.directions),
-            bin_index(intensities, self.low, self.high, self.intensities),
-        )
+        values = (*azimuth_elevation(directions), intensities)
+        return tuple(bin_index(part, *span) for part, span in zip(values, self._spans(), strict=True))
 
     def encode_soft(
         self, directions: torch.Tensor, intensities: torch.Tensor
@@ -107,9 +103,9 @@ class LightClasses:
 
     def decode(self, azimuth: Array, elevation: Array, intensity: Array) -> tuple[Array, Array]:
         """Return the unit direction (..., 3) and intensity (...) at the centre of each class."""
-        azimuth = bin_centre(azimuth, -90.0, 90.0, self.directions)
-        elevation = bin_centre(elevation, -90.0, 90.0, self.directions)
-        return unit_direction(azimuth, elevation), bin_centre(intensity, self.low, self.high, self.intensities)
+        pairs = zip((azimuth, elevation, intensity), self._spans(), strict=True)
+        azimuth, elevation, intensity = (bin_centre(part, *span) for part, span in pairs)
+        return unit_direction(azimuth, elevation), intensity
 
     def read_out(
         self,
@@ -120,9 +116,9 @@ class LightClasses:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Turn class logits into unit directions (..., 3) and intensities (...), float32.
 
-        `centre` is the paper's read-out, the middle of the most probable class; `expectation` the mean over the
-        softmax, which has no quantisation floor; `peak` the top of the parabola through the log-probabilities of the
-        most probable class and its two neighbours.
+        `centre` (argmax) is the paper's, the middle of the most probable class; `expectation` (soft-argmax) the mean
+        over the softmax, which has no quantisation floor; `peak` (parabolic) the top of the parabola through the
+        log-probabilities of the most probable class and its two neighbours.
         """
         logits = [values.float() for values in (azimuth, elevation, intensity)]
         if how == "centre":

@@ -87,13 +87,13 @@ def augment(
     bounds = config.exposure_range if config.exposure == "paper" else config.mean_jitter
     factor = np.float32(rng.uniform(*bounds))
     intensities = rng.uniform(*config.intensity_range, len(images)).astype(np.float32)  # (Q,)
-    gains = intensities[:, None, None, None]
+    strengths = intensities[:, None, None, None]
     # One copy, then in place: fresh memory for every step would cost more than the arithmetic.
     if config.exposure == "paper":
         images = np.minimum(images, np.float32(config.clip))
-        images *= factor * gains
+        images *= factor * strengths
     else:
-        images = images * gains
+        images = images * strengths
         images *= factor * exposure_scale(images[:, mask], config.mean_level, config.clip)
         np.minimum(images, np.float32(config.clip), out=images)
     if config.noise:
@@ -145,41 +145,3 @@ def measure_exposure(values: np.ndarray, config: Augmentation) -> Exposure:
     mean = float(values.mean()) if values.size else 0.0
     lift = PAPER_TEST_FLOOR / mean if 0.0 < mean < PAPER_TEST_FLOOR else 1.0
     return Exposure(lift * PAPER_TEST_GAIN, PAPER_TEST_CLIP)
-
-
-def normalise_exposure(images: np.ndarray, mask: np.ndarray, config: Augmentation) -> tuple[np.ndarray, float]:
-    """Bring test images to the exposure of training, and black out everything but the object.
-
-    Args:
-        images: (L, H, W, 3) float, linear, of any overall scale.
-        mask: (H, W) bool.
-        config: The augmentation the network was trained with.
-
-    Returns:
-        (L, H, W, 3) float32 images, and the factor they were multiplied by before the clip.
-    """
-    images = images.astype(np.float32) * mask[None, :, :, None]
-    exposure = measure_exposure(images[:, mask], config)
-    return exposure.apply(images), exposure.scale
-
-
-def apply_symmetry(
-    images: np.ndarray,  # (Q, H, H, 3)
-    normals: np.ndarray,  # (H, H, 3)
-    mask: np.ndarray,  # (H, H)
-    directions: np.ndarray,  # (Q, 3)
-    turns: int,
-    mirror: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Turn the scene by `turns` quarter turns counter-clockwise about the view axis, after an optional mirror in x.
-
-    Reflectance is isotropic, so the result is a scene that could have been rendered.
-    """
-    if mirror:
-        images, normals, mask = images[:, :, ::-1], normals[:, ::-1], mask[:, ::-1]
-        flip = np.array([-1.0, 1.0, 1.0], np.float32)
-        normals, directions = normals * flip, directions * flip
-    images, normals, mask = np.rot90(images, turns, (1, 2)), np.rot90(normals, turns), np.rot90(mask, turns)
-    for _ in range(turns % 4):
-        normals, directions = (np.stack([-v[..., 1], v[..., 0], v[..., 2]], axis=-1) for v in (normals, directions))
-    return images, normals, mask, directions

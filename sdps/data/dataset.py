@@ -18,7 +18,8 @@ from torch.utils.data import Dataset
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from render.shared.seeds import generator
-from sdps.data.augment import Augmentation, apply_symmetry, augment
+from sdps.core.symmetry import Symmetry
+from sdps.data.augment import Augmentation, augment
 from sdps.data.scene_store import SceneStore, StoredScene, finished_scenes, require_equal_counts
 
 _CROP_DRAWS = 8
@@ -130,24 +131,30 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     exposure, intensities and noise (`sdps.data.augment`).
 
     Args:
-        scene: Manifest line, for the light directions.
+        scene: Manifest line; the light directions are always those of the manifest, with which a shard must agree.
         stored: Its images and ground truth.
         options: How the sample is made.
         rng: Draws everything random, and has drawn nothing yet.
 
     Returns:
         The fields of a `Batch` without B.
+
+    Raises:
+        InputError: another number of images than of lights.
     """
     # A child of the stream, so that the number does not depend on how much the sample draws.
     seed = int(rng.spawn(1)[0].integers(2**63))
-    directions = scene.light_directions()[: len(stored.images)]
+    directions = scene.light_directions()
+    if len(stored.images) != len(directions):
+        raise InputError(f"scene {scene.id}: {len(stored.images)} images for {len(directions)} lights; render it again")
     chosen = choose_images(directions, options, rng)
     images = stored.images[chosen].astype(np.float32)  # (Q, H, W, 3)
     normals, mask = stored.normals, stored.mask
     directions = directions[chosen]
     if options.augmentation.symmetries:
-        turns, mirror = int(rng.integers(4)), bool(rng.integers(2))
-        images, normals, mask, directions = apply_symmetry(images, normals, mask, directions, turns, mirror)
+        symmetry = Symmetry(int(rng.integers(4)), bool(rng.integers(2)))
+        images, normals, mask = symmetry.images(images, 1), symmetry.images(normals, 0), symmetry.images(mask, 0)
+        normals, directions = symmetry.vectors(normals), symmetry.vectors(directions)
     if options.rescale and min(mask.shape) > options.size:
         images, normals, mask = _rescale(images, normals, mask, options, rng)
     images, normals, mask = _resize(images, normals, mask, options.size)

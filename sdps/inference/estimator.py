@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,11 +14,12 @@ from render.shared.errors import InputError
 from sdps.core.estimate import Estimate
 from sdps.core.lighting import ReadOut
 from sdps.core.precision import Arithmetic, arithmetic
+from sdps.core.symmetry import SYMMETRIES
 from sdps.data.augment import measure_exposure
 from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map
 from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
 from sdps.inference.inference_config import InferenceConfig
-from sdps.inference.symmetry import SYMMETRIES, KeptView, TurnedView, mean_lights, turned_context
+from sdps.inference.turned_views import KeptView, TurnedView, mean_lights, turned_context, turned_lights
 from sdps.models.base import Lights
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
@@ -50,7 +50,6 @@ class Estimator(InferenceConfig):
         second: Trained second lighting pass. It sees the normals that `normals` finds at 128x128 under the first
             lights; `normals` then works again, under the second lights.
         device: Where all networks are.
-        antialias: Average when the lighting networks' input is shrunk to 128x128 (the authors' code only interpolates).
         chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images. None: what
             suits the device.
 
@@ -62,7 +61,6 @@ class Estimator(InferenceConfig):
     normals: TrainedModel | None
     second: TrainedModel | None = None
     device: torch.device
-    antialias: bool = True
     chunk_pixels: int | None = None
 
     def __post_init__(self) -> None:
@@ -126,35 +124,12 @@ class Estimator(InferenceConfig):
             raise InputError("no normal model was loaded, so only lights can be estimated; load one")
         if self.needs_lights and self.lighting is None and lights is None:
             raise InputError("no lighting model was loaded, so light directions must be given")
-        began = time.perf_counter()
-        _check_lights(len(images), lights, intensities)
-        scene = self._survey(images, mask)
-        known = self._known(lights, intensities)
-        diagnostics = self._diagnostics(scene)
-        if found is not None:
-            lit = self._taken(found, lights, len(images), diagnostics)
-            began -= found.diagnostics["seconds"]
-        elif self.lighting is not None and (lights is None or intensities is None):
-            lit = self._estimate_lights(scene, known, diagnostics)
-        elif self.needs_lights:
-            equal = np.full(len(images), self._mean_intensity(), np.float32)
-            lit = self._lights(known.directions, equal if known.intensities is None else known.intensities)
-        else:
-            lit = None
-        multiple = 1 if self.normals.role == "pixels" else self.normals.network.size_multiple
-        view = self._view(scene, "normals", known.balance, pad_to(multiple), scene.mask.size, diagnostics)
+        began = time.perf_counter() - (found.diagnostics["seconds"] if found is not None else 0.0)
+        scene, known, diagnostics = self._prepare(images, mask, lights, intensities)
+        lit = self._lit(scene, known, found, diagnostics)
         normals = np.zeros((*mask.shape, 3), np.float32)
-        box = self._normals(view, lit)[0].permute(1, 2, 0).cpu().numpy()  # padded (h, w, 3)
-        box = box[: scene.mask.shape[0], : scene.mask.shape[1]]
-        normals[scene.rows, scene.columns] = np.where(scene.mask[..., None], box, np.float32(0.0))
-        directions, gains = known[:2] if lit is None else (part[0].float().cpu().numpy() for part in lit[:2])
-        diagnostics["seconds"] = time.perf_counter() - began
-        return Estimate(
-            normals,
-            np.zeros((0, 3), np.float32) if directions is None else directions,
-            np.zeros(0, np.float32) if gains is None else gains,
-            diagnostics,
-        )
+        normals[scene.rows, scene.columns] = self._box_normals(scene, known, lit, diagnostics)
+        return _concluded(normals, known if lit is None else lit, began, diagnostics)
 
     @torch.inference_mode()
     def estimate_lights(self, images: ImageSource, mask: np.ndarray, intensities: np.ndarray | None = None) -> Estimate:
@@ -172,19 +147,41 @@ class Estimator(InferenceConfig):
         if self.lighting is None:
             raise InputError("no lighting model was loaded; load one, or give the lights")
         began = time.perf_counter()
-        _check_lights(len(images), None, intensities)
-        scene = self._survey(images, mask)
-        diagnostics = self._diagnostics(scene)
-        found = self._estimate_lights(scene, self._known(None, intensities), diagnostics)
-        directions, gains = (part[0].float().cpu().numpy() for part in found[:2])
-        diagnostics["seconds"] = time.perf_counter() - began
-        return Estimate(np.zeros((0, 0, 3), np.float32), directions, gains, diagnostics)
+        scene, known, diagnostics = self._prepare(images, mask, None, intensities)
+        lights = self._estimate_lights(scene, known, diagnostics)
+        return _concluded(np.zeros((0, 0, 3), np.float32), lights, began, diagnostics)
 
-    def _survey(self, images: ImageSource, mask: np.ndarray) -> ObjectImages:
-        return survey(images, mask, self.margin_of(mask.shape), stray=self.stray_light)
+    def _prepare(
+        self, images: ImageSource, mask: np.ndarray, lights: np.ndarray | None, intensities: np.ndarray | None
+    ) -> tuple[ObjectImages, _Known, dict[str, Any]]:
+        """Check the arguments of `estimate`; return the object's images, what is known, and the first diagnostics."""
+        _check_lights(len(images), lights, intensities)
+        scene = survey(images, mask, self.margin_of(mask.shape), stray=self.stray_light)
+        diagnostics = {"precision": self.arithmetic.precision, "stray_light": scene.stray, "exposure": {}}
+        return scene, self._known(lights, intensities), diagnostics
 
-    def _diagnostics(self, scene: ObjectImages) -> dict[str, Any]:
-        return {"precision": self.arithmetic.precision, "stray_light": scene.stray, "exposure": {}}
+    def _lit(
+        self, scene: ObjectImages, known: _Known, found: Estimate | None, diagnostics: dict[str, Any]
+    ) -> Lights | None:
+        """Return the lights (1, L, ...) the normal model is told: found before, estimated or given; None for none."""
+        if found is not None:
+            return self._taken(found, known, len(scene), diagnostics)
+        if self.lighting is not None and (known.directions is None or known.intensities is None):
+            return self._estimate_lights(scene, known, diagnostics)
+        if not self.needs_lights:
+            return None
+        equal = np.full(len(scene), self._mean_intensity(), np.float32)
+        return self._lights(known.directions, equal if known.intensities is None else known.intensities)
+
+    def _box_normals(
+        self, scene: ObjectImages, known: _Known, lit: Lights | None, diagnostics: dict[str, Any]
+    ) -> np.ndarray:
+        """Return the normals of the object's box, (h, w, 3) float32, zero outside the mask."""
+        multiple = 1 if self.normals.role == "pixels" else self.normals.network.size_multiple
+        view = self._view(scene, "normals", known.balance, pad_to(multiple), scene.mask.size, diagnostics)
+        box = self._normals(view, lit)[0].permute(1, 2, 0).cpu().numpy()  # padded
+        box = box[: scene.mask.shape[0], : scene.mask.shape[1]]
+        return np.where(scene.mask[..., None], box, np.float32(0.0))
 
     def _estimate_lights(self, scene: ObjectImages, known: _Known, diagnostics: dict[str, Any]) -> Lights:
         """Return the lights (1, L, ...) after one or two passes; what is known stays."""
@@ -192,7 +189,7 @@ class Estimator(InferenceConfig):
         lights = self._lighting_pass("lighting", scene, read_out, diagnostics)
         if self.second is not None:
             first = self._merged(known, lights)
-            small = self._view(scene, "normals", known.balance, self._shrink, INPUT_SIZE**2, diagnostics)
+            small = self._view(scene, "normals", known.balance, resize_input, INPUT_SIZE**2, diagnostics)
             normals, mask = self._normals(small, first), small.mask
 
             def context(part: slice) -> Tensor:
@@ -203,9 +200,9 @@ class Estimator(InferenceConfig):
             diagnostics["confidence"] = lights.confidence[0].float().cpu().numpy()
         return self._merged(known, lights)
 
-    def _taken(self, found: Estimate, lights: np.ndarray | None, count: int, diagnostics: dict[str, Any]) -> Lights:
+    def _taken(self, found: Estimate, known: _Known, count: int, diagnostics: dict[str, Any]) -> Lights:
         """Return lights (1, L, ...) that were estimated before, and what was noted of them."""
-        if lights is not None or len(found.light_directions) != count:
+        if known.directions is not None or len(found.light_directions) != count:
             raise InputError("found holds lights of other images, or of images whose lights are given")
         diagnostics["exposure"].update(found.diagnostics["exposure"])
         diagnostics.update({name: found.diagnostics[name] for name in ("confidence",) if name in found.diagnostics})
@@ -214,9 +211,9 @@ class Estimator(InferenceConfig):
     def _lighting_pass(
         self, place: str, scene: ObjectImages, read_out: ReadOut, diagnostics: dict[str, Any], context: Any = None
     ) -> Lights:
-        """Return the lights (1, L, ...) that the lighting network in `place` finds, the mean over the views."""
+        """Return the lights (1, L, ...) that the lighting network in `place` finds, with test-time augmentation."""
         network = getattr(self, place).network
-        view = self._view(scene, place, None, self._shrink, INPUT_SIZE**2, diagnostics)
+        view = self._view(scene, place, None, resize_input, INPUT_SIZE**2, diagnostics)
         views = self.light_views or 1
         if views > 1:
             view = KeptView(view)
@@ -228,13 +225,14 @@ class Estimator(InferenceConfig):
         return mean_lights(found)
 
     def _normals(self, view: View, lights: Lights | None) -> Tensor:
-        """Return normals (1, 3, h, w) of a view, the mean over the views it is turned into."""
+        """Return normals (1, 3, h, w) of a view, with test-time augmentation."""
         network = self.normals.network
         if self.normals.role == "pixels":
             return pixel_normal_map(network, view, lights, self.arithmetic.autocast, rotations=self.rotations)
         found = []
         for symmetry in SYMMETRIES[: self.normal_views or 1]:
-            turned = normal_map(network, TurnedView(view, symmetry), symmetry.lights(lights), self.arithmetic.autocast)
+            lit = turned_lights(symmetry, lights)
+            turned = normal_map(network, TurnedView(view, symmetry), lit, self.arithmetic.autocast)
             found.append(symmetry.back.vectors(symmetry.back.images(turned), dim=1))
         return functional.normalize(torch.stack(found).mean(0), dim=1) if len(found) > 1 else found[0]
 
@@ -253,26 +251,22 @@ class Estimator(InferenceConfig):
         chunk = self.chunk_pixels or _CHUNK_PIXELS.get(self.device.type, 2**19)
         return View(scene, exposure, balance, fit, max(1, chunk // pixels), self.device)
 
-    @property
-    def _shrink(self) -> Any:
-        return partial(resize_input, antialias=self.antialias)
-
     def _mean_intensity(self) -> float:
         model = self.lighting if self.normals is None else self.normals
         return float(np.mean(model.augmentation().intensity_range))
 
     def _known(self, lights: np.ndarray | None, intensities: np.ndarray | None) -> _Known:
         """Bring given lights to unit length and given intensities, whose scale is their own, to that of training."""
-        directions = balance = gains = None
+        directions = balance = strengths = None
         if lights is not None:
             directions = np.asarray(lights, np.float64)
             directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
         if intensities is not None:
             colours = np.asarray(intensities, np.float64)
             colours = colours / colours.mean() * self._mean_intensity()
-            gains = (colours if colours.ndim == 1 else colours.mean(1)).astype(np.float32)
+            strengths = (colours if colours.ndim == 1 else colours.mean(1)).astype(np.float32)
             balance = None if colours.ndim == 1 else (colours / colours.mean(1, keepdims=True)).astype(np.float32)
-        return _Known(directions, gains, balance)
+        return _Known(directions, strengths, balance)
 
     def _lights(self, directions: np.ndarray, intensities: np.ndarray) -> Lights:
         return Lights(*(torch.from_numpy(part)[None].to(self.device) for part in (directions, intensities)))
@@ -324,6 +318,15 @@ def load_model(file: str | Path, device: torch.device, role: str | tuple[str, ..
     model = load_weights(file, role)
     model.network.to(device, memory_format=torch.channels_last)  # a third faster on CPUs
     return model
+
+
+def _concluded(normals: np.ndarray, lights: Lights | _Known, began: float, diagnostics: dict[str, Any]) -> Estimate:
+    """Return an estimate; directions or intensities that nobody knows are empty."""
+    parts = lights[:2] if isinstance(lights, _Known) else (part[0].float().cpu().numpy() for part in lights[:2])
+    shapes = ((0, 3), (0,))
+    known = (np.zeros(shape, np.float32) if part is None else part for part, shape in zip(parts, shapes, strict=True))
+    diagnostics["seconds"] = time.perf_counter() - began
+    return Estimate(normals, *known, diagnostics)
 
 
 def _check_lights(count: int, lights: np.ndarray | None, intensities: np.ndarray | None) -> None:

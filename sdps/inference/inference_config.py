@@ -10,7 +10,7 @@ from sdps.core.precision import Precision, check_precision
 from sdps.models.lcnet import INPUT_SIZE
 
 VIEWS = (1, 2, 4, 8)
-"""Numbers of turned and mirrored views that are a group each (`sdps.inference.symmetry`)."""
+"""Numbers of turned and mirrored views that are a group each (`sdps.core.symmetry`)."""
 
 Margin = int | Literal["auto"] | None
 _BOX_MARGIN = 15
@@ -22,15 +22,16 @@ class InferenceConfig:
     """How networks are used.
 
     Attributes:
-        read_out: How light classes become lights: `expectation`, `centre` (the paper's) or `peak`.
+        read_out: How light classes become lights: `expectation` (soft-argmax), `centre` (argmax, the paper's) or `peak`
+            (parabolic).
         precision: Arithmetic of the networks: `auto` (what is faster on this machine), `float32` or `bfloat16`.
         margin: Pixels kept around the mask's bounding box; null keeps the whole frame. `auto`: frames of 128x128, as
             training renders them, are kept whole, others cut with 15 pixels of margin. A box is brought to the lighting
             networks' 128x128, and the lights they find depend on its size.
         stray_light: Take off what the images show where the object is in shadow (`sdps.inference.stray_light`).
         rotations: Rotations about the view axis that pixel networks average over.
-        light_views: Lights are the mean over so many turned and mirrored views of the object, 1, 2, 4 or 8; null for
-            what the method says, which is 1 but for `sdps-plus`.
+        light_views: Test-time augmentation: lights are the mean over so many turned and mirrored views of the object,
+            1, 2, 4 or 8; null for what the method says, which is 1 but for `sdps-plus`.
         normal_views: The same for normals; every view costs as much again.
 
     Raises:

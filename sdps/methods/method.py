@@ -26,7 +26,8 @@ class Method:
         second: A second lighting pass, or empty.
         intensities: `true` where only the intensities are given, else empty.
         read_out: How light classes become lights; None for the configuration's.
-        light_views: Turned views that lights are averaged over where the configuration does not say; None for one.
+        light_views: Test-time augmentation of lights: turned views averaged over where the configuration does not say;
+            None for one.
         normal_views: The same for normals.
         paper: Row of the paper's table.
     """

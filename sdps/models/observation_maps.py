@@ -9,9 +9,7 @@ Legend: N pixels, Q lights.
 """
 
 import math
-from collections.abc import Callable
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -89,62 +87,6 @@ def predict_normals(
     return torch.where(known, functional.normalize(total, dim=1), total.new_tensor([0.0, 0.0, 1.0]))
 
 
-@torch.no_grad()
-def estimate_normals(
-    network: nn.Module,
-    images: np.ndarray,  # (Q, H, W, 3)
-    mask: np.ndarray,  # (H, W)
-    directions: np.ndarray,  # (Q, 3)
-    *,
-    rotations: int = 10,
-    chunk: int | None = None,
-    progress: Callable[[int], object] | None = None,
-) -> np.ndarray:
-    """Return normals (H, W, 3), float32, unit inside the mask and zero outside, with CNN-PS on the network's device.
-
-    Beside the images themselves, memory depends on `chunk` only: about 1 MiB per pixel of it. The network's work does
-    not depend on the number of lights.
-
-    Args:
-        network: A `CNNPS`; put into evaluation mode for the call.
-        images: (Q, H, W, 3) float, linear radiance divided by the light intensities; any overall scale.
-        mask: (H, W) bool.
-        directions: (Q, 3) float, from the surface to the light; need not be of unit length.
-        rotations: K, the rotations about the view axis that are averaged.
-        chunk: Pixels in work at once; by default 64 on a CPU, whose caches then hold the network's features (twice as
-            fast as 512), and 2048 elsewhere.
-        progress: Called with the number of pixels done after each chunk, such as a bar's `update`.
-
-    Raises:
-        InputError: no lights, shapes that do not belong together, a direction without length, values that are not
-            finite inside the mask.
-    """
-    lights = _check_scene(images, mask, directions)
-    device = next(network.parameters()).device
-    chunk = (64 if device.type == "cpu" else 2048) if chunk is None else chunk
-    if chunk < 1:
-        raise InputError(f"chunk must be at least 1 pixel, got {chunk}")
-    lights = torch.from_numpy(lights).to(device)
-    normals = np.zeros((*mask.shape, 3), np.float32)
-    rows, columns = np.nonzero(mask)
-    training = network.training
-    network.eval()
-    try:
-        for start in range(0, len(rows), chunk):
-            place = rows[start : start + chunk], columns[start : start + chunk]
-            grey = images[:, *place].mean(axis=-1, dtype=np.float32).T  # (N, Q)
-            if not np.isfinite(grey).all():
-                raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
-            values = torch.from_numpy(np.ascontiguousarray(grey)).to(device)
-            valid = torch.ones_like(values, dtype=torch.bool)
-            normals[place] = predict_normals(network, values, lights, valid, rotations=rotations).cpu().numpy()
-            if progress is not None:
-                progress(len(grey))
-    finally:
-        network.train(training)
-    return normals
-
-
 def _check_shapes(values: Tensor, directions: Tensor, valid: Tensor) -> None:
     """Refuse tensors that do not describe the same pixels and lights."""
     if values.ndim != 2 or not values.shape[1]:
@@ -157,20 +99,3 @@ def _check_shapes(values: Tensor, directions: Tensor, valid: Tensor) -> None:
         )
     if valid.shape != values.shape or valid.dtype != torch.bool:
         raise InputError(f"valid must be bool of shape ({pixels}, {lights}), got {valid.dtype} {tuple(valid.shape)}")
-
-
-def _check_scene(images: np.ndarray, mask: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Refuse unusable input in one line; return the directions (Q, 3) float32 at unit length."""
-    if images.ndim != 4 or images.shape[-1] != 3 or not len(images):
-        raise InputError(f"images must be (Q, H, W, 3) of Q >= 1 lights, got {images.shape}")
-    if mask.shape != images.shape[1:3] or mask.dtype != np.bool_:
-        raise InputError(f"the mask must be bool of shape {images.shape[1:3]}, got {mask.dtype} of {mask.shape}")
-    if np.shape(directions) != (len(images), 3):
-        raise InputError(
-            f"{len(images)} images need light directions of shape ({len(images)}, 3), got {np.shape(directions)}"
-        )
-    directions = np.asarray(directions, np.float64)
-    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
-    if not (np.isfinite(lengths) & (lengths > 0.0)).all():
-        raise InputError("a light direction is zero or not finite; give unit vectors from the surface to the light")
-    return (directions / lengths).astype(np.float32)

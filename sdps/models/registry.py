@@ -134,10 +134,6 @@ MODELS: dict[str, ModelEntry] = {
     ),
 }  # fmt: skip
 
-PUBLISHED_PARAMETERS = {  # the paper's table "Normal estimation", in millions; pairs count both networks
-    "psfcn": 2.2, "upsfcn-deep-mask": 6.1, "upsfcn-deep": 6.1, "upsfcn-wide": 6.4, "upsfcn-light": 5.7, "upsfcn": 2.2,
-}  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Combination:
@@ -149,7 +145,7 @@ class Combination:
         second: Second lighting pass, or empty.
         summary: One line.
         paper: Row of the paper's table, if any.
-        light_views: Turned views that lights are averaged over; None for what the caller wants.
+        light_views: Test-time augmentation of lights: turned views averaged over; None for what the caller wants.
         normal_views: The same for normals.
     """
 

@@ -89,9 +89,9 @@ def _casts(photos: Photographs, observations: np.ndarray) -> np.ndarray:  # (L,)
     some = observations[:, :: max(1, observations.shape[1] // _COLOUR_PIXELS)]
     saturation = photos.saturation
     if photos.intensities is not None and photos.intensities.ndim == 2:
-        gains = photos.intensities / photos.intensities.mean(1, keepdims=True)
+        balance = photos.intensities / photos.intensities.mean(1, keepdims=True)
         full = (some >= saturation).any(-1, keepdims=True)
-        some = np.where(full, np.inf, some / gains[:, None]).astype(np.float32)
+        some = np.where(full, np.inf, some / balance[:, None]).astype(np.float32)
         some[full[..., 0]] = saturation
     return colour_casts(some, saturation)
 

@@ -65,13 +65,13 @@ def fit_albedo(
     """
     if passes < 1:
         raise InputError(f"passes must be at least 1, got {passes}")
-    unit, lights, gains = _checked(images, mask, normals, lights, intensities)
+    unit, lights, intensities = _checked(images, mask, normals, lights, intensities)
     albedo = smallest = None
     for _ in range(passes):
         above, below = np.zeros((2, len(unit), 3), np.float32)
         for part, observed in _read(images, mask):
-            for light, gain, values in zip(lights[part], gains[part], observed, strict=True):
-                model = _shading(unit, light)[:, None] * gain  # (n, C)
+            for light, intensity, values in zip(lights[part], intensities[part], observed, strict=True):
+                model = _shading(unit, light)[:, None] * intensity  # (n, C)
                 weighted = model
                 if albedo is not None:
                     off = np.abs((values - model * albedo).mean(axis=1))
@@ -142,14 +142,14 @@ def residuals(
 
     Highlights, cast shadows and interreflections add to the residual as much as wrong normals and lights do.
     """
-    unit, lights, gains = _checked(images, mask, normals, lights, intensities)
+    unit, lights, intensities = _checked(images, mask, normals, lights, intensities)
     if albedo.shape != (*mask.shape, 3):
         raise InputError(f"albedo must be {(*mask.shape, 3)} like the mask, got {albedo.shape}")
     inside = albedo[mask].astype(np.float32)
     wrong, power = np.zeros((2, len(lights))), np.zeros((2, len(unit)))
     for part, observed in _read(images, mask):
         for number, values in zip(range(part.start, part.stop), observed, strict=True):
-            model = _shading(unit, lights[number])[:, None] * gains[number] * inside
+            model = _shading(unit, lights[number])[:, None] * intensities[number] * inside
             off, squared = ((values - model) ** 2).sum(axis=1), (values**2).sum(axis=1)  # (n,)
             wrong[:, number] = off.sum(dtype=np.float64), squared.sum(dtype=np.float64)
             power += off, squared
@@ -171,16 +171,16 @@ def _checked(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return normals (n, 3), lights (L, 3) and intensities (L, 3), all float32."""
     unit = checked_normals(normals, mask)
-    lights, gains = np.asarray(lights, np.float32), np.asarray(intensities, np.float32)
+    lights, intensities = np.asarray(lights, np.float32), np.asarray(intensities, np.float32)
     count = len(images)
-    if lights.shape != (count, 3) or gains.shape not in ((count,), (count, 3)):
+    if lights.shape != (count, 3) or intensities.shape not in ((count,), (count, 3)):
         raise InputError(
             f"{count} images need lights ({count}, 3) and intensities ({count},) or ({count}, 3), got {lights.shape} "
-            f"and {gains.shape}"
+            f"and {intensities.shape}"
         )
-    if not (count and np.isfinite(lights).all() and np.isfinite(gains).all()):
+    if not (count and np.isfinite(lights).all() and np.isfinite(intensities).all()):
         raise InputError("there must be images, and their lights and intensities must be finite")
-    return unit.astype(np.float32), lights, np.broadcast_to(gains.reshape(count, -1), (count, 3))
+    return unit.astype(np.float32), lights, np.broadcast_to(intensities.reshape(count, -1), (count, 3))
 
 
 def _read(images: "ImageSource", mask: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from render.shared.errors import InputError
-from render.shared.files import read_jsonl, write_jsonl
+from render.shared.files import read_whole_lines, write_jsonl
 
 
 class Logger(Protocol):
@@ -36,10 +36,7 @@ class JsonlLogger:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_file():
             # A killed run may have left half a line at the end.
-            text = path.read_text(encoding="utf-8")
-            if not text.endswith("\n"):
-                path.write_text(text[: text.rfind("\n") + 1], encoding="utf-8")
-            write_jsonl(path, [row for row in read_jsonl(path) if row["step"] <= last_step])
+            write_jsonl(path, [row for row in read_whole_lines(path) if row["step"] <= last_step])
         self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by close)
 
     def log(self, step: int, values: dict[str, float]) -> None:

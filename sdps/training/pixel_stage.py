@@ -18,7 +18,6 @@ from render.shared.seeds import derived_seed
 from sdps.core.metrics import angle_degrees
 from sdps.data.dataset import Batch
 from sdps.models.base import Lights
-from sdps.models.checkpoint import TrainedModel
 from sdps.models.observation_maps import observation_maps, predict_normals, rotate_about_view
 from sdps.training.stages import NormalStage, light_errors
 from sdps.training.training_config import PixelTraining
@@ -51,16 +50,7 @@ class PixelStage(NormalStage):
     """
 
     config: PixelTraining
-
-    def __init__(
-        self,
-        config: PixelTraining,
-        lighting: TrainedModel | None = None,
-        *,
-        model: str = "cnnps",
-        name: str | None = None,
-    ) -> None:
-        super().__init__(config, lighting, model=model, name=name)
+    usual = "cnnps"
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the mean squared error of the unit normals' components, as published, over pixels drawn at random.

@@ -44,6 +44,5 @@ def _stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, 
         return LightingStage(config, model=model, name=name)
     if role == "second":
         return SecondStage(config, trained["lighting"], trained["normals"], model=model, name=name)
-    if role == "pixels":
-        return PixelStage(config, model=model, name=name)
-    return NormalStage(config, trained.get("lighting"), model=model, name=name)
+    kind = PixelStage if role == "pixels" else NormalStage
+    return kind(config, trained.get("lighting"), model=model, name=name)

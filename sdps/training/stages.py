@@ -140,15 +140,18 @@ class NormalStage(Stage):
 
     config: NormalTraining
     goal = "normal_mae"
+    usual = "nenet"
+    """Name in the registry where no other is given."""
 
     def __init__(
         self,
         config: NormalTraining,
         lighting: TrainedModel | None = None,
         *,
-        model: str = "nenet",
+        model: str | None = None,
         name: str | None = None,
     ) -> None:
+        model = model or self.usual
         super().__init__(name or model, model, config, normal_options(model, config))
         self.source = config.lights or registry.entry(model).lights
         assert lighting is not None or self.source in (TRUE_LIGHTS, ""), f"{model} needs a trained lighting model"

@@ -31,19 +31,20 @@ class TrainingConfig:
         images: Images drawn per scene and step.
         size: Side in pixels to which scenes of another size are resized.
         learning_rate: Peak learning rate.
-        schedule: `halving` (after each of `halve_after`), `cosine` (to zero), `constant`, or `trapezoid`: constant
-            until the last share `cooldown` of the budget, then linearly to zero; the budget may be raised until then.
+        schedule: `halving` (after each of `halve_after`), `cosine` (to zero), `constant`, or `trapezoid`
+            (warm-up-stable-decay): constant until the last share `cooldown` of the budget, then linearly to zero; the
+            budget may be raised until then.
         cooldown: See `schedule`.
         halve_after: Epochs after which `halving` halves; scaled with the budget when it is not `epochs`.
         warmup: Share of the budget over which the learning rate rises linearly from zero.
         optimiser: `adam` or `adamw`, betas 0.9 and 0.999; or `muon` (`sdps.training.muon`), with AdamW for what is no
-        matrix. weight_decay: Weight decay (0 in the paper: its 4e-4 is parsed but never used).
+            matrix.
+        weight_decay: Weight decay (0 in the paper: its 4e-4 is parsed but never used).
         clip_gradient: Largest gradient norm; 0 leaves gradients alone.
         ema: Decay of an exponential moving average of the weights, which is then validated and saved (0: none).
         compile: Compile the network with `torch.compile`.
         precision: `auto` (what is faster on this machine, `sdps.core.precision`), `float32`, or `bfloat16`, which
-        runs the
-            networks under autocast; weights and loss stay float32.
+            runs the networks under autocast; weights and loss stay float32.
         channels_last: Keep feature maps channels-last, which is faster on every processor tried (docs/training.md).
         workers: Loader processes; 0 loads in the trainer's own.
         cache: Keep decoded scenes as memory-mapped arrays in `<data>/cache`.
@@ -113,17 +114,17 @@ class TrainingConfig:
 
     def learning_rate_at(self, progress: float) -> float:
         """Return the learning rate when the share `progress` in [0, 1] of the budget is spent."""
-        rate = self.learning_rate
+        peak = self.learning_rate
         if progress < self.warmup:
-            return rate * max(progress / self.warmup, 0.01)
+            return peak * max(progress / self.warmup, 0.01)
         if self.schedule == "halving":
-            return rate * 0.5 ** sum(progress * self.epochs >= epoch - 1e-9 for epoch in self.halve_after)
+            return peak * 0.5 ** sum(progress * self.epochs >= epoch - 1e-9 for epoch in self.halve_after)
         if self.schedule == "cosine":
             annealed = (min(progress, 1.0) - self.warmup) / (1.0 - self.warmup)
-            return rate * 0.5 * (1.0 + math.cos(math.pi * annealed))
+            return peak * 0.5 * (1.0 + math.cos(math.pi * annealed))
         if self.schedule == "trapezoid":
-            return rate * min(1.0, max(1.0 - progress, 0.0) / max(self.cooldown, 1e-9))
-        return rate
+            return peak * min(1.0, max(1.0 - progress, 0.0) / max(self.cooldown, 1e-9))
+        return peak
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,9 +171,10 @@ class NormalTraining(TrainingConfig):
         loss: `masked` averages over the object, `faithful` over all pixels as the authors' code does.
         lights: The run of a lighting model, `shipped:<name>`, a `.safetensors` file, or `true`; empty: what the
             model's registry entry names.
-        read_out: How light classes become lights: `centre` (the paper's), `expectation` or `peak`.
+        read_out: How light classes become lights: `centre` (argmax, the paper's), `expectation` (soft-argmax) or
+            `peak` (parabolic).
         light_blend: Largest share of the way to the true lights that estimated ones are moved, drawn evenly for each
-            training sample. The many images and views of use give better lights than a sample's few.
+            training sample. Many images and test-time augmentation give better lights than a sample's few images.
         crop: Side of the random crop the network sees (0: the whole image); the lighting model always sees the whole.
         min_object: Least share of object pixels a crop should have; the best of a few draws is taken.
         lighting_weight: Weight of the lighting loss beside the normal loss, for models that learn both.

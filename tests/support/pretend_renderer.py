@@ -5,16 +5,17 @@ import signal
 import time
 
 from render.records import ledger
-from render.running.isolation import Orders, settle
+from render.running.isolation import settle
+from render.running.messages import Begun, Done, Ended, Failed, Fatal, Ready, WorkerConfig
 
 
-def pretend(connection, orders: Orders) -> None:
+def pretend(connection, config: WorkerConfig) -> None:
     """Serve as a rendering process does, but only write a few bytes per scene, and fail as the material says."""
-    settle(orders)
-    connection.send(("ready",))
+    settle(config)
+    connection.send(Ready())
     while (chunk := connection.recv()) is not None:
         for scene in chunk.scenes():
-            connection.send(("begin", [scene.id]))
+            connection.send(Begun((scene.id,)))
             match scene.material:
                 case "hang":
                     time.sleep(60)
@@ -23,22 +24,22 @@ def pretend(connection, orders: Orders) -> None:
                 case "quit":
                     os._exit(3)
                 case "raise":
-                    connection.send(("failed", [scene.id], "ValueError: no", "Traceback\nValueError: no", 0.1))
+                    connection.send(Failed((scene.id,), "ValueError: no", "Traceback\nValueError: no", 0.1))
                     continue
                 case "full":
-                    connection.send(("fatal", "shards/x.exr: cannot be written (No space left on device)"))
+                    connection.send(Fatal("shards/x.exr: cannot be written (No space left on device)"))
                     return
-            path = orders.folder / scene.file
+            path = config.folder / scene.file
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(scene.digest().encode())
             line = {"id": scene.id, "spec": scene.digest(), "bytes": 64, "seconds": 0.5, "stages": {"render": 0.5},
-                    "time": ledger.now(), "worker": orders.number}  # fmt: skip
-            connection.send(("done", line))
-        connection.send(("end", True))
+                    "time": ledger.now(), "worker": config.number}  # fmt: skip
+            connection.send(Done(line))
+        connection.send(Ended(True))
 
 
-def stillborn(connection, orders: Orders) -> None:
+def stillborn(connection, config: WorkerConfig) -> None:
     """End before being ready, as a process does whose libLLVM aborts."""
-    settle(orders)
+    settle(config)
     os.write(2, b"LLVM ERROR: Cannot select\n")
     os._exit(7)

@@ -17,7 +17,7 @@ from render.materials import model
 from render.materials.fit.network import Brdf, NetworkFile
 from render.materials.fit.spheres import Samples, radiance_limit, sphere_error
 from render.shared.errors import InputError
-from render.shared.files import read_text
+from render.shared.files import markdown_table, read_text
 
 _FIT_PAIRS = 6000
 
@@ -221,20 +221,19 @@ def summary(rows: dict[str, list[float]], names: Sequence[str]) -> str:
     """Return a Markdown table: counts within 10 % and 20 %, the median, and the five worst of each model."""
     tables = model.HALF_KNOTS * model.DIFFERENCE_KNOTS + model.SHADOWING_KNOTS - 1  # S(normal) is 1
     own = 3 * (tables + (model.AZIMUTH_KNOTS[0] - 1) * (model.AZIMUTH_KNOTS[1] - 1))
-    lines = ["| model | parameters | <= 10 % | <= 20 % | median | worst five |", "|---|---|---|---|---|---|"]
+    table = []
     for key, values in rows.items():
         order = np.argsort(values)[::-1][:5]
         worst = ", ".join(f"{names[index]} {100 * values[index]:.0f}" for index in order)
         within = [sum(value <= bound for value in values) for bound in (0.1, 0.2)]
         count = _PARAMETERS.get(key, own)
-        lines.append(f"| {key} | {count} | {within[0]} | {within[1]} | {100 * np.median(values):.1f} % | {worst} |")
-    return "\n".join(lines) + "\n"
+        table.append((key, count, *within, f"{100 * np.median(values):.1f} %", worst))
+    return markdown_table(("model", "parameters", "<= 10 %", "<= 20 %", "median", "worst five"), table)
 
 
 def by_material(rows: dict[str, list[float]], names: Sequence[str]) -> str:
     """Return a Markdown table of every material's error in percent, the worst of the last model first."""
     keys = list(rows)
-    lines = [f"| material | {' | '.join(keys)} |", "|---" * (len(keys) + 1) + "|"]
-    for index in np.argsort(rows[keys[-1]])[::-1]:
-        lines.append(f"| {names[index]} | {' | '.join(f'{100 * rows[key][index]:.1f}' for key in keys)} |")
-    return "\n".join(lines) + "\n"
+    worst_first = np.argsort(rows[keys[-1]])[::-1]
+    table = [(names[index], *(f"{100 * rows[key][index]:.1f}" for key in keys)) for index in worst_first]
+    return markdown_table(("material", *keys), table)

@@ -22,9 +22,8 @@ from render.shared.errors import InputError
 
 mi = variant.load()
 
-GLOSSY = (
-    0.1  # share of light in a narrow highlight from which on it gets samples of its own (`render.kernel.highlights`)
-)
+GLOSSY = 0.1
+"""Share of light in a narrow highlight from which on it gets samples of its own (`render.kernel.highlights`)."""
 
 
 class Part(NamedTuple):

@@ -12,13 +12,14 @@ _SPAN = np.array([4.0, 4.0, np.log(4.0)])
 """Half the box of mu, nu and log lambda, that of Alldrin, Mallick & Kriegman (CVPR 2007)."""
 
 
-def minimise_over_bas_reliefs(
-    energy: Callable[[Gbr], float],
-    starts: Sequence[Gbr],
-    *,
-    nodes: tuple[int, int, int] = (7, 7, 5),
-    survivors: int = 5,
-) -> tuple[Gbr, float, int]:
+_NODES = (7, 7, 5)
+"""Grid size along mu, nu and log lambda."""
+
+_REFINED = 5
+"""How many of the best nodes are refined."""
+
+
+def minimise_over_bas_reliefs(energy: Callable[[Gbr], float], starts: Sequence[Gbr]) -> tuple[Gbr, float, int]:
     """Search boxes of depth scales of one sign from coarse to fine, then polish by Nelder-Mead.
 
     A box spans four times its start's depth scale in mu and nu, and from a quarter to four times it in lambda; a second
@@ -28,8 +29,6 @@ def minimise_over_bas_reliefs(
     Args:
         energy: To minimise; anything not finite counts as infinite.
         starts: Centres of boxes, also candidates themselves.
-        nodes: Grid size along mu, nu and log lambda.
-        survivors: How many nodes are refined.
 
     Returns:
         The best transformation, its energy and the number of energies computed.
@@ -42,12 +41,12 @@ def minimise_over_bas_reliefs(
         result = energy(gbr)
         return result if np.isfinite(result) else np.inf
 
-    axes = [np.linspace(-span, span, count) for span, count in zip(_SPAN, nodes, strict=True)]
+    axes = [np.linspace(-span, span, count) for span, count in zip(_SPAN, _NODES, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     offsets = np.concatenate([np.zeros((1, 3)), 0.25 * grid, grid])
     candidates = [_moved(start, offset) for start in starts for offset in offsets]
     coarse = [value(gbr) for gbr in progress_bar(candidates, desc="bas-relief grid", unit="candidate")]
-    first = np.argsort(coarse, kind="stable")[:survivors]
+    first = np.argsort(coarse, kind="stable")[:_REFINED]
     best, lowest = candidates[first[0]], coarse[first[0]]
     simplex = np.vstack([np.zeros(3), np.diag(_SPAN / 8.0)])
     options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-7, "maxfev": 250}

@@ -10,6 +10,7 @@ import numpy as np
 
 from render.shared.errors import unknown
 from sdps.classical.common.factorisation import Factors, factorise, impose_integrability, oriented
+from sdps.classical.common.gbr import Gbr
 from sdps.classical.common.observations import Observations, observe
 from sdps.classical.common.rpca import robust_low_rank
 from sdps.classical.common.separation import diffuse_factors
@@ -86,15 +87,15 @@ def prepare(
     return Prepared(observations, profiles, cleaned, oriented(factors, observations.mask))
 
 
-def conclude(prepared: Prepared, factors: Factors, diagnostics: dict[str, Any] | None = None) -> Estimate:
-    """Turn resolved factors into an estimate: oriented, normals of length 1, lights split into direction and intensity.
+def conclude(prepared: Prepared, gbr: Gbr, diagnostics: dict[str, Any] | None = None) -> Estimate:
+    """Turn the factors, transformed, into an estimate: oriented, unit normals, lights as direction and intensity.
 
     Args:
         prepared: What `prepare` returned.
-        factors: Factors after the method's bas-relief transformation.
-        diagnostics: What the method adds to `albedo` (H, W), and `singular_values`.
+        gbr: The method's bas-relief transformation of the prepared factors.
+        diagnostics: What the method adds to `albedo` (H, W), `singular_values` and `gbr` (mu, nu, lambda).
     """
-    factors = oriented(factors, prepared.mask)
+    factors = oriented(prepared.factors.transformed(gbr), prepared.mask)
     strength = np.linalg.norm(factors.lights, axis=0)
     directions = (factors.lights / np.maximum(strength, 1e-12)).T
     directions[strength <= 0.0] = (0.0, 0.0, 1.0)
@@ -103,5 +104,10 @@ def conclude(prepared: Prepared, factors: Factors, diagnostics: dict[str, Any] |
         normals=to_map(factors.normals()),
         light_directions=directions.astype(np.float32),
         intensities=(strength / max(float(strength.mean()), 1e-300)).astype(np.float32),
-        diagnostics={"albedo": to_map(factors.albedo()), "singular_values": factors.singular} | (diagnostics or {}),
+        diagnostics={
+            "albedo": to_map(factors.albedo()),
+            "singular_values": factors.singular,
+            "gbr": (gbr.mu, gbr.nu, gbr.lam),
+            **(diagnostics or {}),
+        },
     )

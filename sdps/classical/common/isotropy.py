@@ -60,9 +60,9 @@ def asymmetry(values: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np
     return np.where(norm > 1.0, total / np.maximum(norm, 1e-6), 1.0)
 
 
-def log_values(profiles: np.ndarray, gains: np.ndarray) -> np.ndarray:  # (P, L) float32
+def log_values(profiles: np.ndarray, intensities: np.ndarray) -> np.ndarray:  # (P, L) float32
     """Return log samples over intensity and the pixel's typical value."""
-    values = (profiles / gains).astype(np.float32)
+    values = (profiles / intensities).astype(np.float32)
     values /= np.maximum(np.median(values, axis=1, keepdims=True), 1e-3 * values.max() + 1e-12)
     return np.log(values + np.float32(_FLOOR))
 

@@ -36,14 +36,9 @@ class Observations:
         """Number of images L."""
         return len(self.values)
 
-    @property
-    def coloured(self) -> bool:
-        """Whether there are three channels."""
-        return self.values.shape[-1] == 3
-
-    def grey(self, weights: tuple[float, float, float] = MEAN) -> np.ndarray:  # (P, L)
-        """Return the weighted mean of the channels, (P, L) float64: one intensity profile per row."""
-        parts = weights if self.coloured else (1.0,)
+    def grey(self) -> np.ndarray:  # (P, L)
+        """Return the mean of the channels, (P, L) float64: one intensity profile per row."""
+        parts = MEAN if self.values.shape[-1] == 3 else (1.0,)
         return np.tensordot(self.values, np.array(parts), axes=(-1, 0)).T.astype(np.float64, order="C")
 
     def to_map(self, values: np.ndarray, background: float = 0.0) -> np.ndarray:  # (H, W, ...)

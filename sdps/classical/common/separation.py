@@ -23,17 +23,19 @@ _SHADOW = 0.03
 _CLIP = 1.5
 """Value over the typical one of a pixel at which the starting solution cuts highlights off."""
 
+_STEPS, _SURFACE_STEPS = 40, 12
+"""Alternations that find the lights, and the reweightings of a pixel under known ones."""
+
 _CHUNK = 20_000
 """Pixels at a time in the final solve; keeps the memory flat."""
 
 
-def diffuse_factors(profiles: np.ndarray, *, samples: int = 6000, steps: int = 40, seed: int = 0) -> Factors:
-    """Fit i = max(b . s, 0) to the samples that follow it.
+def diffuse_factors(profiles: np.ndarray, *, samples: int = 6000, seed: int = 0) -> Factors:
+    """Fit i = max(b . s, 0) to the samples that follow it; the tolerance reaches its end after two thirds of the steps.
 
     Args:
         profiles: (P, L), non-negative.
         samples: Most pixels that take part in finding the lights.
-        steps: Alternations; the tolerance reaches its end after two thirds of them.
         seed: Root seed of the draw.
 
     Returns:
@@ -50,8 +52,8 @@ def diffuse_factors(profiles: np.ndarray, *, samples: int = 6000, steps: int = 4
     values = profiles[chosen] / levels[:, None] / gains
     start = factorise(np.minimum(values, _CLIP))
     surface, lights = start.surface, start.lights.T
-    for step in progress_bar(range(steps), desc="diffuse fit", unit="step"):
-        progress = step / (steps - 1)
+    for step in progress_bar(range(_STEPS), desc="diffuse fit", unit="step"):
+        progress = step / (_STEPS - 1)
         surface = _solve(values, _weights(values, surface @ lights.T, progress), lights)
         lights = _solve(values.T, _weights(values, surface @ lights.T, progress).T, surface)
         scale = column_scale(surface)
@@ -61,7 +63,7 @@ def diffuse_factors(profiles: np.ndarray, *, samples: int = 6000, steps: int = 4
     return balanced(surface * levels[:, None], lights.T * gains)
 
 
-def diffuse_surface(profiles: np.ndarray, lights: np.ndarray, *, steps: int = 12) -> np.ndarray:  # (P, 3)
+def diffuse_surface(profiles: np.ndarray, lights: np.ndarray) -> np.ndarray:  # (P, 3)
     """Fit i = max(b . s, 0) pixel by pixel under known lights (L, 3) to the samples that follow it; returns b."""
     gains = np.maximum(np.linalg.norm(lights, axis=1), 1e-12)
     lights32 = (lights / gains[:, None]).astype(np.float32)
@@ -72,8 +74,8 @@ def diffuse_surface(profiles: np.ndarray, lights: np.ndarray, *, steps: int = 12
         levels = _levels(values)
         values /= levels[:, None].astype(np.float32)
         found = _solve(np.minimum(values, _CLIP), np.ones_like(values), lights32)
-        for step in range(steps):
-            weights = _weights(values, found.astype(np.float32) @ lights32.T, step / (steps - 1))
+        for step in range(_SURFACE_STEPS):
+            weights = _weights(values, found.astype(np.float32) @ lights32.T, step / (_SURFACE_STEPS - 1))
             found = _solve(values, weights, lights32)
         surface[part] = found * levels[:, None]
     return surface

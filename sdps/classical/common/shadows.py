@@ -19,9 +19,11 @@ _CHUNK = 16384
 """Pixels solved at a time."""
 
 
-def fit_lit(
-    profiles: np.ndarray, cleaned: np.ndarray, start: np.ndarray, *, samples: int = 8000, steps: int = 60, seed: int = 0
-) -> Factors:
+_SAMPLES, _STEPS = 8000, 60
+"""Pixels that S is fitted on, and alternations; with S known, every pixel is solved by itself."""
+
+
+def fit_lit(profiles: np.ndarray, cleaned: np.ndarray, start: np.ndarray, *, seed: int = 0) -> Factors:
     """Fit I = B S to lit observations.
 
     A shadow says only that shading is not positive there: it counts where the fit exceeds it, and not otherwise.
@@ -32,8 +34,6 @@ def fit_lit(
         profiles: (P, L), intensity profiles, which tell what is in shadow.
         cleaned: (P, L), the same without highlights.
         start: S, (3, L), of a factorisation to start from.
-        samples: Pixels that S is fitted on; with S known, every pixel is solved by itself.
-        steps: Alternations.
         seed: Root seed of the sample.
 
     Returns:
@@ -44,12 +44,12 @@ def fit_lit(
     """
     peak = profiles.max(1)
     bright = np.flatnonzero(peak > 0.05 * np.median(peak))
-    chosen = generator(seed, "lit factors").permutation(bright)[:samples]
+    chosen = generator(seed, "lit factors").permutation(bright)[:_SAMPLES]
     exposure = _typical(profiles[chosen].T)  # (L,)
     data = _Lit(profiles[chosen], cleaned[chosen], exposure)
     lights = start.T  # (L, 3)
     surface = solve_weighted(lights, data.values, data.lit, np.zeros((len(chosen), 3)))
-    for _ in range(steps):
+    for _ in range(_STEPS):
         lights = solve_weighted(surface, data.values.T, data.counts(surface @ lights.T).T, lights)
         lights = np.linalg.qr(lights)[0] * np.sqrt(len(lights))  # its scale is free; keep it from drifting
         surface = data.solve(lights, surface)

@@ -53,7 +53,7 @@ def both(built: scene.Scene, lights: np.ndarray, **settings) -> tuple:
     count = asked.depths[0].count
     assert probed.depths[0].count == count
     faced = facing(asked)
-    return asked, *(bits(found.depths[0].words, count, len(lights)) & faced for found in (probed, asked)), faced
+    return asked, *(bits(found.depths[0].bitmask, count, len(lights)) & faced for found in (probed, asked)), faced
 
 
 def pixel_of(found: paths.Paths) -> np.ndarray:
@@ -75,7 +75,7 @@ def test_bits_tell_which_lights_a_vertex_sees(lights):
     built, directions = scene.build(support.bowl()), support.spread(lights, 0.02)
     found = traced(built, directions, probe=False)
     first = found.depths[0]
-    seen = bits(first.words, first.count, lights)
+    seen = bits(first.bitmask, first.count, lights)
     for number in range(lights):
         towards = mi.Vector3f(*(float(c) for c in np.array(found.directions)[:, number]))
         # Off the surface along the exact normals: facets of the bowl are flat to 1e-3.

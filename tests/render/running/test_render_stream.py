@@ -23,7 +23,7 @@ from render.planning.plan import DataConfig, plan
 from render.records.manifest import SceneSpec, View, write_manifest
 from render.records.shards import read_shard
 from render.running import rendered, worker
-from render.running.scene_stream import StreamOrders, _render, rendered_scenes, serve, stream_order
+from render.running.scene_stream import StreamWorkerConfig, _render, rendered_scenes, serve, stream_order
 from render.shared.errors import InputError
 from sdps.data.augment import Augmentation
 from sdps.data.dataset import SampleOptions
@@ -160,8 +160,8 @@ def test_defects_in_the_renderer_are_one_line(simple, monkeypatch):
         raise RuntimeError("drjit: first line\nsecond line")
 
     monkeypatch.setattr(worker, "build", defect)
-    orders = StreamOrders(scenes=simple, seed=0, start=0, count=1, depth=1, threads=1)
-    kind, reason = _render(orders, queue.Queue())
+    config = StreamWorkerConfig(scenes=simple, seed=0, start=0, count=1, depth=1, threads=1)
+    kind, reason = _render(config, queue.Queue())
     assert kind == "failed"
     assert reason.startswith("the renderer failed (RuntimeError: drjit: first line); `sdps render-data`")
 
@@ -219,13 +219,13 @@ def alive(pid: int) -> bool:
 PARENT = """
 import multiprocessing, time
 from pretend_stream import busy
-from render.stream import StreamOrders
+from render.running.scene_stream import StreamWorkerConfig
 
 if __name__ == "__main__":
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    orders = StreamOrders(scenes=[None], seed=0, start=0, count=9, depth=1, threads=1)
-    process = context.Process(target=busy, args=(theirs, orders), daemon=True)
+    config = StreamWorkerConfig(scenes=[None], seed=0, start=0, count=9, depth=1, threads=1)
+    process = context.Process(target=busy, args=(theirs, config), daemon=True)
     process.start()
     ours.poll(None)
     print(process.pid, flush=True)

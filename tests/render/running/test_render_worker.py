@@ -12,6 +12,7 @@ from render.planning.plan import DataConfig, plan
 from render.records.manifest import SceneSpec, View
 from render.records.shards import Shard, file_hash, is_whole, read_shard
 from render.running import isolation, worker
+from render.running.messages import Begun, Done, Failed, Message, WorkerConfig
 from render.shared.errors import InputError
 
 CONFIG = DataConfig(
@@ -88,12 +89,13 @@ def test_shard_holds_what_the_manifest_says(scenes, whole, tmp_path):
     json.dumps(shard.provenance)
 
 
-def test_groups_share_rays_only_within_a_view(scenes):
-    groups = list(view_groups(scenes, 2))
+def test_groups_share_rays_only_within_a_view(scenes, monkeypatch):
+    monkeypatch.setattr("render.planning.chunks.GROUP_SIZE", 2)
+    groups = list(view_groups(scenes))
     assert [len(group) for group in groups] == [2, 1] * 4
     assert [scene for group in groups for scene in group] == scenes
     other = replace(scenes[1], spp=8)
-    assert len(list(view_groups([scenes[0], other], 16))) == 2
+    assert len(list(view_groups([scenes[0], other]))) == 2
 
 
 def test_lights_brighten_the_side_they_stand_on(tmp_path):
@@ -188,13 +190,13 @@ def test_an_unknown_part_of_a_pattern_is_told(scenes, tmp_path):
 # ---- One process's work, isolated ------------------------------------------------------------------
 
 
-def work(scenes: list[SceneSpec], folder: Path) -> tuple[bool, list[tuple]]:
+def work(scenes: list[SceneSpec], folder: Path) -> tuple[bool, list[Message]]:
     """Render one chunk as a rendering process does; return whether it is still sound, and what it told."""
     groups = tuple(tuple(group) for group in view_groups(scenes))
     chunk = Chunk(scenes[0].shape, groups, frozenset(scene.id for scene in scenes))
-    told: list[tuple] = []
-    orders = isolation.Orders(folder=folder, number=3, threads=1, variant="", llvm=None, errors=folder / "errors")
-    return isolation.Work(told.append, chunk, orders).run(), told
+    told: list[Message] = []
+    config = WorkerConfig(folder=folder, number=3, threads=1, variant="", llvm=None, errors=folder / "errors")
+    return isolation.Work(told.append, chunk, config).run(), told
 
 
 def fail_writing(monkeypatch: pytest.MonkeyPatch, scene: SceneSpec, error: Exception) -> None:
@@ -212,10 +214,10 @@ def fail_writing(monkeypatch: pytest.MonkeyPatch, scene: SceneSpec, error: Excep
 def test_a_scene_that_fails_leaves_the_bytes_of_its_neighbours(scenes, whole, tmp_path, monkeypatch):
     fail_writing(monkeypatch, scenes[1], InputError("the image has infinite values"))
     sound, told = work(scenes[:3], tmp_path)
-    assert sound and [message[0] for message in told] == ["begin", "begin", "done", "failed", "begin", "done"]
-    assert told[3][1:3] == ([scenes[1].id], "the image has infinite values")
+    assert sound and [type(message) for message in told] == [Begun, Begun, Done, Failed, Begun, Done]
+    assert (told[3].ids, told[3].reason) == ((scenes[1].id,), "the image has infinite values")
     assert hashes(tmp_path) == {f"{scenes[k].id}.exr": whole[f"{scenes[k].id}.exr"] for k in (0, 2)}
-    line = told[2][1]
+    line = told[2].line
     assert line["id"] == scenes[0].id and line["spec"] == scenes[0].digest() and line["worker"] == 3
     assert line["bytes"] == (tmp_path / scenes[0].file).stat().st_size
     assert line["seconds"] == pytest.approx(sum(line["stages"].values()), abs=1e-3)
@@ -224,8 +226,8 @@ def test_a_scene_that_fails_leaves_the_bytes_of_its_neighbours(scenes, whole, tm
 def test_a_defect_ends_the_process_with_a_traceback(scenes, tmp_path, monkeypatch):
     fail_writing(monkeypatch, scenes[0], RuntimeError("internal"))
     sound, told = work(scenes[:3], tmp_path)
-    assert not sound and [message[0] for message in told] == ["begin", "begin", "failed"]
-    assert told[-1][2] == "RuntimeError: internal" and "in write" in told[-1][3]
+    assert not sound and [type(message) for message in told] == [Begun, Begun, Failed]
+    assert told[-1].reason == "RuntimeError: internal" and "in write" in told[-1].traceback
 
 
 def test_a_disk_that_refuses_concerns_the_whole_run(scenes, tmp_path):
@@ -236,9 +238,9 @@ def test_a_disk_that_refuses_concerns_the_whole_run(scenes, tmp_path):
 
 def test_shapes_and_views_that_fail_take_their_scenes_along(scenes, tmp_path):
     sound, told = work([replace(scene, shape="gone.obj") for scene in scenes[:3]], tmp_path)
-    assert sound and told[-1][1] == [scene.id for scene in scenes[:3]] and "gone.obj" in told[-1][2]
+    assert sound and told[-1].ids == tuple(scene.id for scene in scenes[:3]) and "gone.obj" in told[-1].reason
     lost = View(scale=0.05, offset=(4.0, 0.0))
     sound, told = work([replace(scenes[0], view=lost, id="a"), scenes[3]], tmp_path)
-    failed = [message for message in told if message[0] == "failed"]
-    assert sound and [message[1] for message in failed] == [["a"]] and "outside the frame" in failed[0][2]
+    (failed,) = [message for message in told if isinstance(message, Failed)]
+    assert sound and failed.ids == ("a",) and "outside the frame" in failed.reason
     assert (tmp_path / scenes[3].file).is_file()

@@ -26,9 +26,9 @@ def prepared(scene: scenes.Scene) -> Prepared:
 
 def solve(prepared: Prepared, maxima: pf14.Maxima, start: Gbr | None = None) -> np.ndarray:
     """Return the normals (H, W, 3) found from factors that a transformation has put elsewhere first."""
-    factors = prepared.factors.transformed(start or Gbr())
-    gbr = pf14.median_gbr(*pf14.intersect(factors, maxima))
-    return conclude(prepared, factors.transformed(gbr)).normals
+    start = start or Gbr()
+    gbr = pf14.median_gbr(*pf14.intersect(prepared.factors.transformed(start), maxima))
+    return conclude(prepared, start.then(gbr)).normals
 
 
 def test_exact_on_a_smooth_lambertian_surface(scene: scenes.Scene) -> None:

@@ -16,7 +16,8 @@ from render.records.manifest import read_manifest
 from render.records.shards import read_shard
 from render.shared.errors import InputError
 from sdps.core.metrics import normal_mae
-from sdps.data.augment import Augmentation, apply_symmetry, augment, exposure_scale, normalise_exposure
+from sdps.core.symmetry import Symmetry
+from sdps.data.augment import Augmentation, augment, exposure_scale, measure_exposure
 from sdps.data.dataset import (
     Batch,
     SampleKey,
@@ -92,9 +93,10 @@ def test_mean_exposure_brings_dark_and_bright_objects_to_one_level(albedo: float
     config = Augmentation(mean_jitter=(1.0, 1.0), noise=0.0)
     out, _ = augment(images, mask, config, rng())
     assert out[:, mask].mean() == pytest.approx(0.3, rel=0.02)
-    test, scale = normalise_exposure(images, mask, config)
+    exposure = measure_exposure(images[:, mask], config)
+    test = exposure.apply(images)
     assert test[:, mask].mean() == pytest.approx(0.3, rel=0.02)
-    np.testing.assert_allclose(test, images * scale, rtol=1e-5)
+    np.testing.assert_allclose(test, images * exposure.scale, rtol=1e-5)
 
 
 def test_exposure_is_not_held_down_by_a_few_highlights() -> None:
@@ -108,25 +110,29 @@ def test_exposure_is_not_held_down_by_a_few_highlights() -> None:
 
 
 def test_paper_mode_exposes_dark_test_images_as_published() -> None:
-    images, mask = np.full((2, 4, 4, 3), 0.005, np.float32), np.ones((4, 4), bool)
-    mask[0] = False
-    out, scale = normalise_exposure(images, mask, PLAIN)
-    assert scale == pytest.approx(1.5 * 4.0, rel=1e-4)
-    np.testing.assert_allclose(out[:, mask], 0.03, rtol=1e-4)
-    np.testing.assert_array_equal(out[:, ~mask], 0.0)
+    images = np.full((2, 4, 4, 3), 0.005, np.float32)
+    exposure = measure_exposure(images[:, 1:], PLAIN)
+    assert exposure.scale == pytest.approx(1.5 * 4.0, rel=1e-4)
+    np.testing.assert_allclose(exposure.apply(images), 0.03, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("turns", "mirror"), [(0, True), (1, False), (2, False), (3, True)])
-def test_symmetries_give_scenes_that_still_obey_lamberts_law(turns: int, mirror: bool) -> None:
+def turn(symmetry: Symmetry, images: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Turn a scene as `make_sample` does."""
+    turned = symmetry.vectors(symmetry.images(normals, 0)), symmetry.vectors(lights)
+    return symmetry.images(images, 1), *turned
+
+
+@pytest.mark.parametrize("symmetry", [Symmetry(0, True), Symmetry(1), Symmetry(2), Symmetry(3, True)])
+def test_symmetries_give_scenes_that_still_obey_lamberts_law(symmetry: Symmetry) -> None:
     normals, mask = sphere_normals(24)
     normals[:12, :12] = mask[:12, :12, None] * np.array([0.6, 0.0, 0.8], np.float32)  # no longer symmetric
     lights = hemisphere_lights(5, rng())
-    turned = apply_symmetry(shade(normals, lights), normals, mask, lights, turns, mirror)
-    np.testing.assert_allclose(turned[0], shade(turned[1], turned[3]), atol=1e-6)
+    turned = turn(symmetry, shade(normals, lights), normals, lights)
+    np.testing.assert_allclose(turned[0], shade(*turned[1:]), atol=1e-6)
     assert not np.allclose(turned[1], normals)
     # A sphere's own normals are the same after any symmetry: the vectors turn with the pixels.
-    sphere, disc = sphere_normals(24)
-    np.testing.assert_allclose(apply_symmetry(shade(sphere, lights), sphere, disc, lights, turns, mirror)[1], sphere)
+    sphere, _ = sphere_normals(24)
+    np.testing.assert_allclose(turn(symmetry, shade(sphere, lights), sphere, lights)[1], sphere)
 
 
 def test_sample_is_the_shard(folder: Path) -> None:
@@ -138,6 +144,18 @@ def test_sample_is_the_shard(folder: Path) -> None:
     np.testing.assert_array_equal(sample.images.numpy(), shard.images[order].transpose(0, 3, 1, 2))
     np.testing.assert_array_equal(sample.normals.numpy(), shard.normals.transpose(2, 0, 1))
     np.testing.assert_array_equal(sample.mask[0].numpy(), shard.mask)
+
+
+def test_light_directions_are_those_of_the_manifest_with_which_shards_agree(folder: Path) -> None:
+    scenes = read_manifest(folder, "train")
+    for scene in scenes:
+        np.testing.assert_array_equal(read_shard(folder / scene.file).light_directions, scene.light_directions())
+    other = replace(scenes[0], lights=scenes[0].lights[::-1])
+    with pytest.raises(InputError, match="light directions differ from the manifest"):
+        read_shard(folder / other.file, other)
+    with pytest.raises(InputError, match="6 images for 5 lights"):
+        stored = StoredScene(*(getattr(read_shard(folder / scenes[0].file), name) for name in StoredScene._fields))
+        make_sample(replace(scenes[0], lights=scenes[0].lights[:5]), stored, options(), rng())
 
 
 def test_other_sizes_are_resized_with_unit_normals(folder: Path) -> None:
@@ -308,6 +326,7 @@ def ramp(height: int, width: int) -> StoredScene:
 @pytest.mark.parametrize(("height", "width"), [(64, 64), (48, 80)])
 def test_large_scenes_are_rescaled_by_one_factor_and_cropped(folder: Path, height: int, width: int) -> None:
     (scene,) = read_manifest(folder, "train")[:1]
+    scene = replace(scene, lights=scene.lights[:4])
     config = options(augmentation=PLAIN, rescale=True)
     steps, starts = [], []
     for number in range(60):

@@ -15,12 +15,12 @@ from sdps_scenes import hemisphere_lights, shade, sphere_normals
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from sdps.core.metrics import score
-from sdps.data.augment import Augmentation, normalise_exposure
+from sdps.data.augment import Augmentation, measure_exposure
 from sdps.data.dataset import Batch
 from sdps.inference import chunked, image_source
 from sdps.inference.estimator import Estimator, load_estimator
 from sdps.models.checkpoint import TrainedModel, save_weights
-from sdps.models.observation_maps import estimate_normals
+from sdps.models.observation_maps import predict_normals
 from sdps.models.registry import create
 from sdps.training.joint import SecondStage
 from sdps.training.training_config import LightingTraining
@@ -220,7 +220,7 @@ def test_nan_outside_the_mask_is_no_concern(estimator: Estimator) -> None:
 def test_exposure_is_measured_on_a_fair_sample(estimator: Estimator, monkeypatch: pytest.MonkeyPatch) -> None:
     images, mask, _ = scene(count=12)
     exact = estimator.estimate(images, mask).diagnostics["exposure"]
-    assert exact["normals"] == pytest.approx(normalise_exposure(images, mask, Augmentation())[1], rel=1e-5)
+    assert exact["normals"] == pytest.approx(measure_exposure(images[:, mask], Augmentation()).scale, rel=1e-5)
     monkeypatch.setattr(image_source, "EXPOSURE_VALUES", 12 * 3 * 400)
     sampled = estimator.estimate(images, mask).diagnostics["exposure"]
     assert sampled["normals"] != exact["normals"]
@@ -308,7 +308,7 @@ def test_second_pass_is_the_one_of_training() -> None:
     second = trained("lcnet-second")
     estimator = Estimator(**models, second=second, device=torch.device("cpu"), precision="float32", margin=None)
     estimate = estimator.estimate(images, mask)
-    exposed, _ = normalise_exposure(images, mask, Augmentation())
+    exposed = measure_exposure(images[:, mask], Augmentation()).apply(images * mask[..., None])
     batch = Batch(
         images=torch.from_numpy(exposed).permute(0, 3, 1, 2)[None],
         mask=torch.from_numpy(mask.astype(np.float32))[None, None],
@@ -339,8 +339,12 @@ def test_pixel_networks_see_the_whole_pixel(estimator: Estimator, monkeypatch: p
     gains = np.linspace(0.5, 2.0, 6).astype(np.float32)
     model = replace(estimator, normals=trained("cnnps"), rotations=3)
     estimate = model.estimate(images, mask, lights, gains)
-    divided = images / gains[:, None, None, None]
-    expected = estimate_normals(model.normals.network, divided, mask, lights, rotations=3)
+    grey = torch.from_numpy((images / gains[:, None, None, None])[:, mask].mean(-1).T)
+    expected = np.zeros((*mask.shape, 3), np.float32)
+    with torch.no_grad():
+        valid = torch.ones_like(grey, dtype=torch.bool)
+        found = predict_normals(model.normals.network, grey, torch.from_numpy(lights), valid, rotations=3)
+    expected[mask] = found
     np.testing.assert_allclose(estimate.normals, expected, atol=1e-4)
     monkeypatch.setattr(chunked, "_GREY_VALUES", 6 * 50)  # 50 pixels at a time
     np.testing.assert_allclose(model.estimate(images, mask, lights, gains).normals, expected, atol=1e-4)

@@ -10,7 +10,7 @@ from sdps.models.blocks import conv, parameter_count
 from sdps.models.lcnet import LCNet, LightingLogits, resize_input
 from sdps.models.lighting_variants import LCNetSecond
 from sdps.models.nenet import NENet
-from sdps.models.registry import COMBINATIONS, MODELS, PUBLISHED_PARAMETERS, create
+from sdps.models.registry import COMBINATIONS, MODELS, create
 from sdps.models.upsfcn import UPSFCN
 
 
@@ -145,7 +145,11 @@ def test_faithful_loss_is_torchs_cosine_embedding_loss() -> None:
 
 
 def test_published_counts_are_met_within_two_per_cent() -> None:
-    for name, millions in PUBLISHED_PARAMETERS.items():
+    published = {  # the paper's table "Normal estimation", in millions
+        "psfcn": 2.2, "upsfcn-deep-mask": 6.1, "upsfcn-deep": 6.1, "upsfcn-wide": 6.4, "upsfcn-light": 5.7,
+        "upsfcn": 2.2,
+    }  # fmt: skip
+    for name, millions in published.items():
         assert MODELS[name].parameters == pytest.approx(millions * 1e6, rel=0.02), name
     for name in ("sdps", "sdps-reg"):
         assert COMBINATIONS[name].parameters() == pytest.approx(6.6e6, rel=0.02)

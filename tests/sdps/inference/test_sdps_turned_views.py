@@ -1,4 +1,4 @@
-"""Turning scenes: the way back, agreement with training's own symmetry, and what averaging over views gives."""
+"""Turning scenes: the way back, arrays and tensors alike, and what averaging over views gives."""
 
 import numpy as np
 import pytest
@@ -7,9 +7,9 @@ import torch
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from sdps.core.metrics import angle_degrees
-from sdps.data.augment import apply_symmetry
+from sdps.core.symmetry import SYMMETRIES, Symmetry
 from sdps.inference.estimator import Estimator
-from sdps.inference.symmetry import SYMMETRIES, Symmetry, mean_lights, turned_context
+from sdps.inference.turned_views import mean_lights, turned_context
 from sdps.models.base import Lights
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.registry import create
@@ -19,11 +19,11 @@ EVERY = pytest.mark.parametrize("symmetry", SYMMETRIES)
 
 
 @EVERY
-def test_every_symmetry_is_that_of_training_and_has_a_way_back(symmetry: Symmetry) -> None:
+def test_every_symmetry_turns_arrays_and_tensors_alike_and_has_a_way_back(symmetry: Symmetry) -> None:
     rng = np.random.default_rng(0)
     images, normals = rng.random((2, 6, 6, 3)), rng.standard_normal((6, 6, 3))
     directions = rng.standard_normal((2, 3))
-    turned = apply_symmetry(images, normals, np.ones((6, 6), bool), directions, symmetry.turns, symmetry.mirror)
+    turned = symmetry.images(images, 1), symmetry.vectors(symmetry.images(normals, 0)), symmetry.vectors(directions)
     stack, map_, lights = (
         torch.tensor(images).movedim(-1, 1),
         torch.tensor(normals).movedim(-1, 0),
@@ -31,7 +31,7 @@ def test_every_symmetry_is_that_of_training_and_has_a_way_back(symmetry: Symmetr
     )
     np.testing.assert_array_equal(symmetry.images(stack).movedim(1, -1), turned[0])
     np.testing.assert_array_equal(symmetry.vectors(symmetry.images(map_), dim=0).movedim(0, -1), turned[1])
-    np.testing.assert_array_equal(symmetry.vectors(lights), turned[3])
+    np.testing.assert_array_equal(symmetry.vectors(lights), turned[2])
     assert torch.equal(symmetry.back.images(symmetry.images(stack)), stack)
     assert torch.equal(symmetry.back.vectors(symmetry.vectors(lights)), lights)
 

@@ -1,55 +1,25 @@
-"""The eight ways to turn and mirror a scene about the view axis, and back.
+"""Test-time augmentation: networks answer turned and mirrored views of a scene, and the answers are averaged.
 
-Reflectance is isotropic, so a turned scene is one a camera could have seen, with its turned lights and normals.
-Networks are trained on all eight views but answer each a little differently; the mean of the answers, each turned
-back, is nearer to the truth than one of them.
+Networks are trained on all eight views (`sdps.core.symmetry`) but answer each a little differently; the mean of the
+answers, each turned back, is nearer to the truth than one of them.
 
 Legend: L images, h and w the sides of an image.
 """
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from sdps.core.symmetry import Symmetry
 from sdps.inference.image_source import View
 from sdps.models.base import Lights
 
 
-class Symmetry(NamedTuple):
-    """A mirror in x, if any, and quarter turns counter-clockwise after it; as `sdps.data.augment.apply_symmetry`."""
-
-    turns: int = 0
-    mirror: bool = False
-
-    def images(self, images: Tensor) -> Tensor:
-        """Turn images (..., h, w)."""
-        images = images.flip(-1) if self.mirror else images
-        # Not by zero turns: that copies, out of the memory layout that networks are fast in.
-        return torch.rot90(images, self.turns, (-2, -1)) if self.turns else images
-
-    def vectors(self, vectors: Tensor, dim: int = -1) -> Tensor:
-        """Turn vectors whose x, y and z lie along dimension `dim`."""
-        x, y, z = vectors.unbind(dim)
-        x = -x if self.mirror else x
-        for _ in range(self.turns % 4):
-            x, y = -y, x
-        return torch.stack([x, y, z], dim)
-
-    @property
-    def back(self) -> "Symmetry":
-        """What undoes it; a mirrored turn undoes itself."""
-        return self if self.mirror else Symmetry(-self.turns % 4)
-
-    def lights(self, lights: Lights | None) -> Lights | None:
-        """Turn the directions of lights."""
-        return None if lights is None else lights._replace(directions=self.vectors(lights.directions))
-
-
-SYMMETRIES = tuple(Symmetry(turns, mirror) for turns in (0, 2, 1, 3) for mirror in (False, True))
-"""The first 1, 2, 4 or 8 of them are a group each."""
+def turned_lights(symmetry: Symmetry, lights: Lights | None) -> Lights | None:
+    """Turn the directions of lights."""
+    return None if lights is None else lights._replace(directions=symmetry.vectors(lights.directions))
 
 
 class TurnedView:
