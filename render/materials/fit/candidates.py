@@ -17,7 +17,8 @@ from render.materials import model
 from render.materials.fit.network import Brdf, NetworkFile
 from render.materials.fit.spheres import Samples, radiance_limit, sphere_error
 from render.shared.errors import InputError
-from render.shared.files import markdown_table, read_text
+from render.shared.files import read_text
+from render.shared.templates import markdown_table
 
 _FIT_PAIRS = 6000
 
