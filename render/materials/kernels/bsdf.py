@@ -180,6 +180,10 @@ class MERLFitBSDF(FamilyBSDF):
         self.material = load(props["material"])
         super().__init__(props, [PackedMaterials([self.material])])
 
+    def to_string(self) -> str:
+        """Name the material."""
+        return f"MERLFitBSDF[material={self.material.name}]"
+
 
 def _packed_tables(material: Material) -> np.ndarray:
     """Return (32, 6, 2, 4): per knot the RGB table at e = 0 and e = 1, padded to four floats each."""

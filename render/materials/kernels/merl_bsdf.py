@@ -127,6 +127,10 @@ class MerlBSDF(FamilyBSDF):
             raise InputError(f"{props['filename']}: the plugin `merl` reads MERL tables, files ending in .binary")
         super().__init__(props, [PackedMerl([self.table])])
 
+    def to_string(self) -> str:
+        """Name the file."""
+        return f"MerlBSDF[filename={self.table.path}]"
+
 
 def _cell(coordinate: "mi.Float", cells: int) -> tuple:
     """Return the first knot about `coordinate` and the weight of the second, as `merl._cell`."""

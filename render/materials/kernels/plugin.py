@@ -72,10 +72,6 @@ class FamilyBSDF(mi.BSDF):
         parts = self.parts(si)
         return _eval(parts, si, wo, active), _pdf(parts, si, wo, active)
 
-    def to_string(self) -> str:
-        """Name the class and its materials."""
-        return f"{type(self).__name__}[{', '.join(name for family in self.families for name in family.names)}]"
-
     def traverse(self, callback: Any) -> None:
         """Expose the families' arrays."""
         for number, family in enumerate(self.families):

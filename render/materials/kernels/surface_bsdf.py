@@ -39,3 +39,7 @@ class SurfaceBSDF(FamilyBSDF):
         weights = self.pattern.at(self.to_object @ si.p, si.prim_index) if self.pattern else [mi.Float(1)]
         places = self.packed.parts[0]
         return [(self.families[p.family], mi.UInt32(p.index), w) for p, w in zip(places, weights, strict=True)]
+
+    def to_string(self) -> str:
+        """Name the surface."""
+        return f"SurfaceBSDF[material={self.packed.names[0]}]"
