@@ -21,9 +21,10 @@ from render.planning import light_sets
 from render.records.manifest import View
 from render.shared.config import to_plain
 from render.shared.errors import InputError
-from render.shared.files import markdown_table, write_json, write_text
+from render.shared.files import write_json, write_text
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
+from render.shared.templates import markdown_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +203,7 @@ def table(result: dict) -> str:
     ]
     ratios = [(name, f"{value:.2f}", RATIOS[name][3]) for name, value in result["ratios"].items()]
     tables = (("way", "seconds (median)", "fastest - slowest"), ways), (("ratio", "measured", "target"), ratios)
-    return "\n".join([about, *(markdown_table(*table) for table in tables)])
+    return "\n".join([about, *(f"{markdown_table(*table)}\n" for table in tables)])
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -28,8 +28,9 @@ from pipelines.shared.memory import apart, peak_bytes, timed
 from pipelines.shared.text_tables import number
 from render.shared.config import to_plain
 from render.shared.errors import InputError
-from render.shared.files import markdown_table, write_json, write_text
+from render.shared.files import write_json, write_text
 from render.shared.progress import progress_bar
+from render.shared.templates import markdown_table
 from sdps.core.losses import masked_normal_loss
 from sdps.core.precision import arithmetic
 from sdps.data.dataset import Batch
@@ -361,7 +362,8 @@ def _model_text(model: str, found: dict[str, Any], precision: str) -> str:
         rows.append((f"peak memory, {name}", "unknown" if size is None else f"{number(size)} MB", ""))
     header = ("a step", "images/s (median)", "least - most", "images per processor second")
     title = f"## {model}: {scenes} scenes of {images} images of {width}x{height}\n"
-    return "\n".join([title, markdown_table(header, steps), markdown_table(("", "measured", "target"), rows)])
+    tables = (header, steps), (("", "measured", "target"), rows)
+    return "\n".join([title, *(f"{markdown_table(*table)}\n" for table in tables)])
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

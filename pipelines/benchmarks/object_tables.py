@@ -1,6 +1,6 @@
 """Tables with a column per object: ours, then the published rows, each with its source."""
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -73,30 +73,23 @@ def object_table(
     """
     official = any(name in known for name in present)
     columns = [*(known if official else ()), *(name for name in present if name not in known)]
-
-    def row(
-        name: str, source: str, figures: Mapping[str, float], printed: float | None = None, refused: Container[str] = ()
-    ) -> tuple[str, ...]:
-        cells = [REFUSED if column in refused else _figure(figures.get(column), digits) for column in columns]
-        means = [_mean(figures, present)]
-        means += [_mean(figures, known) if printed is None else printed] if official else []
-        return (name, source, *cells, *(_figure(mean, digits) for mean in means))
-
-    ours = [
-        row(name, OURS, _scores(found, metric), refused=[key for key, one in found.items() if one.reason])
+    entries = [
+        (name, OURS, _scores(found, metric), None, [key for key, one in found.items() if one.reason])
         for name, found in results.items()
         if any(metric in result.scores or result.reason for result in found.values())
     ]
-    theirs = [row(one.method, one.source, one.figures, one.average) for one in published] if official else []
-    means = [f"mean of {len(present)}" if len(present) > 1 else "this object"]
-    means += [f"all {len(known)}"] if official else []
-    return Table(
-        title=title,
-        header=("method", "source", *columns, *means),
-        rows=(*ours, *theirs),
-        published=tuple(range(len(ours), len(ours) + len(theirs))),
-        note=note,
-    )
+    ours = len(entries)
+    entries += [(one.method, one.source, one.figures, one.average, ()) for one in published] if official else []
+    rows = []
+    for name, source, figures, printed, refused in entries:
+        cells = [REFUSED if column in refused else _figure(figures.get(column), digits) for column in columns]
+        means = [_mean(figures, present)]
+        means += [_mean(figures, known) if printed is None else printed] if official else []
+        rows.append((name, source, *cells, *(_figure(mean, digits) for mean in means)))
+    last = [f"mean of {len(present)}" if len(present) > 1 else "this object"]
+    last += [f"all {len(known)}"] if official else []
+    header, theirs = ("method", "source", *columns, *last), tuple(range(ours, len(rows)))
+    return Table(title=title, header=header, rows=tuple(rows), published=theirs, note=note)
 
 
 def _scores(found: Mapping[str, Result], metric: str) -> dict[str, float]:

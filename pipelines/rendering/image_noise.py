@@ -19,9 +19,10 @@ from render.planning.chunks import GROUP_SIZE
 from render.records.manifest import View
 from render.shared.config import build
 from render.shared.errors import InputError
-from render.shared.files import markdown_table, write_json, write_text
+from render.shared.files import write_json, write_text
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
+from render.shared.templates import markdown_table
 
 _NUMBERS = ("reference", "lights", "size", "bounces", "seed")
 
@@ -124,7 +125,7 @@ def table(rows: list[Row], config: NoiseConfig) -> str:
         shown = [by_name[name][shape] for shape in config.shapes]
         errors = [f"{row.error[spp]:.2f}" for row in shown for spp in config.spp]
         body.append([name, *errors, *(f"{row.bias[last]:+.2f}" for row in shown)])
-    return markdown_table(["material", *heads], body)
+    return markdown_table(["material", *heads], body) + "\n"
 
 
 def summary(rows: list[Row], config: NoiseConfig) -> str:
