@@ -25,12 +25,11 @@ from pipelines.bench.bench_scenes import write_scenes
 from pipelines.shared.flags import add_fields, add_out, from_flags
 from pipelines.shared.machines import hold, kinds, processor
 from pipelines.shared.memory import apart, peak_bytes, timed
-from pipelines.shared.text_tables import number
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import write_json, write_text
 from render.shared.progress import progress_bar
-from render.shared.templates import markdown_table
+from render.shared.templates import fill
 from sdps.core.losses import masked_normal_loss
 from sdps.core.precision import arithmetic
 from sdps.data.dataset import Batch
@@ -322,48 +321,11 @@ def _spread(values: list[float]) -> dict[str, float]:
 
 def table(result: dict[str, Any]) -> str:
     """Format the result of `run` as Markdown."""
-    parts = []
-    for kind, found in result["kinds"].items():
-        about, rates = found["machine"], found["machine"]["matmul_gflops"]
-        load = "unknown" if about["load"] is None else f"{about['load']:.1f}"
-        parts.append(
-            f"# {kind[0].upper()}{kind[1:]}\n\n"
-            f"{about['processor']}, {about['instructions']}, {about['threads']} threads, torch {about['torch']}, load "
-            f"{load} at the start; matrix products {rates['float32']:.0f} GFLOP/s in float32, {rates['bfloat16']:.0f} "
-            f"in bfloat16 ({rates['bfloat16'] / rates['float32']:.2f}x). The trainer computes in {about['precision']}: "
-            f"{about['reason']}.\n"
-        )
-        parts += [_model_text(model, one, about["precision"]) for model, one in found["models"].items()]
-    return "\n".join(parts)
-
-
-def _model_text(model: str, found: dict[str, Any], precision: str) -> str:
-    """Format what was measured of a model."""
-
-    def range_of(rate: dict[str, float], digits: int) -> str:
-        return f"{rate['least']:.{digits}f} - {rate['most']:.{digits}f}"
-
-    scenes, images, _, height, width = found["batch"]
-    steps = [
-        (name, f"{rate['median']:.1f}", range_of(rate, 1), f"{found['per_processor_second'][name]['median']:.1f}")
-        for name, rate in found["ways"].items()
-    ]
-    steps += [(name, f"skipped: {why}", "", "") for name, why in found["skipped"].items()]
-    ratio, bound = found["ratio"], WAITING_TARGETS[registry.entry(model).role]
-    measured = f"{ratio['median']:.2f} ({range_of(ratio, 2)})"
-    rows = [("trainer / plain loop", measured, f"at least {RATIO_TARGETS[precision]}")]
-    if found["muon_share"] is not None:
-        target = f"under {MUON_TARGET:.0%}" if precision == "float32" else ""
-        rows.append(("Muon's share of a step", f"{found['muon_share']:.1%}", target))
-    for name, waited in found["waiting"].items():
-        share = f"{waited['share']:.1%}, {waited['images_per_second']:.0f} images/s"
-        rows.append((f"waiting for data, {name}", share, f"under {bound:.0%}"))
-    for name, size in found["memory_mb"].items():
-        rows.append((f"peak memory, {name}", "unknown" if size is None else f"{number(size)} MB", ""))
-    header = ("a step", "images/s (median)", "least - most", "images per processor second")
-    title = f"## {model}: {scenes} scenes of {images} images of {width}x{height}\n"
-    tables = (header, steps), (("", "measured", "target"), rows)
-    return "\n".join([title, *(f"{markdown_table(*table)}\n" for table in tables)])
+    models = {model for found in result["kinds"].values() for model in found["models"]}
+    return fill(
+        Path(__file__).with_suffix(".md.j2"), kinds=result["kinds"], ratio_targets=RATIO_TARGETS,
+        muon_target=MUON_TARGET, waiting_targets={name: WAITING_TARGETS[registry.entry(name).role] for name in models},
+    )  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
