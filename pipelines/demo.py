@@ -177,13 +177,9 @@ def make_plan(preset: Preset, rates: dict[str, float]) -> Plan:
         if evaluation <= _EVALUATION_MINUTES:
             break
     return Plan(
-        arithmetic=arithmetic("auto", default_device()).describe(),
-        images_per_second=rates,
-        minutes=minutes,
-        materials=materials,
-        shipped=shipped,
-        evaluation_minutes=round(evaluation, 1),
-    )
+        arithmetic=arithmetic("auto", default_device()).describe(), images_per_second=rates, minutes=minutes,
+        materials=materials, shipped=shipped, evaluation_minutes=round(evaluation, 1),
+    )  # fmt: skip
 
 
 def images_per_second(preset: Preset, name: str) -> float:

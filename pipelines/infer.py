@@ -124,9 +124,7 @@ def _section(result: "Inference") -> SectionWriter:
     tiles = [("a photograph", shown), (f"mask ({photos.mask_origin})", _masked(shown, mask)), ("normals", normals)]
     tiles.append(("depth, near is bright", _depth_picture(result)))
     if len(result.light_directions):
-        tiles.append(
-            ("lights, seen from the camera", pictures.light_intensity_plot(result.light_directions, result.gains))
-        )
+        tiles.append(("lights, seen from the camera", pictures.light_plot(result.light_directions, result.gains)))
     writer.strip("Photograph, mask, normals, depth, lights", tiles)
     writer.strip("The surface from the left, the front and the right", [("", strip(result.depth, 360))], wide=True)
     relit = [(name.replace("-", " "), pictures.tone_map(view)) for name, view in result.relit().items()]

@@ -7,15 +7,16 @@ out. `pipelines.bench.bench_data` adds what concerns whole runs: steady state, m
 
 import argparse
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
 from pipelines.bench import bench_data
+from pipelines.shared.flags import add_fields, from_flags
+from pipelines.shared.memory import timed
 from render.planning import light_sets
 from render.records.manifest import View
 from render.shared.config import to_plain
@@ -23,6 +24,7 @@ from render.shared.errors import InputError
 from render.shared.files import write_json, write_text
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
+from render.shared.templates import markdown_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,18 +112,13 @@ def run(config: BenchConfig) -> dict:
     seconds = {name: float(np.median(values)) for name, values in times.items()}
     return {
         "config": to_plain(config),
-        "machine": {
-            "mitsuba": mi.__version__,
-            "drjit": dr.__version__,
-            "variant": mi.variant(),
-            "threads": dr.thread_count(),
-            "coverage": found["coverage"],
-        },
+        "machine": {"mitsuba": mi.__version__, "drjit": dr.__version__, "variant": mi.variant(),
+                    "threads": dr.thread_count(), "coverage": found["coverage"]},
         "seconds": seconds,
         "spread": {name: [min(values), max(values)] for name, values in times.items()},
         "ratios": {name: seconds[a] / seconds[b] - less for name, (a, b, less, _) in RATIOS.items()},
         "first_light_mean": {"all lights": found["mean"], "path": found["path_mean"]},
-    }
+    }  # fmt: skip
 
 
 def _ways(config: BenchConfig, found: dict) -> dict[str, Callable[[], None]]:
@@ -175,7 +172,7 @@ def _path(config: BenchConfig, found: dict, bar: tqdm) -> float:
         size=config.size, spp=config.spp, bounces=config.bounces, seed=config.seed,
     )  # fmt: skip
     found["path_mean"] = float(next(images).mean())
-    elapsed = _timed(lambda: [image.shape for image in images])
+    elapsed = timed(lambda: [image.shape for image in images])
     bar.update()
     return elapsed
 
@@ -185,42 +182,33 @@ def _interleaved(ways: dict[str, Callable[[], None]], repeats: int, bar: tqdm) -
     times: dict[str, list[float]] = {name: [] for name in ways}
     for number in range(repeats + 2):
         for name, way in ways.items():
-            elapsed = _timed(way)
+            elapsed = timed(way)
             if number >= 2:
                 times[name].append(elapsed)
             bar.update()
     return times
 
 
-def _timed(action: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    action()
-    return time.perf_counter() - start
-
-
 def table(result: dict) -> str:
     """Format the result of `run` as Markdown tables with a line about the scene and the machine."""
     config, machine, seconds, spread = (result[key] for key in ("config", "machine", "seconds", "spread"))
-    lines = [
+    about = (
         f"{config['shape']} covering {machine['coverage']:.0%} of {config['size']}x{config['size']} pixels, "
         f"{config['lights']} lights, {config['spp']} spp, {config['bounces']} bounces, {config['material']}; "
-        f"{machine['variant']}, {machine['threads']} threads, mitsuba {machine['mitsuba']}",
-        "",
-        "| way | seconds (median) | fastest - slowest |",
-        "|---|---|---|",
+        f"{machine['variant']}, {machine['threads']} threads, mitsuba {machine['mitsuba']}\n"
+    )
+    ways = [
+        (label, f"{seconds[name]:.3f}", f"{spread[name][0]:.3f} - {spread[name][1]:.3f}")
+        for name, label in LABELS.items()
     ]
-    for name, label in LABELS.items():
-        lines.append(f"| {label} | {seconds[name]:.3f} | {spread[name][0]:.3f} - {spread[name][1]:.3f} |")
-    lines += ["", "| ratio | measured | target |", "|---|---|---|"]
-    lines += [f"| {name} | {value:.2f} | {RATIOS[name][3]} |" for name, value in result["ratios"].items()]
-    return "\n".join(lines) + "\n"
+    ratios = [(name, f"{value:.2f}", RATIOS[name][3]) for name, value in result["ratios"].items()]
+    tables = (("way", "seconds (median)", "fastest - slowest"), ways), (("ratio", "measured", "target"), ratios)
+    return "\n".join([about, *(f"{markdown_table(*table)}\n" for table in tables)])
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add one flag per field of `BenchConfig`, and what to run."""
-    for entry in fields(BenchConfig):
-        flag = f"--{entry.name.replace('_', '-')}"
-        parser.add_argument(flag, dest=entry.name, type=entry.type, default=entry.default, help="(default %(default)s)")
+    add_fields(parser, BenchConfig)
     parser.add_argument("--only", choices=("ratios", *bench_data.PARTS), help="run one part only")
     parser.add_argument("--scenes", type=int, default=1000, help="scenes of the memory test (default %(default)s)")
     parser.add_argument("--out", type=Path, help="folder for bench.md, bench.json and memory.png")
@@ -228,17 +216,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the benchmark, print its tables and return the exit code."""
-    config = BenchConfig(**{entry.name: getattr(args, entry.name) for entry in fields(BenchConfig)})
-    result, text = {}, []
-    if args.only in (None, "ratios"):
-        result["ratios"] = run(config)
-        text.append(table(result["ratios"]))
-        sys.stdout.write(text[-1] + "\n")
-    for part in bench_data.PARTS if args.only is None else [args.only] if args.only in bench_data.PARTS else []:
-        result[part], lines = bench_data.run(part, args.scenes, args.out)
-        text.append(lines)
-        sys.stdout.write(lines + "\n")
+    config = from_flags(BenchConfig, args)
+    result, texts = {}, []
+    for part in [args.only] if args.only else ["ratios", *bench_data.PARTS]:
+        if part == "ratios":
+            result[part] = run(config)
+            texts.append(table(result[part]))
+        else:
+            result[part], text = bench_data.PARTS[part](args.scenes, args.out)
+            texts.append(text)
+        sys.stdout.write(texts[-1] + "\n")
     if args.out:
         write_json(args.out / "bench.json", result)
-        write_text(args.out / "bench.md", "\n".join(text))
+        write_text(args.out / "bench.md", "\n".join(texts))
     return 0

@@ -9,22 +9,20 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.evaluate.lit import photographs
+from pipelines.evaluate.workbench import photographs, write_photographs
+from pipelines.shared.flags import add_out
 from pipelines.shared.text_tables import render_text
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import read_shard
 from render.shared.errors import InputError
 from render.shared.files import write_json
-from render.shared.images import quantise, write_png
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
-
-if TYPE_CHECKING:
-    from sdps.photos import Finding
+from sdps.photos import Finding, check, load
 
 MOST = 40
 """Pictures of a scene at most."""
@@ -55,9 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps bench-checks`."""
     parser.add_argument("folders", nargs="+", type=Path, help="data folders of rendered scenes")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="every N-th scene (default: all)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/bench-checks"), help="output folder (default: %(default)s)"
-    )
+    add_out(parser, Path("out/bench-checks"))
 
 
 def main(args: argparse.Namespace) -> int:
@@ -87,10 +83,9 @@ def judge(folder: Path, scene: SceneSpec) -> list[dict]:
         if done not in alarms:  # two cases leave the pictures as they are
             alarms[done] = _alarms(_altered(images, spoilt, picked), mask)
         named = _named(alarms[done], spoilt.words)
-        right = sorted(named & set(picked.tolist())) if named is not None else []
-        wrong = sorted(named - set(picked.tolist())) if named is not None else []
+        right = (named or set()) & set(picked.tolist())
         rows.append({"scene": scene.id, "case": case, "said": named is not None, "pictures": len(picked),
-                     "right": len(right), "wrong": len(wrong)})  # fmt: skip
+                     "right": len(right), "wrong": len((named or set()) - right)})  # fmt: skip
     return rows
 
 
@@ -111,19 +106,14 @@ def _altered(images: np.ndarray, spoilt: Spoilt, picked: np.ndarray) -> np.ndarr
     return altered
 
 
-def _alarms(images: np.ndarray, mask: np.ndarray) -> "list[Finding]":
+def _alarms(images: np.ndarray, mask: np.ndarray) -> list[Finding]:
     """Write photographs and check them; notes are no alarms."""
-    from sdps.photos import check, load
-
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
-        for number, image in enumerate(images):
-            write_png(folder / f"{number:03d}.png", quantise(image, 16))
+        folder = write_photographs(Path(temporary), images, mask)
         return [finding for finding in check(load(folder)) if finding.level != "note"]
 
 
-def _named(alarms: "Sequence[Finding]", words: Sequence[str]) -> set[int] | None:
+def _named(alarms: Sequence[Finding], words: Sequence[str]) -> set[int] | None:
     """Return the pictures named with one of the words; None without the words."""
     found = [finding for finding in alarms if any(word in finding.text for word in words)]
     return {int(name[:3]) for finding in found for name in finding.images} if found else None

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.shared import presets
+from pipelines.shared.charts import new_figure, tidy
+from pipelines.shared.memory import resident_bytes
 from render.planning import budget
 from render.planning.plan import plan
 from render.running.supervisor import RunOptions, RunSummary, render_supervised
@@ -17,20 +19,6 @@ from render.shared.files import atomic_path
 
 _WARM_UP = 12  # views, after which every kernel a run needs has been met
 _VIEWS = 40
-
-
-def run(part: str, scenes: int, out: Path | None) -> tuple[dict, str]:
-    """Run one part.
-
-    Args:
-        part: A key of `PARTS`.
-        scenes: Scenes of the memory test.
-        out: Folder for pictures, or None.
-
-    Returns:
-        Plain values, and Markdown lines about them.
-    """
-    return PARTS[part](scenes, out)
 
 
 def steady_state(_: int, __: Path | None) -> tuple[dict, str]:
@@ -77,6 +65,8 @@ def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
     """Render many small scenes in this process and follow its memory."""
     from render.running import worker
 
+    if resident_bytes() is None:
+        raise InputError("bench: the memory part reads /proc, so it needs Linux; choose others by --only")
     config = presets.load("small").data
     shapes = -(-scenes // 16)
     config = replace(config, families={"blobby": shapes, "sculpture": shapes}, views=4, size=64, spp=16,
@@ -89,7 +79,7 @@ def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
         planned = [scene for pair in pairs for first in pair for scene in planned[first : first + 8]][:scenes]
 
         def record(scene: object) -> None:
-            sizes.append(_resident())
+            sizes.append(resident_bytes())
             (Path(folder) / scene.file).unlink()
 
         worker.render_scenes(planned, folder, on_shard=record)
@@ -99,7 +89,13 @@ def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
     values = {"scenes": len(megabytes), "start_mb": float(megabytes[quarter]), "end_mb": float(megabytes[-1]),
               "peak_mb": float(megabytes.max()), "growth_mb_per_1000": float(growth)}  # fmt: skip
     if out:
-        _plot(megabytes, out / "memory.png")
+        figure = new_figure(6.0, 2.6)
+        axes = figure.add_subplot()
+        axes.plot(np.arange(len(sizes)) + 1, megabytes, lw=0.8)
+        axes.set(xlabel="scenes rendered", ylabel="resident memory, MB", ylim=(0, None))
+        tidy(axes)
+        with atomic_path(out / "memory.png") as temporary:
+            figure.savefig(temporary)
     return values, (
         f"Memory over {len(megabytes):,} scenes in one process: {values['start_mb']:.0f} MB after a quarter of them, "
         f"{values['end_mb']:.0f} MB at the end, peak {values['peak_mb']:.0f} MB; trend of the last three quarters "
@@ -145,31 +141,7 @@ def _run(planned: list, processes: int, cores: int) -> RunSummary:
         os.sched_setaffinity(0, set(allowed))
 
 
-def _resident() -> int:
-    """Return the resident memory of this process in bytes.
-
-    Raises:
-        InputError: not on Linux.
-    """
-    try:
-        with open("/proc/self/statm", encoding="ascii") as handle:
-            return int(handle.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError as error:
-        raise InputError("bench: the memory part reads /proc, so it needs Linux; choose others by --only") from error
-
-
-def _plot(megabytes: np.ndarray, path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 2.6), dpi=110, layout="tight")
-    axes = figure.add_subplot()
-    axes.plot(np.arange(1, len(megabytes) + 1), megabytes, lw=0.8)
-    axes.set(xlabel="scenes rendered", ylabel="resident memory, MB", ylim=(0, None))
-    axes.grid(alpha=0.3)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary)
-
-
+# What runs one part, given the scenes of the memory test and a folder for pictures: plain values, Markdown about them.
 PARTS: dict[str, Callable[[int, Path | None], tuple[dict, str]]] = {
     "steady": steady_state,
     "memory": memory,

@@ -10,22 +10,23 @@ import shutil
 import sys
 import tempfile
 import time
-from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pipelines.bench.bench_classical import BenchClassicalConfig, scene
+from pipelines.bench.bench_scenes import BenchClassicalConfig, add_size, large_object, size_from
+from pipelines.evaluate.workbench import write_photographs
 from pipelines.shared import using
-from pipelines.shared.lists import split_list
+from pipelines.shared.flags import add_models, add_out, split_list
 from pipelines.shared.machines import hold, kinds, processor
-from pipelines.shared.memory import apart, peak_gib
+from pipelines.shared.memory import measured, peak_gib
 from pipelines.shared.text_tables import render_text
-from render.shared.errors import InputError
 from render.shared.files import write_json
-from render.shared.images import quantise, write_png
 from render.shared.progress import progress_bar
+from sdps.api import infer, load
 from sdps.inference.inference_config import InferenceConfig, inference_config
+from sdps.photos import check
 
 SECONDS, GIBIBYTES = 180.0, 3.0
 """The limits of a folder of 96 pictures of 612x512 on two cores."""
@@ -35,23 +36,16 @@ STEPS = ("load", "check", "method", "save")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps bench-infer`."""
     parser.add_argument("--methods", action="append", help="commas or repeat (default: sdps)")
-    parser.add_argument("--models", type=Path, default=None, help="folder of trained runs (default: shipped weights)")
+    add_models(parser)
     using.add_arguments(parser)
-    parser.add_argument("--height", type=int, default=BenchClassicalConfig.height)
-    parser.add_argument("--width", type=int, default=BenchClassicalConfig.width)
-    parser.add_argument("--images", type=int, default=BenchClassicalConfig.lights)
+    add_size(parser)
     parser.add_argument("--many", type=int, default=0, help="also infer a folder of this many pictures")
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/bench-infer"), help="output folder (default: %(default)s)"
-    )
+    add_out(parser, Path("out/bench-infer"))
 
 
 def main(args: argparse.Namespace) -> int:
     """Write the photographs, infer them with every method, print the tables and write bench_infer.json."""
-    config, used = (
-        BenchClassicalConfig(height=args.height, width=args.width, lights=args.images),
-        inference_config(args),
-    )
+    config, used = size_from(args), inference_config(args)
     folders = {args.images: photograph(args.out / "photographs", config)}
     if args.many:
         folders[args.many] = repeated(args.out / "many", folders[args.images], args.many)
@@ -59,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
     for kind in kinds():
         with hold(kind):
             found[kind] = {
-                f"{name}, {count} pictures": measure(folder, name, args.models, used)
+                f"{name}, {count} pictures": measured(_work, folder, name, args.models, used)
                 for name in split_list(args.methods) or ["sdps"]
                 for count, folder in folders.items()
             }
@@ -75,17 +69,10 @@ def photograph(folder: Path, config: BenchClassicalConfig) -> Path:
     Raises:
         InputError: the folder cannot be written.
     """
-    images, mask, *_ = scene(config)
+    images, mask, *_ = large_object(config)
     scale = 1.0 / float(np.percentile(images[:, mask], 99.5))
-    try:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
-        for number, image in enumerate(progress_bar(images, desc="photograph", unit="picture")):
-            write_png(folder / f"{number:04d}.png", quantise(image * scale, 16))
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another --out") from error
-    return folder
+    shutil.rmtree(folder, ignore_errors=True)
+    return write_photographs(folder, (image * scale for image in progress_bar(images, desc="photograph")), mask)
 
 
 def repeated(folder: Path, source: Path, count: int) -> Path:
@@ -99,41 +86,26 @@ def repeated(folder: Path, source: Path, count: int) -> Path:
     return folder
 
 
-def measure(folder: Path, method: str, models: Path | None, config: InferenceConfig) -> dict:
-    """Infer a folder in a fresh process: seconds per step and in all, peak_gib, pixels, precision, error."""
-    return apart(_work, folder, method, models, config)
-
-
-def _work(folder: Path, method: str, models: Path | None, config: InferenceConfig, results: Connection) -> None:
-    """Do what `sdps infer` does, and send what it took."""
-    from sdps.api import infer, load
-    from sdps.photos import check
-
+def _work(folder: Path, method: str, models: Path | None, config: InferenceConfig) -> dict:
+    """Do what `sdps infer` does, and tell what it took: seconds per step and in all, peak_gib, pixels, precision."""
     marks = [time.perf_counter()]
-    try:
-        photos = load(folder)
+
+    def done(result: Any) -> Any:
         marks.append(time.perf_counter())
-        findings = tuple(check(photos))
-        marks.append(time.perf_counter())
-        result = infer(photos, method, models=models, config=config, findings=findings)
-        marks.append(time.perf_counter())
-        with tempfile.TemporaryDirectory() as out:
-            result.save(out)
-        marks.append(time.perf_counter())
-    except InputError as error:
-        results.send({"error": str(error)})
-        return
-    steps = dict(zip(STEPS, np.diff(marks).round(2).tolist(), strict=True))
-    results.send(
-        {
-            **steps,
-            "seconds": marks[-1] - marks[0],
-            "peak_gib": peak_gib(),
-            "pixels": int(photos.mask.sum()),
-            "precision": result.estimate.diagnostics.get("precision", "-"),
-            "error": "",
-        }
-    )
+        return result
+
+    photos = done(load(folder))
+    findings = done(tuple(check(photos)))
+    result = done(infer(photos, method, models=models, config=config, findings=findings))
+    with tempfile.TemporaryDirectory() as out:
+        done(result.save(out))
+    return {
+        **dict(zip(STEPS, np.diff(marks).round(2).tolist(), strict=True)),
+        "seconds": marks[-1] - marks[0],
+        "peak_gib": peak_gib(),
+        "pixels": int(photos.mask.sum()),
+        "precision": result.estimate.diagnostics.get("precision", "-"),
+    }
 
 
 def table(found: dict[str, dict], config: BenchClassicalConfig, machine: str) -> str:

@@ -7,21 +7,18 @@ Accuracy needs scenes whose depth is known, such as those of `make eval-classica
 import argparse
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import replace
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.bench.bench_classical import BenchClassicalConfig, scene
-from pipelines.shared.lists import split_list
-from pipelines.shared.memory import apart, peak_gib
+from pipelines.bench.bench_scenes import BenchClassicalConfig, add_size, large_object, size_from
+from pipelines.shared.flags import add_out, picked
+from pipelines.shared.memory import apart, peak_gib, timed
 from pipelines.shared.text_tables import render_text
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import Shard, read_shard
-from render.shared.errors import InputError, unknown
 from render.shared.files import write_json
 from render.shared.progress import progress_bar
 from sdps.classical import registry
@@ -40,22 +37,14 @@ LOW_LIGHT = (0.9, 0.2, 0.3)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps bench-surface`."""
     parser.add_argument("folders", nargs="*", type=Path, help="data folders of rendered scenes (default: timings only)")
-    parser.add_argument("--height", type=int, default=BenchClassicalConfig.height)
-    parser.add_argument("--width", type=int, default=BenchClassicalConfig.width)
-    parser.add_argument("--images", type=int, default=BenchClassicalConfig.lights)
+    add_size(parser)
     parser.add_argument("--steps", action="append", help=f"commas or repeat; of {', '.join(STEPS)} (default: all)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/bench-surface"), help="output folder (default: %(default)s)"
-    )
+    add_out(parser, Path("out/bench-surface"))
 
 
 def main(args: argparse.Namespace) -> int:
     """Score every scene, time every step, print the tables and write bench_surface.json."""
-    config = BenchClassicalConfig(height=args.height, width=args.width, lights=args.images)
-    steps = split_list(args.steps) or STEPS
-    wrong = next((step for step in steps if step not in STEPS), None)
-    if wrong is not None:
-        raise unknown("step", wrong, STEPS)
+    config, steps = size_from(args), picked("step", args.steps, STEPS)
     scenes = [(folder, spec) for folder in args.folders for spec in read_manifest(folder)]
     shapes: dict[str, list[dict]] = {}
     rows = []
@@ -137,34 +126,29 @@ def _shadows(shard: Shard, albedo: np.ndarray) -> dict[str, dict[str, float]]:
     return found
 
 
-def _work(step: str, config: BenchClassicalConfig, results: Connection) -> None:
-    """Do one step on the large object, and send what it took."""
-    images, mask, normals, lights, gains = scene(config)
+def _work(step: str, config: BenchClassicalConfig) -> dict:
+    """Do one step on the large object, and tell what it took."""
+    images, mask, normals, lights, gains = large_object(config)
     if step not in ("albedo", "residuals"):
         images = images[:1]
-    depth = surface = None
-    if step in ("mesh", "views", "cast shadows", *(name for name in STEPS if name.startswith("."))):
-        depth = integrate(normals, mask)
-        surface = mesh(depth, normals=normals) if step.startswith(".") else None
+    kind = step.partition(".")[0]  # of file formats, nothing
+    depth = integrate(normals, mask) if kind in ("mesh", "views", "cast shadows", "") else None
+    surface = mesh(depth, normals=normals) if not kind else None
     albedo = np.full((*mask.shape, 3), 0.5, np.float32)
-    before, began = peak_gib(), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        if step in ("integrate", "discontinuities"):
-            integrate(normals, mask, discontinuities=step == "discontinuities")
-        elif step == "mesh":
-            mesh(depth, normals=normals)
-        elif step.startswith("."):
-            write_mesh(surface, Path(folder) / f"object{step}")
-        elif step == "views":
-            strip(depth)
-        elif step == "cast shadows":
-            relit(normals, albedo, LOW_LIGHT, depth=depth)
-        elif step == "albedo":
-            fit_albedo(images, mask, normals, lights, gains)
-        else:
-            residuals(images, mask, normals, lights, gains, albedo)
-        seconds = time.perf_counter() - began
-    results.send({"seconds": seconds, "before_gib": before, "peak_gib": peak_gib(), "pixels": int(mask.sum())})
+        actions = {
+            "integrate": lambda: integrate(normals, mask),
+            "discontinuities": lambda: integrate(normals, mask, discontinuities=True),
+            "mesh": lambda: mesh(depth, normals=normals),
+            "": lambda: write_mesh(surface, Path(folder) / f"object{step}"),
+            "views": lambda: strip(depth),
+            "cast shadows": lambda: relit(normals, albedo, LOW_LIGHT, depth=depth),
+            "albedo": lambda: fit_albedo(images, mask, normals, lights, gains),
+            "residuals": lambda: residuals(images, mask, normals, lights, gains, albedo),
+        }
+        before = peak_gib()
+        seconds = timed(actions[kind])
+    return {"seconds": seconds, "before_gib": before, "peak_gib": peak_gib(), "pixels": int(mask.sum())}
 
 
 def _depth_table(depths: Sequence[dict]) -> str:
@@ -195,8 +179,6 @@ def _picture_table(rows: Sequence[dict]) -> str:
 def _step_table(found: dict[str, dict], config: BenchClassicalConfig) -> str:
     body = []
     for step, item in found.items():
-        if "error" in item:
-            raise InputError(f"bench-surface: {step}: {item['error']}")
         more = "-" if item["peak_gib"] is None else f"{1024 * (item['peak_gib'] - item['before_gib']):.0f}"
         body.append([step, f"{item['seconds']:.2f}", more])
     pixels = next(iter(found.values()))["pixels"]

@@ -1,10 +1,9 @@
 """`sdps bench-train`: what a training step costs, the trainer's against a plain float32 loop, in one run.
 
 Both kinds of processor are measured: this one, and this one held to AVX2 (`pipelines.shared.machines`). The ways of
-taking a
-step are timed in turn, round after round, so that a change of the machine's load meets all of them. Images per second
-are medians of wall time; images per second of processor time stand beside them, since these hold on a machine that is
-not idle. Normal models are given true lights, so that no lighting model runs with them.
+taking a step are timed in turn, round after round, so that a change of the machine's load meets all of them. Images per
+second are medians of wall time; images per second of processor time stand beside them, since these hold on a machine
+that is not idle. Normal models are given true lights, so that no lighting model runs with them.
 """
 
 import argparse
@@ -13,29 +12,34 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
-from multiprocessing import get_context
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from pipelines.bench.bench_scenes import write_scenes
+from pipelines.shared.flags import add_fields, add_out, from_flags
 from pipelines.shared.machines import hold, kinds, processor
-from pipelines.shared.memory import peak_bytes
-from pipelines.shared.text_tables import number
+from pipelines.shared.memory import apart, peak_bytes, timed
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import write_json, write_text
 from render.shared.progress import progress_bar
-
-if TYPE_CHECKING:
-    from sdps.data.dataset import Batch
-    from sdps.training.trainer import Trainer
-    from sdps.training.training_config import TrainingConfig
+from render.shared.templates import fill
+from sdps.core.losses import masked_normal_loss
+from sdps.core.precision import arithmetic
+from sdps.data.dataset import Batch
+from sdps.models import registry
+from sdps.models.base import Lights
+from sdps.training.distributed import Team
+from sdps.training.loggers import Meter
+from sdps.training.stage_factory import create_stage
+from sdps.training.trainer import Trainer
+from sdps.training.training_config import LightingTraining, NormalTraining, TrainingConfig
 
 RATIO_TARGETS = {"bfloat16": 2.7, "float32": 1.0}
 """Trainer over plain loop, by what the trainer computes in."""
@@ -81,18 +85,15 @@ class BenchTrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        from sdps.models import registry
-
         for name in ("seconds", "rounds", "scenes", "images"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} must be positive, got {getattr(self, name)}")
         if not self.models:
             raise InputError("models must name at least one; see `sdps models`")
         for model in self.models:
-            if registry.entry(model).role not in WAITING_TARGETS:
-                raise InputError(
-                    f"models: {model!r} is for {registry.entry(model).role!r}; name models for lights or normals"
-                )
+            role = registry.entry(model).role
+            if role not in WAITING_TARGETS:
+                raise InputError(f"models: {model!r} is for {role!r}; name models for lights or normals")
 
 
 def run(config: BenchTrainConfig) -> dict[str, Any]:
@@ -115,17 +116,11 @@ def run(config: BenchTrainConfig) -> dict[str, Any]:
         for kind, model in progress_bar(pairs, unit="model", desc="bench-train"):
             with hold(kind):
                 if kind not in result["kinds"]:
-                    result["kinds"][kind] = {"machine": _apart(machine), "models": {}}
-                found = _apart(measure, config, model, folder)
-                found["memory_mb"] = {way: _apart(peak_memory, config, model, folder, way) for way in (PLAIN, OURS)}
+                    result["kinds"][kind] = {"machine": apart(machine), "models": {}}
+                found = apart(measure, config, model, folder)
+                found["memory_mb"] = {way: apart(peak_memory, config, model, folder, way) for way in (PLAIN, OURS)}
             result["kinds"][kind]["models"][model] = found
     return result
-
-
-def _apart(function: Callable, *arguments: Any) -> Any:
-    """Call a function in a fresh process, whose memory and compiled kernels are its own."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()
 
 
 def machine() -> dict[str, Any]:
@@ -133,37 +128,29 @@ def machine() -> dict[str, Any]:
 
     Their ratio bounds what bfloat16 can gain on networks that are convolutions and little else.
     """
-    import torch
-
-    from sdps.core.precision import arithmetic
-
     chosen = arithmetic()
     rates = {}
     for name in ("float32", "bfloat16"):
         left, right = (torch.ones(2048, 2048, dtype=getattr(torch, name)) for _ in range(2))
         left @ right
-        rates[name] = float(np.median([2 * 2048**3 / 1e9 / _timed(lambda a=left, b=right: a @ b)[0] for _ in range(5)]))
+        rates[name] = float(np.median([2 * 2048**3 / 1e9 / timed(lambda a=left, b=right: a @ b) for _ in range(5)]))
     return {
-        "processor": processor(),
-        "precision": chosen.precision,
-        "reason": chosen.reason,
-        "instructions": torch.backends.cpu.get_cpu_capability(),
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "processor": processor(), "precision": chosen.precision, "reason": chosen.reason,
+        "instructions": torch.backends.cpu.get_cpu_capability(), "threads": torch.get_num_threads(),
+        "torch": torch.__version__, "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "matmul_gflops": rates,
-    }
+    }  # fmt: skip
 
 
 def measure(config: BenchTrainConfig, model: str, folder: Path) -> dict[str, Any]:
     """Time a model's steps on one prepared batch, and its waiting for data."""
+    updates: list[float] = []  # seconds that Muon takes, a step each
     with tempfile.TemporaryDirectory() as scratch:
         batch = first_batch(config, model, folder)
         images = batch.images.shape[0] * batch.images.shape[1]
-        clock = _Clock()
-        ways, skipped = _ways(config, model, folder, Path(scratch), batch, clock)
+        ways, skipped = _ways(config, model, folder, Path(scratch), batch, updates)
         skipped |= _warm_up(ways)
-        clock.seconds, clock.calls = 0.0, 0
+        updates.clear()
         wall, processor = _in_turn(ways, config, images)
         waiting = {
             f"{workers} loader processes": _waiting(config, model, folder, Path(scratch), workers) for workers in (0, 1)
@@ -175,38 +162,18 @@ def measure(config: BenchTrainConfig, model: str, folder: Path) -> dict[str, Any
         "ways": rates,
         "per_processor_second": {name: _spread(values) for name, values in processor.items()},
         "ratio": _spread(ratios),
-        "muon_share": clock.seconds / clock.calls * rates[MUON]["median"] / images if MUON in ways else None,
+        "muon_share": float(np.mean(updates)) * rates[MUON]["median"] / images if MUON in ways else None,
         "waiting": waiting,
         "skipped": skipped,
     }
 
 
-class _Clock:
-    """Adds up the time of the calls that it wraps."""
-
-    def __init__(self) -> None:
-        self.seconds, self.calls = 0.0, 0
-
-    def timed(self, action: Callable[[], object]) -> Callable[[], object]:
-        def call() -> object:
-            seconds, value = _timed(action)
-            self.seconds += seconds
-            self.calls += 1
-            return value
-
-        return call
-
-
 def _ways(
-    config: BenchTrainConfig, model: str, folder: Path, scratch: Path, batch: "Batch", clock: _Clock
+    config: BenchTrainConfig, model: str, folder: Path, scratch: Path, batch: Batch, updates: list[float]
 ) -> tuple[dict[str, Callable[[], object]], dict[str, str]]:
     """Return the ways of taking a step by name, and what is left out with the reason."""
-    import torch
-
-    from sdps.core.precision import arithmetic
-
     ways: dict[str, Callable[[], object]] = {PLAIN: plain_loop(model, batch)}
-    skipped = {}
+    skipped, threads = {}, torch.get_num_threads()
     for name, changes in VARIANTS.items():
         if changes.get("compile") and not any(map(shutil.which, (os.environ.get("CXX", "g++"), "c++", "clang++"))):
             skipped[name] = "no C++ compiler"
@@ -216,15 +183,18 @@ def _ways(
             continue
         trainer = make_trainer(replace(training(config, model), **changes), model, folder, scratch / name)
         if name == MUON:
-            trainer.optimiser.step = clock.timed(trainer.optimiser.step)
-        ways[name] = lambda trainer=trainer: trainer.take_step(batch, 0.5)
-    threads = torch.get_num_threads()
+            update = trainer.optimiser.step
+            trainer.optimiser.step = lambda update=update: updates.append(timed(update))
+        ways[name] = partial(trainer.take_step, batch, 0.5)
+
+    def one_thread() -> None:
+        torch.set_num_threads(1)
+        try:
+            ways[OURS]()
+        finally:
+            torch.set_num_threads(threads)
+
     if threads > 1:
-
-        def one_thread() -> None:
-            with _threads(1):
-                ways[OURS]()
-
         ways[ONE_THREAD] = one_thread
     else:
         skipped[ONE_THREAD] = "there is no other"
@@ -246,69 +216,38 @@ def _warm_up(ways: dict[str, Callable[[], object]]) -> dict[str, str]:
     return failed
 
 
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def training(config: BenchTrainConfig, model: str) -> "TrainingConfig":
+def training(config: BenchTrainConfig, model: str) -> TrainingConfig:
     """Return the settings the trainer is measured with: those of the presets for processors without a GPU."""
-    from sdps.models import registry
-    from sdps.training.training_config import LightingTraining, NormalTraining
-
-    lighting = registry.entry(model).role == "lighting"
-    values = {"lights": "true"} if registry.entry(model).lights else {}
-    return (LightingTraining if lighting else NormalTraining)(
-        seed=config.seed, batch_scenes=config.scenes, images=config.images, size=config.size, optimiser="adamw",
-        validation_scenes=0, **({} if lighting else values),
-    )  # fmt: skip
+    common = {"seed": config.seed, "batch_scenes": config.scenes, "images": config.images, "size": config.size,
+              "optimiser": "adamw", "validation_scenes": 0}  # fmt: skip
+    entry = registry.entry(model)
+    if entry.role == "lighting":
+        return LightingTraining(**common)
+    return NormalTraining(**common, **({"lights": "true"} if entry.lights else {}))
 
 
-def make_trainer(settings: "TrainingConfig", model: str, folder: Path, scratch: Path) -> "Trainer":
+def make_trainer(settings: TrainingConfig, model: str, folder: Path, scratch: Path) -> Trainer:
     """Build the trainer as a run does."""
-    import torch
-
-    from sdps.training.distributed import Team
-    from sdps.training.stage_factory import create_stage
-    from sdps.training.trainer import Trainer
-
     return Trainer(create_stage(model, model, settings, {}), folder, scratch, Team(0, 1, torch.device("cpu")))
 
 
-def first_batch(config: BenchTrainConfig, model: str, folder: Path) -> "Batch":
+def first_batch(config: BenchTrainConfig, model: str, folder: Path) -> Batch:
     """Return the first training batch of the data folder.
 
     Raises:
         InputError: the folder cannot be trained on.
     """
-    from sdps.data.dataset import SceneDataset
-    from sdps.data.sources import StoredScenes
-    from sdps.training.stage_factory import create_stage
-
-    options = create_stage(model, model, training(config, model), {}).sample_options()
-    source = StoredScenes(SceneDataset(folder, "train", options, cache=False), batch=config.scenes)
-    batch = next(source.batches(0))
-    source.close()
+    with tempfile.TemporaryDirectory() as scratch:
+        source = make_trainer(training(config, model), model, folder, Path(scratch)).source
+        batch = next(source.batches(0))
+        source.close()
     if isinstance(batch, InputError):
         raise batch
     return batch
 
 
-def plain_loop(model: str, batch: "Batch") -> Callable[[], object]:
+def plain_loop(model: str, batch: Batch) -> Callable[[], object]:
     """Return a step as one would write it first: float32, default memory layout, AdamW."""
-    import torch
-
-    from sdps.core.losses import masked_normal_loss
-    from sdps.models import registry
-    from sdps.models.base import Lights
-
     network = registry.create(model)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-4)
 
@@ -332,8 +271,7 @@ def _in_turn(
     ways: dict[str, Callable[[], object]], config: BenchTrainConfig, images: int
 ) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
     """Return each way's images per second in every round, of wall time and of processor time."""
-    wall: dict[str, list[float]] = {name: [] for name in ways}
-    processor: dict[str, list[float]] = {name: [] for name in ways}
+    wall, processor = ({name: [] for name in ways} for _ in range(2))
     for _ in range(config.rounds):
         for name, way in ways.items():
             steps, began, spent = 0, time.perf_counter(), time.process_time()
@@ -347,8 +285,6 @@ def _in_turn(
 
 def _waiting(config: BenchTrainConfig, model: str, folder: Path, scratch: Path, workers: int) -> dict[str, float]:
     """Train on the real source and return the share of time spent waiting for it, and images per second."""
-    from sdps.training.loggers import Meter
-
     trainer = make_trainer(replace(training(config, model), workers=workers), model, folder, scratch / f"w{workers}")
     batches = trainer.source.batches(0)
     try:
@@ -372,18 +308,11 @@ def peak_memory(config: BenchTrainConfig, model: str, folder: Path, way: str) ->
         if way == PLAIN:
             step = plain_loop(model, batch)
         else:
-            trainer = make_trainer(training(config, model), model, folder, Path(scratch))
-            step = lambda: trainer.take_step(batch, 0.5)  # noqa: E731
+            step = partial(make_trainer(training(config, model), model, folder, Path(scratch)).take_step, batch, 0.5)
         for _ in range(_MEMORY_STEPS):
             step()
     peak = peak_bytes()
     return None if peak is None else peak / 1e6
-
-
-def _timed(action: Callable[[], object]) -> tuple[float, object]:
-    start = time.perf_counter()
-    value = action()
-    return time.perf_counter() - start, value
 
 
 def _spread(values: list[float]) -> dict[str, float]:
@@ -392,68 +321,22 @@ def _spread(values: list[float]) -> dict[str, float]:
 
 def table(result: dict[str, Any]) -> str:
     """Format the result of `run` as Markdown."""
-    lines = []
-    for kind, found in result["kinds"].items():
-        about, rates = found["machine"], found["machine"]["matmul_gflops"]
-        load = "unknown" if about["load"] is None else f"{about['load']:.1f}"
-        lines += [
-            f"# {kind[0].upper()}{kind[1:]}",
-            "",
-            f"{about['processor']}, {about['instructions']}, {about['threads']} threads, torch {about['torch']}, load "
-            f"{load} at the start; matrix products {rates['float32']:.0f} GFLOP/s in float32, {rates['bfloat16']:.0f} "
-            f"in bfloat16 ({rates['bfloat16'] / rates['float32']:.2f}x). The trainer computes in {about['precision']}: "
-            f"{about['reason']}.",
-            "",
-        ]
-        for model, one in found["models"].items():
-            lines += [*_model_lines(model, one, about["precision"]), ""]
-    return "\n".join(lines)
-
-
-def _model_lines(model: str, found: dict[str, Any], precision: str) -> list[str]:
-    """Format what was measured of a model."""
-    from sdps.models import registry
-
-    scenes, images, _, height, width = found["batch"]
-    lines = [f"## {model}: {scenes} scenes of {images} images of {width}x{height}", ""]
-    lines += ["| a step | images/s (median) | least - most | images per processor second |", "|---|---|---|---|"]
-    for name, rate in found["ways"].items():
-        alone = found["per_processor_second"][name]["median"]
-        lines.append(f"| {name} | {rate['median']:.1f} | {rate['least']:.1f} - {rate['most']:.1f} | {alone:.1f} |")
-    lines += [f"| {name} | skipped: {why} | | |" for name, why in found["skipped"].items()]
-    lines += ["", "| | measured | target |", "|---|---|---|"]
-    ratio, bound = found["ratio"], WAITING_TARGETS[registry.entry(model).role]
-    lines.append(
-        f"| trainer / plain loop | {ratio['median']:.2f} ({ratio['least']:.2f} - {ratio['most']:.2f}) "
-        f"| at least {RATIO_TARGETS[precision]} |"
-    )
-    if found["muon_share"] is not None:
-        target = f"under {MUON_TARGET:.0%}" if precision == "float32" else ""
-        lines.append(f"| Muon's share of a step | {found['muon_share']:.1%} | {target} |")
-    for name, waited in found["waiting"].items():
-        rate = f"{waited['images_per_second']:.0f} images/s"
-        lines.append(f"| waiting for data, {name} | {waited['share']:.1%}, {rate} | under {bound:.0%} |")
-    for name, size in found["memory_mb"].items():
-        lines.append(f"| peak memory, {name} | {'unknown' if size is None else number(size) + ' MB'} | |")
-    return lines
+    models = {model for found in result["kinds"].values() for model in found["models"]}
+    return fill(
+        Path(__file__).with_suffix(".md.j2"), kinds=result["kinds"], ratio_targets=RATIO_TARGETS,
+        muon_target=MUON_TARGET, waiting_targets={name: WAITING_TARGETS[registry.entry(name).role] for name in models},
+    )  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add one flag per field of `BenchTrainConfig`."""
-    for entry in fields(BenchTrainConfig):
-        kind = _names if entry.name == "models" else entry.type
-        parser.add_argument(f"--{entry.name}", type=kind, default=entry.default, help="(default %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("out/bench-train"), help="folder for bench.md and bench.json")
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name for name in text.split(",") if name)
+    add_fields(parser, BenchTrainConfig)
+    add_out(parser, Path("out/bench-train"))
 
 
 def main(args: argparse.Namespace) -> int:
     """Run the benchmark, print its tables, write them and return the exit code."""
-    config = BenchTrainConfig(**{entry.name: getattr(args, entry.name) for entry in fields(BenchTrainConfig)})
-    result = run(config)
+    result = run(from_flags(BenchTrainConfig, args))
     text = table(result)
     sys.stdout.write(text)
     write_json(args.out / "bench.json", result)

@@ -5,27 +5,77 @@ benchmark"). Every number carries its protocol: bits, crop, mask, images of bear
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
-from pipelines.benchmarks import published_real, suite
-from pipelines.benchmarks.diligent import OBJECTS, DiligentConfig, diligent_objects
-from pipelines.benchmarks.object_tables import object_table
+import numpy as np
+
+from pipelines.benchmarks import suite
+from pipelines.benchmarks.stacks import MARGIN, Images, photographed
 from pipelines.evaluate.evaluation import TestObject
-from pipelines.report.sections import Section, Table
-from pipelines.shared.lists import split_list
-from pipelines.shared.using import describe
+from pipelines.shared.flags import from_flags
+from render.exchange.foreign_samples import Source
+from render.exchange.read_diligent import diligent_sources
 from render.shared.config import to_plain
+from render.shared.errors import InputError
+from render.shared.images import bit_depth, read_image, to_unit
 from sdps.inference.inference_config import inference_config
 from sdps.methods import select
-from sdps.methods.method import Method
 
-_PRINTED = "Published rows: bear with 96 images; 'this object' and 'mean of' are over the objects present."
+OBJECTS = ("ball", "cat", "pot1", "bear", "pot2", "buddha", "goblet", "reading", "cow", "harvest")
+"""In the order of the published tables."""
+
+_BEAR_CORRUPT = 20
+"""First images of bear that CNN-PS and others leave out (README of CNN-PS)."""
+
+DILIGENT = suite.Benchmark(
+    "diligent", "DiLiGenT", 40, OBJECTS,
+    (
+        ("DiLiGenT (a), light directions, degrees", "directions", "direction_mae", 2),
+        ("DiLiGenT (b), light intensities, relative error", "intensities", "intensity_error", 3),
+        ("DiLiGenT (c), normals, degrees", "normals", "normal_mae", 2),
+    ),
+    "Published rows: bear with 96 images; 'this object' and 'mean of' are over the objects present.",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiligentConfig:
+    """How the files are read.
+
+    Attributes:
+        bits: 16 reads the PNGs exactly; 8 keeps the high byte, which is all that the published results of SDPS-Net saw.
+        bear: Images of bear: 96, as in the paper, or 76 without the first 20.
+        margin: Pixels kept around the mask's bounding box; sides are then rounded up to multiples of 4.
+    """
+
+    bits: int = 8
+    bear: int = 96
+    margin: int = MARGIN
+
+    def __post_init__(self) -> None:
+        if self.bits not in (8, 16):
+            raise InputError(f"bits must be 8 or 16, got {self.bits}")
+        if self.bear not in (76, 96):
+            raise InputError(f"bear must be 96 or 76, got {self.bear}")
+        if self.margin < 0:
+            raise InputError(f"margin must be 0 pixels or more, got {self.margin}")
+
+    def definition(self) -> str:
+        """Say in words how images are read."""
+        depth = "16 bits" if self.bits == 16 else "8 bits (the high byte of 16-bit files)"
+        bear = "bear with all 96 images" if self.bear == 96 else "bear without its first 20 images (76)"
+        return (
+            f"{depth}; cropped to the mask's box with {self.margin} pixels of margin, sides multiples of 4; images "
+            "divided by full scale, times the mask, not divided by the known intensities (methods that are given the "
+            f"lights get the file's directions and intensities); {bear}"
+        )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps eval-diligent`."""
-    suite.add_arguments(parser, "out/real")
+    suite.add_arguments(parser)
     parser.add_argument("--bits", type=int, default=8, choices=(8, 16),
                         help="16: the PNGs exactly; 8: their high byte, as published (default: 8)")  # fmt: skip
     parser.add_argument("--bear", type=int, default=96, choices=(96, 76),
@@ -34,42 +84,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Evaluate, print the tables, and write <out>/diligent/results.json and the report's section."""
-    config = DiligentConfig(bits=args.bits, bear=args.bear)
-    models = select.runs_folder(args.models)
-    using = inference_config(args)
-    chosen = select.selected(split_list(args.methods), models, using)
-    items = suite.pick(diligent_objects(args.data, config), split_list(args.objects))
-    chosen = chosen or select.every_method(models, using)
-    shown = suite.pictured(chosen)
-    found, runners = suite.run(items, chosen, models, args.out / "diligent" / "cache", using, shown)
-    tables = build_tables(items, found, chosen)
-    text = definition(items, config) + describe(runners, using)
-    section = Section(
-        name="diligent",
-        title="DiLiGenT",
-        text=text,
-        order=40,
-        tables=tuple(tables),
-        command=f"sdps eval-diligent {args.data} --bits {args.bits} --bear {args.bear} --out {args.out}",
-    )
-    suite.write(args.out, section, items, found, runners, shown, {**to_plain(config), **to_plain(using)})
-    sys.stdout.write(f"{suite.text_of(tables, found)}\n{text}\n{args.out / 'diligent' / 'results.json'}\n")
-    return 0
-
-
-def build_tables(items: Sequence[TestObject], found: suite.Found, chosen: Sequence[Method]) -> list[Table]:
-    """Return tables (a), (b) and (c)."""
-    names, lights = [item.name for item in items], suite.lighting_only(found, chosen)
-    common = {"present": names, "known": OBJECTS, "note": _PRINTED}
-    tables = [
-        object_table("DiLiGenT (a), light directions, degrees", lights, "direction_mae",
-                     published=published_real.DILIGENT_DIRECTIONS, digits=2, **common),
-        object_table("DiLiGenT (b), light intensities, relative error", lights, "intensity_error",
-                     published=published_real.DILIGENT_INTENSITIES, digits=3, **common),
-        object_table("DiLiGenT (c), normals, degrees", found, "normal_mae",
-                     published=published_real.DILIGENT_NORMALS, digits=2, **common),
-    ]  # fmt: skip
-    return tables
+    config, chosen = from_flags(DiligentConfig, args), suite.named_methods(args)
+    items = suite.pick(diligent_objects(args.data, config), args.objects)
+    chosen = chosen or select.every_method(select.runs_folder(args.models), inference_config(args))
+    return suite.evaluate(
+        DILIGENT, args, items, chosen, text=definition(items, config), protocol=to_plain(config),
+        command=f"sdps eval-diligent {args.data} --bits {args.bits} --bear {args.bear}",
+    )  # fmt: skip
 
 
 def definition(items: Sequence[TestObject], config: DiligentConfig) -> str:
@@ -84,3 +105,43 @@ def definition(items: Sequence[TestObject], config: DiligentConfig) -> str:
         "divided per channel by the first image's, one least-squares scale, mean relative error. A dash: not in the "
         "folder, not printed, or given to the method."
     )
+
+
+def diligent_objects(tree: Path, config: DiligentConfig) -> list[TestObject]:
+    """Return the objects of a DiLiGenT folder in the order of the published tables, others after them.
+
+    Args:
+        tree: `pmsData`, the folder above it, or one object's folder.
+        config: Bits, images of bear, crop.
+
+    Raises:
+        InputError: not such a folder, or files that are missing or do not fit together.
+    """
+    if not tree.is_dir():
+        raise InputError(f"{tree}: no such folder; give DiLiGenT's pmsData, the folder above it, or one <object>PNG")
+    found = {source.name: source for source in diligent_sources(tree)}
+    names = [name for name in OBJECTS if name in found] + [name for name in found if name not in OBJECTS]
+    return [_object(found[name], config) for name in names]
+
+
+def _object(source: Source, config: DiligentConfig) -> TestObject:
+    """Read what is small, and refer to the images."""
+    truth = source.truth()
+    drop = _BEAR_CORRUPT if source.name == "bear" and config.bear == 76 else 0
+    if drop >= len(source.images):
+        raise InputError(f"{source.folder}: {len(source.images)} images, --bear 76 drops the first {drop}")
+    files = [source.folder / name for name in source.images[drop:]]
+    return photographed(
+        source.name, Images.of_files(files, lambda path: _read(path, config.bits)), truth.mask,
+        source.directions[drop:], source.intensities[drop:], normals=truth.normals, margin=config.margin,
+        files=[source.folder / "mask.png", truth.origin], settings=(config.bits,),
+    )  # fmt: skip
+
+
+def _read(path: Path, bits: int) -> np.ndarray:  # (H, W, 3) float32, full scale 1
+    pixels = read_image(path)
+    if bits == 16 and bit_depth(pixels) == 8:
+        raise InputError(f"{path}: has 8 bits per channel, not the original's 16; evaluate with --bits 8")
+    if bits == 8 and bit_depth(pixels) == 16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    return to_unit(pixels)

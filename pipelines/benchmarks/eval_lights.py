@@ -5,67 +5,36 @@ Gourd&Apple (Alldrin et al. 2008) and the Light Stage Data Gallery (Einarsson et
 """
 
 import argparse
-import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
-from pipelines.benchmarks import gourd_apple, light_stage, published_real, suite
-from pipelines.benchmarks.object_tables import object_table
+from pipelines.benchmarks import suite
+from pipelines.benchmarks.lit_photographs import GOURD_APPLE, LIGHT_STAGE, gourd_apple_objects, light_stage_objects
 from pipelines.evaluate.evaluation import TestObject
-from pipelines.report.sections import Section, Table
-from pipelines.shared.lists import split_list
-from pipelines.shared.using import describe
-from render.shared.config import to_plain
 from render.shared.errors import InputError
-from sdps.inference.inference_config import inference_config
 from sdps.methods import select
 from sdps.methods.method import CONSTANT, Method
 from sdps.models.registry import TRUE_LIGHTS
 
 
-@dataclass(frozen=True)
-class Benchmark:
-    """A benchmark of lighting estimation.
-
-    Attributes:
-        name: Folder name of its results.
-        title: Its name in tables.
-        known: Its objects in the order of the published table.
-        load: Reads the objects for the flags.
-        directions, intensities: Published rows.
-        about: What is special to its images, one clause.
-    """
-
-    name: str
-    title: str
-    known: tuple[str, ...]
-    load: Callable[[argparse.Namespace], list[TestObject]]
-    directions: tuple[published_real.PublishedRow, ...]
-    intensities: tuple[published_real.PublishedRow, ...]
-    about: Callable[[argparse.Namespace], str]
+def _benchmark(name: str, title: str, known: tuple[str, ...]) -> suite.Benchmark:
+    return suite.Benchmark(
+        name, title, 50, known,
+        (
+            (f"{title}, light directions, degrees", "directions", "direction_mae", 2),
+            (f"{title}, light intensities, relative error", "intensities", "intensity_error", 3),
+        ),
+    )  # fmt: skip
 
 
 BENCHMARKS = {
-    "gourd-apple": Benchmark(
-        "gourd-apple", "Gourd&Apple", gourd_apple.OBJECTS,
-        lambda args: gourd_apple.gourd_apple_objects(
-            args.data, refined=not args.measured_lights, longest=args.longest_side),
-        published_real.GOURD_APPLE_DIRECTIONS, published_real.GOURD_APPLE_INTENSITIES,
-        lambda args: f"against the {'measured' if args.measured_lights else 'refined'} lights",
-    ),
-    "light-stage": Benchmark(
-        "light-stage", "Light Stage Data Gallery", light_stage.OBJECTS,
-        lambda args: light_stage.light_stage_objects(
-            args.data, least_z=args.least_z, gamma=args.gamma, longest=args.longest_side),
-        published_real.LIGHT_STAGE_DIRECTIONS, published_real.LIGHT_STAGE_INTENSITIES,
-        lambda args: f"images whose light has z > {args.least_z:g}, PNG values to the power {args.gamma:g}",
-    ),
-}  # fmt: skip
+    "gourd-apple": _benchmark("gourd-apple", "Gourd&Apple", GOURD_APPLE),
+    "light-stage": _benchmark("light-stage", "Light Stage Data Gallery", LIGHT_STAGE),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps eval-lights`."""
-    suite.add_arguments(parser, "out/real")
+    suite.add_arguments(parser)
     parser.add_argument("--dataset", required=True, choices=tuple(BENCHMARKS), help="which layout the folder has")
     parser.add_argument("--measured-lights", action="store_true",
                         help="gourd-apple: compare with the measured lights, not the refined ones")  # fmt: skip
@@ -80,29 +49,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Evaluate, print the tables, and write <out>/<dataset>/results.json and the report's section."""
     _check(args)
-    bench = BENCHMARKS[args.dataset]
-    models = select.runs_folder(args.models)
-    using = inference_config(args)
-    chosen = select.selected(split_list(args.methods), models, using)
-    _refuse_given([method for method in chosen if method.lights == TRUE_LIGHTS])
-    items = suite.pick(bench.load(args), split_list(args.objects))
-    chosen = chosen or default_methods(models)
-    shown = suite.pictured(chosen)
-    found, runners = suite.run(items, chosen, models, args.out / bench.name / "cache", using, shown)
-    tables = build_tables(bench, items, found, chosen)
-    text = definition(bench, items, args) + describe(runners, using)
-    section = Section(
-        name=bench.name,
-        title=bench.title,
-        text=text,
-        order=50,
-        tables=tuple(tables),
-        command=f"sdps eval-lights {args.data} --dataset {args.dataset} --out {args.out}",
-    )
-    protocol = {name: getattr(args, name) for name in ("measured_lights", "least_z", "gamma", "longest_side")}
-    suite.write(args.out, section, items, found, runners, shown, {**protocol, **to_plain(using)})
-    sys.stdout.write(f"{suite.text_of(tables, found)}\n{text}\n{args.out / bench.name / 'results.json'}\n")
-    return 0
+    bench, chosen = BENCHMARKS[args.dataset], suite.named_methods(args)
+    given = next((method for method in chosen if method.lights == TRUE_LIGHTS), None)
+    if given:
+        raise InputError(f"--methods: {given.name} is given the lights, so there is nothing to score")
+    items, about = read(args)
+    items = suite.pick(items, args.objects)
+    chosen = chosen or default_methods(select.runs_folder(args.models))
+    return suite.evaluate(
+        bench, args, items, chosen, text=definition(bench, items, about, args.longest_side),
+        protocol={name: getattr(args, name) for name in ("measured_lights", "least_z", "gamma", "longest_side")},
+        command=f"sdps eval-lights {args.data} --dataset {args.dataset}",
+    )  # fmt: skip
+
+
+def read(args: argparse.Namespace) -> tuple[list[TestObject], str]:
+    """Return the objects of the folder, and what is special to their images in a clause."""
+    if args.dataset == "gourd-apple":
+        lights = "measured" if args.measured_lights else "refined"
+        items = gourd_apple_objects(args.data, refined=not args.measured_lights, longest=args.longest_side)
+        return items, f"against the {lights} lights"
+    items = light_stage_objects(args.data, least_z=args.least_z, gamma=args.gamma, longest=args.longest_side)
+    return items, f"images whose light has z > {args.least_z:g}, PNG values to the power {args.gamma:g}"
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -114,37 +82,18 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError(f"--longest-side {args.longest_side}: must be 0 or at least 16 pixels")
 
 
-def _refuse_given(given: Sequence[Method]) -> None:
-    if given:
-        raise InputError(f"--methods: {given[0].name} is given the lights, so there is nothing to score")
-
-
 def default_methods(models: object) -> list[Method]:
     """Return every method that finds lights, and the paper's pair for its normals."""
     pairs = [method for method in select.every_method(models) if method.paper == "B1" or method.second]
     return [*select.lighting_rows(models), *pairs, *select.classical_rows(calibrated=False)]
 
 
-def build_tables(
-    bench: Benchmark, items: Sequence[TestObject], found: suite.Found, chosen: Sequence[Method]
-) -> list[Table]:
-    """Return the tables of directions and intensities."""
-    lights = suite.lighting_only(found, chosen)
-    common = {"present": [item.name for item in items], "known": bench.known}
-    return [
-        object_table(f"{bench.title}, light directions, degrees", lights, "direction_mae",
-                     published=bench.directions, digits=2, **common),
-        object_table(f"{bench.title}, light intensities, relative error", lights, "intensity_error",
-                     published=bench.intensities, digits=3, **common),
-    ]  # fmt: skip
-
-
-def definition(bench: Benchmark, items: Sequence[TestObject], args: argparse.Namespace) -> str:
+def definition(bench: suite.Benchmark, items: Sequence[TestObject], about: str, longest: int) -> str:
     """Say what the numbers are of."""
     images = ", ".join(f"{item.name} {len(item.light_directions)}" for item in items)
-    size = f", crops averaged down to {args.longest_side} pixels" if args.longest_side else ""
+    size = f", crops averaged down to {longest} pixels" if longest else ""
     return (
-        f"{bench.title}: images of {images}; {bench.about(args)}; cropped to the mask's box with 15 pixels of margin, "
+        f"{bench.title}: images of {images}; {about}; cropped to the mask's box with 15 pixels of margin, "
         f"times the mask{size}. Directions: mean angular error in degrees over images. Intensities: truth divided per "
         "channel by the first image's, one least-squares scale, mean relative error. No true normals exist; "
         f"the {CONSTANT} predictor sees nothing. A dash: not in the folder or not printed."

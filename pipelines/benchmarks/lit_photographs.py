@@ -1,18 +1,129 @@
-"""What Gourd&Apple and the Light Stage Data Gallery share: photographs with measured lights and no normals."""
+"""Photographs with measured lights and no normals: Gourd&Apple and the Light Stage Data Gallery.
 
-from collections.abc import Callable, Sequence
+Gourd&Apple (Alldrin, Zickler & Kriegman, CVPR 2008) is HDR; its frame is ours: x right, y up, z to the camera, vectors
+to the light. The refined lights, corrected by its authors while they fitted the objects, are what published results
+compare with.
+
+The Light Stage Data Gallery (Einarsson et al. 2006; USC ICT) shows objects under 253 lights all around. Its vectors
+point the way light travels, in the same frame: negated they point to the lights. Published results use the images whose
+light is in front of the object.
+"""
+
+import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.benchmarks.stacks import MARGIN, Stack, files_digest
+from pipelines.benchmarks.stacks import Images, photographed
 from pipelines.evaluate.evaluation import TestObject
-from render.exchange.ingest import crop_box
 from render.shared.errors import InputError
 from render.shared.files import read_text
 from render.shared.images import read_image, to_unit
 from render.shared.tables import natural_key, read_names, read_numbers
 from sdps.photos.picture_file import decode
+
+_log = logging.getLogger(__name__)
+
+GOURD_APPLE = ("apple", "gourd1", "gourd2")
+LIGHT_STAGE = (
+    "helmet_side_left", "plant_left", "knight_fighting", "knight_kneeling", "knight_standing", "helmet_front_left",
+)  # fmt: skip
+_GOURD_APPLE_WANT = "give the folder of apple, gourd1 and gourd2, or one of them; see docs/guides/benchmarks.md"
+_LIGHT_STAGE_WANT = (
+    "give the folder of light_directions.txt and the objects' folders, or one; see docs/guides/benchmarks.md"
+)
+_LIGHTS, _FRONT = 253, 133
+
+
+def gourd_apple_objects(root: Path, *, refined: bool = True, longest: int = 0) -> list[TestObject]:
+    """Return the objects of a folder, or of one object's folder.
+
+    Args:
+        root: The folder.
+        refined: Take the refined lights rather than the measured ones.
+        longest: Greatest side in pixels, 0 for no limit.
+
+    Raises:
+        InputError: files that are missing or do not fit together.
+    """
+    suffix, objects = "_refined" if refined else "", []
+    lights = f"light_directions{suffix}.txt"
+    folders = [root] if (root / lights).is_file() else object_folders(root, lights, _GOURD_APPLE_WANT)
+    for folder in folders:
+        directions, _ = read_directions(folder / lights, 1.0)
+        intensities = read_intensities(folder / f"light_intensities{suffix}.txt", len(directions))
+        images, mask = find_images(folder, (".exr",), len(directions)), folder / "mask.png"
+        objects.append(photographed(folder.name, images, read_mask(mask), directions, intensities,
+                                    longest=longest, files=[mask]))  # fmt: skip
+    return objects
+
+
+def light_stage_objects(root: Path, *, least_z: float = 0.0, gamma: float = 1.0, longest: int = 0) -> list[TestObject]:
+    """Return the objects of a folder, or of one object's folder whose parent holds the lights.
+
+    Args:
+        root: The folder.
+        least_z: Images are used whose unit light direction has z above it.
+        gamma: Exponent by which values of PNG files become linear.
+        longest: Greatest side in pixels, 0 for no limit.
+
+    Raises:
+        InputError: files that are missing or do not fit together.
+    """
+    single = not (root / "light_directions.txt").is_file() and (root.parent / "light_directions.txt").is_file()
+    base = root.resolve().parent if single else root
+    folders = [root.resolve()] if single and root.is_dir() else object_folders(base, "*matte.png", _LIGHT_STAGE_WANT)
+    if not (base / "light_directions.txt").is_file():
+        raise InputError(f"{base}: no light_directions.txt; {_LIGHT_STAGE_WANT}")
+    directions, numbers = read_directions(base / "light_directions.txt", -1.0)
+    if numbers is not None and not (np.diff(numbers) == 1).all():
+        raise InputError(f"{base / 'light_directions.txt'}: lights are not numbered in order; sort its lines")
+    intensities = read_intensities(base / "light_intensities.txt", len(directions))
+    objects = []
+    for folder in folders:
+        images, chosen = find_images(folder, (".exr", ".png"), len(directions), gamma), slice(None)
+        if len(images.files) == len(directions):  # an array holds the images in front only, and the lights' files too
+            chosen = front(directions, least_z)
+            images = Images(
+                lambda number, read=images.read, chosen=chosen: read(int(chosen[number])),
+                [images.files[number] for number in chosen], [images.names[number] for number in chosen],
+            )  # fmt: skip
+        matte = next((path for path in sorted(folder.glob("*matte.png"))), folder / "matte.png")
+        objects.append(photographed(folder.name, images, read_mask(matte), directions[chosen], intensities[chosen],
+                                    longest=longest, files=[matte], settings=(gamma,)))  # fmt: skip
+    return objects
+
+
+def front(directions: np.ndarray, least_z: float) -> np.ndarray:
+    """Return the numbers of the lights in front of the object: z above `least_z`.
+
+    Raises:
+        InputError: none.
+    """
+    chosen = np.flatnonzero(directions[:, 2] > least_z)
+    if not len(chosen):
+        raise InputError(f"no light has z > {least_z:g}; vectors of this set point away from the lights")
+    if len(directions) == _LIGHTS and len(chosen) != _FRONT:
+        _log.warning("%d of the 253 lights have z > %g, the paper used %d", len(chosen), least_z, _FRONT)
+    return chosen
+
+
+def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
+    """Read a mask or matte, whatever its values: what most of the image's border shows is the background.
+
+    Gourd&Apple's object is 1; the Light Stage's is dark in the original files and bright in converted ones.
+
+    Raises:
+        InputError: missing or damaged, or all on one side.
+    """
+    pixels = read_image(path, channels=None)
+    bright = pixels > pixels.max() // 2
+    border = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]])
+    mask = ~bright if border.mean() > 0.5 else bright
+    if not mask.any():
+        raise InputError(f"{path}: tells no object from the background; give the object's mask")
+    return mask
 
 
 def object_folders(root: Path, pattern: str, want: str) -> list[Path]:
@@ -67,34 +178,44 @@ def read_table(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     return (table[:, 1:], table[:, 0]) if wide else (table, None)
 
 
-def picture_files(folder: Path, suffixes: Sequence[str], count: int) -> list[Path]:
-    """Return the numbered pictures of a folder in natural order: of the first suffix that there are any of.
+def find_images(folder: Path, suffixes: Sequence[str], count: int, gamma: float = 1.0) -> Images:
+    """Return the images of an object's folder: of the array that loaders keep, of names.txt, or numbered pictures.
+
+    Args:
+        folder: The folder.
+        suffixes: Of the pictures; the first that there are any of is taken.
+        count: Number of lights.
+        gamma: Exponent by which integers become linear; floats are.
 
     Raises:
         InputError: none, or another number than of lights.
     """
-    for suffix in suffixes:
-        found = [
-            path for path in folder.glob(f"*{suffix}") if path.stem[-1:].isdigit() and not path.name.startswith(".")
-        ]
-        if found:
-            if len(found) != count:
-                raise InputError(f"{folder}: {len(found)} {suffix} images for {count} lights; give one image per light")
-            return sorted(found, key=lambda path: natural_key(path.name))
-    raise InputError(f"{folder}: no images; want files numbered in their names that end in {' or '.join(suffixes)}")
+    packed, listed = folder / f"{folder.name}_uncalib.npy", folder / "names.txt"
+    if packed.is_file():
+        return packed_images(packed, count)
+    if listed.is_file():
+        files, what = [folder / name for name in read_names(listed)], f"{listed}: "
+    else:
+        numbered = (path for path in folder.glob("*") if path.stem[-1:].isdigit() and not path.name.startswith("."))
+        pictures = sorted(numbered, key=lambda path: natural_key(path.name))
+        kinds = ([path for path in pictures if path.suffix == suffix] for suffix in suffixes)
+        files = next(filter(None, kinds), [])
+        if not files:
+            wanted = " or ".join(suffixes)
+            raise InputError(f"{folder}: no images; want files numbered in their names that end in {wanted}")
+        what = f"{folder}: {files[0].suffix} "
+    if len(files) != count:
+        raise InputError(f"{what}{len(files)} images for {count} lights; give one image per light")
+
+    def read(path: Path) -> np.ndarray:  # (H, W, 3) float32
+        pixels = decode(path).pixels
+        return pixels if pixels.dtype.kind == "f" else to_unit(pixels) ** np.float32(gamma)
+
+    return Images.of_files(files, read)
 
 
-def binary_mask(path: Path) -> np.ndarray:  # (H, W) bool
-    """Read a mask, whatever its foreground value (1 in Gourd&Apple, 255 elsewhere)."""
-    pixels = read_image(path, channels=None)
-    mask = pixels > pixels.max() // 2
-    if not mask.any():
-        raise InputError(f"{path}: is black throughout; give the object's mask")
-    return mask
-
-
-def packed_images(path: Path, count: int) -> Callable[[int], np.ndarray]:
-    """Return what reads image k of an array (H, W, 3 L) as the loaders of SDPS-Net's family keep them.
+def packed_images(path: Path, count: int) -> Images:
+    """Return the images in an array (H, W, 3 L), as the loaders of SDPS-Net's family keep them.
 
     Raises:
         InputError: damaged, or another number of images than of lights.
@@ -105,51 +226,5 @@ def packed_images(path: Path, count: int) -> Callable[[int], np.ndarray]:
         raise InputError(f"{path}: damaged or not an array ({error}); convert the images again") from error
     if array.ndim != 3 or array.shape[2] != 3 * count:
         raise InputError(f"{path}: is {array.shape}; want height x width x {3 * count}, RGB of {count} lights in turn")
-    return lambda number: np.asarray(array[..., 3 * number : 3 * number + 3], np.float32)
-
-
-def picture_reader(files: Sequence[Path], gamma: float) -> Callable[[int], np.ndarray]:
-    """Return what reads picture k as linear radiance: integers to the power `gamma`, floats as they are."""
-
-    def read(number: int) -> np.ndarray:  # (H, W, 3) float32
-        pixels = decode(files[number]).pixels
-        return pixels if pixels.dtype.kind == "f" else to_unit(pixels) ** np.float32(gamma)
-
-    return read
-
-
-def photographed(
-    name: str,
-    read: Callable[[int], np.ndarray],
-    names: Sequence[str],
-    mask: np.ndarray,
-    directions: np.ndarray,
-    intensities: np.ndarray,
-    *,
-    files: Sequence[Path],
-    settings: tuple,
-    longest: int,
-) -> TestObject:
-    """Return an object of which the lights are known and the normals are not; its images stay on disk.
-
-    Args:
-        name: The object.
-        read: Reads image k, (H, W, 3) float32.
-        names: Of the L images, for complaints.
-        mask: (H, W) bool.
-        directions: (L, 3), from the surface to the light.
-        intensities: (L, 3).
-        files: Everything the images and the mask come from.
-        settings: What else they depend on.
-        longest: Greatest side in pixels, 0 for no limit.
-    """
-    stack = Stack(read, names, mask, crop_box(mask, MARGIN), longest)
-    parts = (*settings, MARGIN, longest, directions.tolist(), intensities.tolist())
-    return TestObject(
-        name=name,
-        digest=files_digest(files, *parts),
-        load=lambda: stack,
-        mask=stack.mask,
-        light_directions=directions.astype(np.float32),
-        intensities=intensities,
-    )
+    names = [f"{path}, image {number}" for number in range(count)]
+    return Images(lambda number: np.asarray(array[..., 3 * number : 3 * number + 3], np.float32), [path], names)

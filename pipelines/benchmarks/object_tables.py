@@ -1,18 +1,48 @@
 """Tables with a column per object: ours, then the published rows, each with its source."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
 
 import numpy as np
 
-from pipelines.benchmarks.published_real import PublishedRow
 from pipelines.evaluate.evaluation import Result
 from pipelines.report.sections import Table
+from render.shared.config import read_yaml
 
-OURS = "ours"
-REFUSED = "refused"
+OURS, REFUSED = "ours", "refused"
+PUBLISHED = "published/real_benchmarks.yaml"
 
 Results = Mapping[str, Mapping[str, Result]]
 """By method, then object."""
+
+
+@dataclass(frozen=True)
+class PublishedRow:
+    """A row of a published table.
+
+    Attributes:
+        method: The method.
+        source: Where the figures were printed.
+        average: The printed average; None where none was.
+        figures: By object; empty where only the average is known.
+    """
+
+    method: str
+    source: str
+    average: float | None
+    figures: dict[str, float]
+
+
+@cache
+def published_rows(benchmark: str, quantity: str) -> tuple[PublishedRow, ...]:
+    """Return the rows of a benchmark (`diligent`, ...) for `directions`, `intensities` or `normals`."""
+    table = read_yaml(str(resources.files("assets") / PUBLISHED))[benchmark]
+    return tuple(
+        PublishedRow(method, source, average, dict(zip(table["objects"], figures, strict=True)) if figures else {})
+        for method, source, average, *figures in table.get(quantity, ())
+    )
 
 
 def object_table(
@@ -43,43 +73,27 @@ def object_table(
     """
     official = any(name in known for name in present)
     columns = [*(known if official else ()), *(name for name in present if name not in known)]
-
-    def means(figures: Mapping[str, float], printed: float | None) -> list[str]:
-        whole = _mean(figures, known) if printed is None else printed
-        return [_figure(_mean(figures, present), digits), *([_figure(whole, digits)] if official else [])]
-
-    ours = [
-        [name, OURS, *_cells(found, metric, columns, digits), *means(_scores(found, metric), None)]
+    entries = [
+        (name, OURS, _scores(found, metric), None, [key for key, one in found.items() if one.reason])
         for name, found in results.items()
         if any(metric in result.scores or result.reason for result in found.values())
     ]
-    theirs = [
-        [
-            row.method,
-            row.source,
-            *(_figure(row.figures.get(name), digits) for name in columns),
-            *means(row.figures, row.average),
-        ]
-        for row in (published if official else ())
-    ]
-    here = f"mean of {len(present)}" if len(present) > 1 else "this object"
-    header = ["method", "source", *columns, here, *([f"all {len(known)}"] if official else [])]
-    return Table(
-        title=title,
-        header=tuple(header),
-        rows=tuple(tuple(row) for row in [*ours, *theirs]),
-        published=tuple(range(len(ours), len(ours) + len(theirs))),
-        note=note,
-    )
+    ours = len(entries)
+    entries += [(one.method, one.source, one.figures, one.average, ()) for one in published] if official else []
+    rows = []
+    for name, source, figures, printed, refused in entries:
+        cells = [REFUSED if column in refused else _figure(figures.get(column), digits) for column in columns]
+        means = [_mean(figures, present)]
+        means += [_mean(figures, known) if printed is None else printed] if official else []
+        rows.append((name, source, *cells, *(_figure(mean, digits) for mean in means)))
+    last = [f"mean of {len(present)}" if len(present) > 1 else "this object"]
+    last += [f"all {len(known)}"] if official else []
+    header, theirs = ("method", "source", *columns, *last), tuple(range(ours, len(rows)))
+    return Table(title=title, header=header, rows=tuple(rows), published=theirs, note=note)
 
 
 def _scores(found: Mapping[str, Result], metric: str) -> dict[str, float]:
     return {name: result.scores[metric] for name, result in found.items() if metric in result.scores}
-
-
-def _cells(found: Mapping[str, Result], metric: str, columns: Sequence[str], digits: int) -> list[str]:
-    scores = _scores(found, metric)
-    return [REFUSED if name in found and found[name].reason else _figure(scores.get(name), digits) for name in columns]
 
 
 def _mean(figures: Mapping[str, float], names: Sequence[str]) -> float | None:

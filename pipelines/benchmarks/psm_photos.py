@@ -8,14 +8,16 @@ strengths fitted there differ by under 5 %. The directions in lights.txt are up 
 sphere; the grey sphere sides with the chrome one (2.0 degrees on average against 3.2).
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 from scipy import ndimage
 
-from render.shared.errors import InputError, unknown
+from pipelines.benchmarks.stacks import Images, Stack, photographed
+from pipelines.evaluate.evaluation import TestObject
+from render.exchange.ingest import crop_box
+from render.shared.errors import InputError
 from render.shared.files import read_text
 
 SPHERES = ("chrome", "gray")
@@ -26,21 +28,6 @@ _MARGIN = 4
 
 _HIGHLIGHT = 0.8
 """Share of the brightest value from which on a pixel of the chrome sphere shows the lamp."""
-
-
-@dataclass(frozen=True, eq=False)
-class Photos:
-    """An object's photographs, cropped to it.
-
-    Attributes:
-        name: The object.
-        images: (L, H, W, 3) float32, linear, 1 where the camera saturates.
-        mask: (H, W) bool.
-    """
-
-    name: str
-    images: np.ndarray
-    mask: np.ndarray
 
 
 def list_objects(folder: Path) -> list[str]:
@@ -60,19 +47,17 @@ def list_objects(folder: Path) -> list[str]:
     return names
 
 
-def read_photos(folder: Path, name: str) -> Photos:
-    """Read an object.
+def read_photos(folder: Path, name: str, lights: np.ndarray) -> TestObject:
+    """Return an object with the lights (L, 3); 1 is where the camera saturates. Its normals are not known.
 
     Raises:
-        InputError: an unknown object, missing or unreadable files, sizes that differ, or an empty mask.
+        InputError: missing or unreadable files, an empty mask, or another number of lights than of images.
     """
-    known = list_objects(folder)
-    if name not in known:
-        raise unknown("object", name, known)
     images, mask = _read_set(folder, name)
-    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
-    window = tuple(slice(max(part[0] - _MARGIN, 0), part[-1] + _MARGIN + 1) for part in (rows, columns))
-    return Photos(name, images[:, *window], mask[window])
+    if len(lights) != len(images.files):
+        raise InputError(f"{name}: {len(images.files)} images but {len(lights)} lights")
+    file = folder / name / f"{name}.mask.tga"
+    return photographed(name, images, mask, lights, margin=_MARGIN, files=[file])
 
 
 def read_lights(folder: Path, source: str = "auto") -> np.ndarray:  # (L, 3)
@@ -86,7 +71,9 @@ def read_lights(folder: Path, source: str = "auto") -> np.ndarray:  # (L, 3)
         InputError: neither is there, or it is not of the layout.
     """
     if resolve_source(folder, source) == "chrome":
-        return chrome_lights(*_read_set(folder, "chrome"), where=str(folder / "chrome"))
+        images, mask = _read_set(folder, "chrome")
+        whole = Stack(images, mask, crop_box(mask, None))
+        return chrome_lights(whole[0 : len(whole)], mask, where=str(folder / "chrome"))
     path = folder / "lights.txt"
     try:
         values = np.array(read_text(path).split(), np.float64)
@@ -147,23 +134,16 @@ def chrome_lights(images: np.ndarray, mask: np.ndarray, where: str = "chrome") -
     return np.array(directions)
 
 
-def _read_set(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return all images (L, H, W, 3) float32 of a folder and its mask (H, W)."""
+def _read_set(folder: Path, name: str) -> tuple[Images, np.ndarray]:
+    """Return the images of a folder and its mask (H, W)."""
     mask = _read(folder / name / f"{name}.mask.tga").max(-1) > 0.5
-    numbers = sorted(
-        int(middle)
-        for path in (folder / name).glob(f"{name}.*.tga")
-        if (middle := path.name.split(".")[-2]).isdecimal()
-    )
+    middles = [path.name.split(".")[-2] for path in (folder / name).glob(f"{name}.*.tga")]
+    numbers = sorted(int(middle) for middle in middles if middle.isdecimal())
     if len(numbers) < 3 or numbers != list(range(len(numbers))):
         raise InputError(f"{folder / name}: want {name}.0.tga, {name}.1.tga ... without gaps, three at least")
-    images = [_read(folder / name / f"{name}.{number}.tga") for number in numbers]
-    odd = next((number for number, image in enumerate(images) if image.shape[:2] != mask.shape), None)
-    if odd is not None:
-        raise InputError(f"{folder / name}: image {odd} is {images[odd].shape[:2]}, the mask {mask.shape}")
     if not mask.any():
         raise InputError(f"{folder / name}: the mask is empty")
-    return np.stack(images), mask
+    return Images.of_files([folder / name / f"{name}.{number}.tga" for number in numbers], _read), mask
 
 
 def _read(path: Path) -> np.ndarray:  # (H, W, 3) float32

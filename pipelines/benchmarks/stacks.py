@@ -1,23 +1,42 @@
-"""Images of an object that stay on disk until they are asked for, cut to the object and black around it."""
+"""Photographs of an object that stay on disk until they are asked for, cut to the object and black around it."""
 
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from render.exchange.ingest import Box
+from pipelines.evaluate.evaluation import TestObject
+from render.exchange.ingest import Box, crop_box
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
 
 MARGIN = 15
 """Pixels kept around the mask's bounding box, as the published results do (SDPS-Net's preparation of DiLiGenT)."""
 
-
 _KEPT_BYTES = 2**30
+
+
+class Images(NamedTuple):
+    """Images on disk.
+
+    Attributes:
+        read: Reads image number k whole, (H, W, 3) float32 linear radiance; raises InputError.
+        files: Everything they are read from.
+        names: What image k is called, for complaints.
+    """
+
+    read: Callable[[int], np.ndarray]
+    files: Sequence[Path]
+    names: Sequence[str]
+
+    @classmethod
+    def of_files(cls, files: Sequence[Path], read: Callable[[Path], np.ndarray]) -> "Images":
+        """Return images of a file each."""
+        return cls(lambda number: read(files[number]), files, [str(path) for path in files])
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,21 +44,19 @@ class Stack:
     """Linear images, an `sdps.inference.image_source.ImageSource`.
 
     Attributes:
-        read: Reads image number k whole, (H, W, 3) float32 linear radiance; raises InputError.
-        names: What image k is called, for complaints.
+        images: The images as they are on disk.
         full_mask: (H, W) bool, of the whole frame.
         box: The part that is kept.
         longest: Greatest side in pixels; larger images are averaged down. 0 for no limit.
     """
 
-    read: Callable[[int], np.ndarray]
-    names: Sequence[str]
+    images: Images
     full_mask: np.ndarray
     box: Box
     longest: int = 0
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self.images.names)
 
     def __getitem__(self, part: slice) -> np.ndarray:  # (n, h, w, 3) float32
         mask = self.box.cut(self.full_mask)
@@ -66,11 +83,12 @@ class Stack:
         return self._shrunk(self.box.cut(self.full_mask).astype(np.float32)) > 0.5
 
     def _cut(self, number: int) -> np.ndarray:
-        image = self.read(number)
+        image = self.images.read(number)
         if image.shape[:2] != self.full_mask.shape:
+            found, wanted = ("x".join(map(str, array.shape[:2])) for array in (image, self.full_mask))
             raise InputError(
-                f"{self.names[number]}: is {image.shape[0]}x{image.shape[1]}, the mask is {self.full_mask.shape[0]}x"
-                f"{self.full_mask.shape[1]} (height x width); give all pictures of an object one size"
+                f"{self.images.names[number]}: is {found}, the mask is {wanted} (height x width); give all pictures of "
+                "an object one size"
             )
         return np.nan_to_num(self.box.cut(image), nan=0.0, posinf=0.0, neginf=0.0)
 
@@ -92,3 +110,41 @@ def files_digest(files: Sequence[Path], *settings: Any) -> str:
     for path in files:
         digest.update(hashlib.sha256(read_bytes(path)).digest())
     return digest.hexdigest()[:24]
+
+
+def photographed(
+    name: str,
+    images: Images,
+    mask: np.ndarray,
+    directions: np.ndarray,
+    intensities: np.ndarray | None = None,
+    *,
+    normals: np.ndarray | None = None,
+    margin: int = MARGIN,
+    longest: int = 0,
+    files: Sequence[Path] = (),
+    settings: tuple = (),
+) -> TestObject:
+    """Return an object of which the lights are known; its images stay on disk.
+
+    Args:
+        name: The object.
+        images: L images.
+        mask: (H, W) bool.
+        directions: (L, 3), from the surface to the light, of any length.
+        intensities: (L, 3), None where they are not known.
+        normals: (H, W, 3) true normals, None where they are not known.
+        margin: Pixels kept around the mask's bounding box.
+        longest: Greatest side in pixels, 0 for no limit.
+        files: What else the object comes from, such as its mask.
+        settings: What else its images depend on.
+    """
+    box = crop_box(mask, margin)
+    stack = Stack(images, mask, box, longest)
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    gains = None if intensities is None else intensities.tolist()
+    return TestObject(
+        name=name, digest=files_digest([*images.files, *files], *settings, margin, longest, directions.tolist(), gains),
+        load=lambda: stack, mask=stack.mask, normals=None if normals is None else box.cut(normals),
+        light_directions=directions.astype(np.float32), intensities=intensities,
+    )  # fmt: skip

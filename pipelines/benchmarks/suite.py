@@ -1,20 +1,21 @@
 """Running methods on a benchmark's objects, and what is written about it: results.json and the report's section."""
 
+import argparse
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import cache
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pipelines.benchmarks.object_tables import object_table, published_rows
 from pipelines.evaluate.evaluation import Evaluation, TestObject
 from pipelines.evaluate.object_pictures import Found, tiles
+from pipelines.evaluate.results import publish, weights_of
 from pipelines.report.sections import Section, SectionWriter, Table
 from pipelines.shared import using
-from pipelines.shared.text_tables import render_text
-from render.shared.errors import unknown
-from render.shared.files import write_json
+from pipelines.shared.flags import add_out, picked, split_list
+from render.shared.config import to_plain
 from render.shared.progress import progress_bar
-from sdps.inference.inference_config import InferenceConfig
+from sdps.inference.inference_config import InferenceConfig, inference_config
 from sdps.methods import select
 from sdps.methods.method import Method
 from sdps.methods.pretrained import finder
@@ -42,30 +43,72 @@ def run(
     runners = [Runner(method, finder(models), config) for method in chosen]
     evaluation = Evaluation(folder)
     found: Found = {runner.method.name: {} for runner in runners}
-    with progress_bar(None, desc="evaluate", unit="result", total=len(items) * len(runners)) as bar:
-        for item in items:
-            once = replace(item, load=cache(lambda item=item: item.load().opened()))
-            for runner in runners:
-                name = runner.method.name
-                found[name][item.name] = evaluation.result(once, runner, keep_normals=name in shown)
-                bar.update(1)
+    for item in progress_bar(items, desc="evaluate", unit="object"):
+        opened = replace(item, load=lambda item=item: item.load().opened())
+        for runner, result in zip(runners, evaluation.results(opened, runners, shown), strict=True):
+            found[runner.method.name][item.name] = result
     return found, runners
 
 
-def write(
-    out: Path,
-    section: Section,
+@dataclass(frozen=True)
+class Benchmark:
+    """Real objects with published results.
+
+    Attributes:
+        name: Folder name of its results.
+        title: Its name in tables.
+        order: Place of its section in the report.
+        known: Its objects in the order of the published tables.
+        tables: Caption, published quantity, score and digits of each table.
+        note: A sentence below the tables.
+    """
+
+    name: str
+    title: str
+    order: int
+    known: tuple[str, ...]
+    tables: tuple[tuple[str, str, str, int], ...]
+    note: str = ""
+
+
+def named_methods(args: argparse.Namespace) -> list[Method]:
+    """Return the methods of `--methods`; none where it is not given."""
+    return select.selected(split_list(args.methods), select.runs_folder(args.models), inference_config(args))
+
+
+def evaluate(
+    bench: Benchmark,
+    args: argparse.Namespace,
     items: Sequence[TestObject],
-    found: Found,
-    runners: Sequence[Runner],
-    shown: Sequence[str],
+    chosen: Sequence[Method],
+    *,
+    text: str,
     protocol: dict[str, Any],
-) -> None:
-    """Write `<out>/<section>/results.json` and the report's section."""
-    write_json(out / section.name / "results.json", {
-        "definition": section.text,
-        "protocol": protocol,
-        "weights": {name: str(file) for runner in runners for name, file in runner.files.items()},
+    command: str,
+) -> int:
+    """Run methods, print the tables, and write `<out>/<name>/results.json` and the report's section.
+
+    Args:
+        bench: The benchmark.
+        args: Flags of `add_arguments`.
+        items: Its objects.
+        chosen: The methods.
+        text: What the numbers are of.
+        protocol: The same for results.json.
+        command: The command that does it again, without `--out`.
+    """
+    config, shown, file = inference_config(args), pictured(chosen), args.out / bench.name / "results.json"
+    found, runners = run(items, chosen, select.runs_folder(args.models), file.parent / "cache", config, shown)
+    section = Section(
+        name=bench.name, title=bench.title, text=text + using.describe(runners, config), order=bench.order,
+        tables=build_tables(bench, items, found, chosen), command=f"{command} --out {args.out}",
+    )  # fmt: skip
+    writer = SectionWriter(section)
+    for item in items:
+        writer.strip(f"{item.name}, {len(item.light_directions)} images", tiles(item, found, shown))
+    values = {
+        "protocol": protocol | to_plain(config),
+        "weights": weights_of(runners),
         "objects": {item.name: _about(item) for item in items},
         "methods": {
             name: {
@@ -73,13 +116,23 @@ def write(
             }
             for name, row in found.items()
         },
-        "tables": {table.title: {"header": table.header, "rows": table.rows, "published": table.published}
-                   for table in section.tables},
-    })  # fmt: skip
-    writer = SectionWriter(section)
-    for item in items:
-        writer.strip(f"{item.name}, {len(item.light_directions)} images", tiles(item, found, shown))
-    writer.write(out)
+    }
+    publish(writer, args.out, file, values, left=(0, 1), said=refusals(found))
+    return 0
+
+
+def build_tables(
+    bench: Benchmark, items: Sequence[TestObject], found: Found, chosen: Sequence[Method]
+) -> tuple[Table, ...]:
+    """Return a benchmark's tables, ours and published rows; those of lights list each lighting model once."""
+    lights = lighting_only(found, chosen)
+    return tuple(
+        object_table(
+            caption, found if metric == "normal_mae" else lights, metric, present=[item.name for item in items],
+            known=bench.known, published=published_rows(bench.name, quantity), digits=digits, note=bench.note,
+        )
+        for caption, quantity, metric, digits in bench.tables
+    )  # fmt: skip
 
 
 def _about(item: TestObject) -> dict[str, Any]:
@@ -90,16 +143,12 @@ def _about(item: TestObject) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def text_of(tables: Sequence[Table], found: Found) -> str:
-    """Lay out tables and refusals for the terminal."""
-    parts = [
-        render_text(f"\n{table.title}", list(table.header), [list(row) for row in table.rows], left=(0, 1))
-        for table in tables
-    ]
-    refused = [
+def refusals(found: Found) -> str:
+    """Say which methods refused which objects, a line each."""
+    lines = [
         f"{name} refused {key}: {one.reason}" for name, row in found.items() for key, one in row.items() if one.reason
     ]
-    return "".join(parts) + ("\n" + "\n".join(refused) + "\n" if refused else "")
+    return "".join(f"\n{line}" for line in lines) + ("\n" if lines else "")
 
 
 def lighting_only(found: Found, chosen: Sequence[Method]) -> Found:
@@ -115,7 +164,7 @@ def _lights_of(method: Method) -> tuple[str, str | None, int | None]:
     return method.lights, method.read_out, method.light_views
 
 
-def add_arguments(parser: Any, out: str) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags every benchmark has."""
     parser.add_argument("data", type=Path, help="folder of the benchmark, see docs/guides/benchmarks.md")
     parser.add_argument("--methods", action="append", metavar="METHOD,LIGHTS+NORMALS,...",
@@ -124,20 +173,17 @@ def add_arguments(parser: Any, out: str) -> None:
                         help="--out of `sdps train`, whose models are evaluated (default: shipped ones)")  # fmt: skip
     parser.add_argument("--objects", action="append", help="commas or repeat (default: all in the folder)")
     using.add_arguments(parser)
-    parser.add_argument("--out", type=Path, default=Path(out), help="output folder (default: %(default)s)")
+    add_out(parser, Path("out/real"))
 
 
-def pick(items: list[TestObject], names: Sequence[str]) -> list[TestObject]:
+def pick(items: Sequence[TestObject], names: list[str] | None) -> list[TestObject]:
     """Return the objects of `--objects`, or all.
 
     Raises:
         InputError: a name that is not there.
     """
     known = {item.name: item for item in items}
-    for name in names:
-        if name not in known:
-            raise unknown("object", name, known)
-    return [known[name] for name in names] if names else items
+    return [known[name] for name in picked("object", names, known)]
 
 
 def pictured(chosen: Sequence[Method]) -> list[str]:

@@ -5,25 +5,16 @@ figure on PF14 (supplement: good on diffuse, bad on specular reflectance) is a r
 """
 
 import argparse
-import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
+from typing import Any
 
-import numpy as np
-
-from pipelines.evaluate.evaluation import Evaluation
-from pipelines.evaluate.lit import lit_object
-from pipelines.rendering.render_data import render_planned
+from pipelines.evaluate.results import mean, publish
+from pipelines.evaluate.workbench import Workbench
 from pipelines.report.sections import Section, SectionWriter, Table
 from pipelines.shared import presets, scenes
-from pipelines.shared.lists import split_list
-from pipelines.shared.presets import TestConfig
-from pipelines.shared.text_tables import number, render_text
+from pipelines.shared.flags import picked, split_list
 from render.materials import surfaces
 from render.records.manifest import SceneSpec
-from render.shared.files import write_json
-from render.shared.progress import progress_bar
 from sdps.classical import registry
 from sdps.methods import pretrained
 from sdps.methods.parse import parse
@@ -41,29 +32,6 @@ DEFINITION = (
 )
 
 
-@dataclass(frozen=True)
-class Row:
-    """What one method made of one scene.
-
-    Attributes:
-        method: Its name.
-        lights: The light set.
-        shape: Shape of the scene.
-        category: Kind of reflectance.
-        scores: Metrics by name; empty where the method refused.
-        seconds: Time it took.
-        reason: Why it refused, or empty.
-    """
-
-    method: str
-    lights: str
-    shape: str
-    category: str
-    scores: dict[str, float]
-    seconds: float = 0.0
-    reason: str = ""
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps eval-classical`."""
     presets.add_common_arguments(parser, default="classical")
@@ -74,50 +42,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Render or reuse the scenes, run the methods, print the tables and write results.json."""
     preset, out = presets.from_arguments(args)
-    names = split_list(args.methods) or list(registry.METHODS)
-    runners = [classical_runner(name) for name in names]
-    rows: list[Row] = []
-    evaluation = Evaluation(out / "eval")
+    names = picked("method", args.methods, registry.METHODS)
+    runners = tuple(Runner(parse(name, pretrained.require), pretrained.require) for name in names)
+    bench, rows = Workbench(preset, out, runners), []
     for lights in split_list(args.light_sets) or LIGHT_SETS:
-        test = replace(preset.test, lights=lights)
-        wanted, folder = scenes.test_scenes(test), out / scenes.slug(lights)
-        render_planned(wanted, folder, replace(preset, test=test))
-        rows += evaluate(wanted, folder, runners, test, evaluation)
-    tables = build_tables(rows, names)
-    listed = [vars(row) for row in rows]
-    rendered = {table.title: {"header": table.header, "rows": table.rows} for table in tables}
-    write_json(out / "results.json", {"definition": DEFINITION, "tables": rendered, "rows": listed})
+        rows += evaluate(bench, lights)
     section = Section(name="classical", title="Classical methods on regenerated scenes", text=DEFINITION, order=50,
-                      tables=tuple(tables), command=f"sdps eval-classical --out {out}")  # fmt: skip
-    SectionWriter(section).write(out)
-    texts = (render_text(f"\n{table.title}", list(table.header), list(table.rows)) for table in tables)
-    sys.stdout.write("\n".join(texts))
-    sys.stdout.write(f"\n{DEFINITION}\n{out / 'results.json'}\n")
+                      tables=tuple(build_tables(rows, names)), command=f"sdps eval-classical --out {out}")  # fmt: skip
+    publish(SectionWriter(section), out, out / "results.json", {"rows": rows})
     return 0
 
 
-def classical_runner(name: str) -> Runner:
-    """Return a classical method, told the true lights if it is a calibrated one.
-
-    Raises:
-        InputError: an unknown name, with the nearest.
-    """
-    registry.method(name)
-    return Runner(parse(name, pretrained.require), pretrained.require)
-
-
-def evaluate(
-    wanted: Sequence[SceneSpec], folder: Path, runners: Sequence[Runner], config: TestConfig, evaluation: Evaluation
-) -> list[Row]:
-    """Run every method on every scene that is not in the cache yet."""
-    rows = []
-    for scene in progress_bar(wanted, desc=config.lights, unit="scene"):
-        item, kind = lit_object(scene, folder, config), category(scene)
-        found = evaluation.results(item, runners, [False] * len(runners))
-        for runner, result in zip(runners, found, strict=True):
-            name = runner.method.normals
-            rows.append(Row(name, config.lights, scene.shape, kind, result.scores, result.seconds, result.reason))
-    return rows
+def evaluate(bench: Workbench, lights: str) -> list[dict[str, Any]]:
+    """Run the methods on the scenes under a light set; results by names that are kept in results.json."""
+    test = replace(bench.config, lights=lights)
+    wanted, folder = bench.rendered(test, bench.out / scenes.slug(lights))
+    results = bench.evaluated(bench.objects(wanted, folder, test), bench.runners, len(wanted), lights)
+    return [
+        {"method": runner.method.normals, "lights": lights, "shape": scene.shape, "category": category(scene),
+         "scores": result.scores, "seconds": result.seconds, "reason": result.reason}
+        for scene, runner, result in results
+    ]  # fmt: skip
 
 
 def category(scene: SceneSpec) -> str:
@@ -126,23 +71,19 @@ def category(scene: SceneSpec) -> str:
     return kinds.pop() if len(kinds) == 1 else "mixed"
 
 
-def build_tables(rows: list[Row], names: list[str]) -> list[Table]:
+def build_tables(rows: list[dict[str, Any]], names: list[str]) -> list[Table]:
     """Average over the scenes of a shape, kind of reflectance and light set."""
     tables = []
     for metric, title in TABLES.items():
-        for lights in dict.fromkeys(row.lights for row in rows):
-            for shape in dict.fromkeys(row.shape for row in rows):
-                part = [row for row in rows if (row.lights, row.shape) == (lights, shape)]
-                kinds = list(dict.fromkeys(row.category for row in part))
-                shown = [n for n in names if metric == "normal_mae" or not registry.METHODS[n].calibrated]
-                body = tuple((name, *(_cell(part, name, kind, metric) for kind in kinds)) for name in shown)
-                tables.append(Table(title=f"{title}: {shape}, {lights}", header=("method", *kinds), rows=body))
+        shown = [name for name in names if metric == "normal_mae" or not registry.METHODS[name].calibrated]
+        for lights, shape in dict.fromkeys((row["lights"], row["shape"]) for row in rows):
+            part = [row for row in rows if (row["lights"], row["shape"]) == (lights, shape)]
+            kinds = list(dict.fromkeys(row["category"] for row in part))
+            scores = {
+                (name, kind): [row["scores"] for row in part if (row["method"], row["category"]) == (name, kind)]
+                for name in shown
+                for kind in kinds
+            }
+            body = tuple((name, *(mean(scores[name, kind], metric).cell() for kind in kinds)) for name in shown)
+            tables.append(Table(title=f"{title}: {shape}, {lights}", header=("method", *kinds), rows=body))
     return tables
-
-
-def _cell(rows: list[Row], name: str, kind: str, metric: str) -> str:
-    """Return a method's mean over the scenes of a category, and how many failed."""
-    rows = [row for row in rows if (row.method, row.category) == (name, kind)]
-    values = [row.scores[metric] for row in rows if metric in row.scores]
-    text = number(float(np.mean(values))) if values else "-"
-    return text + (f" [{len(rows) - len(values)} failed]" if len(values) < len(rows) else "")

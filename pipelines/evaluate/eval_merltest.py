@@ -13,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.evaluate.evaluation import Evaluation
-from pipelines.evaluate.lit import lit_object
-from pipelines.evaluate.merltest_tables import SceneScores, definition, lighting_table, normal_table
-from pipelines.rendering.render_data import render_planned
+from pipelines.evaluate.merltest_tables import SceneScores, definition, lighting_table, normal_table, write
+from pipelines.evaluate.results import tables_text, weights_of
+from pipelines.evaluate.workbench import Workbench, lit_object
+from pipelines.report import page as report
 from pipelines.report.sections import Table
-from pipelines.shared import presets, scenes, using
-from pipelines.shared.presets import Preset, TestConfig
-from pipelines.shared.text_tables import render_text
+from pipelines.shared import presets, using
+from pipelines.shared.presets import Preset
 from render.records.manifest import SceneSpec
 from render.shared.config import to_plain
 from render.shared.errors import InputError
@@ -47,39 +46,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Render or reuse the scenes, score, print the tables, and write results.json, the section and report.html."""
-    from pipelines.evaluate import merltest_section
-    from pipelines.report import page as report
-
     preset, out = presets.from_arguments(args)
     lighting, normals = table_rows(args, out, preset)
     config = inference_config(preset.test)
-    runners = [Runner(method, finder(out), config) for method in (*lighting, *normals)]
-    wanted = scenes.test_scenes(preset.test)
-    folder = out / "merltest"
-    render_planned(wanted, folder, preset)
-    evaluation = Evaluation(out / "eval")
-    pictured = shown(normals)
-    results = list(evaluate(wanted, folder, preset.test, runners, evaluation, pictured))
-    tables = build_tables(results, lighting, normals)
+    runners = tuple(Runner(method, finder(out), config) for method in (*lighting, *normals))
+    bench, pictured = Workbench(preset, out, runners), shown(normals)
+    wanted, folder = bench.merltest()
+    results = list(evaluate(bench, wanted, folder, pictured))
+    tables, networks = build_tables(results, lighting, normals), using.describe(runners, config)
     presets.save_resolved(preset, out / "eval")
-    weights = {name: str(file) for runner in runners for name, file in runner.files.items()}
-    networks = using.describe(runners, config)
-    write_json(out / "eval" / "results.json", results_json(results, tables, preset, weights, networks))
+    write_json(out / "eval" / "results.json", {
+        "definition": definition(preset.test),
+        "networks": networks.strip(),
+        "weights": weights_of(runners),
+        "config": to_plain(preset.test),
+        "tables": {table.title: {"header": table.header, "rows": table.rows} for table in tables},
+        "scenes": [
+            {"id": r.scene.id, "shape": r.scene.shape, "material": r.scene.material, "scores": r.scores}
+            for r in results
+        ],
+    })  # fmt: skip
     chosen = {runner.method.name: runner for runner in runners}
-    merltest_section.write(
-        out,
-        preset,
-        tables,
-        results,
-        folder,
-        evaluation,
-        [chosen[name] for name in pictured if name in chosen],
-        networks,
-    )
+    write(bench, folder, tables, results, [chosen[name] for name in pictured if name in chosen], networks)
     page = report.write(out, preset)
-    listed = (render_text(f"\n{table.title}", list(table.header), list(table.rows), left=(0, 1)) for table in tables)
-    sys.stdout.write("\n".join(listed))
-    sys.stdout.write(f"\n{definition(preset.test)}{networks}\n{page}\n")
+    sys.stdout.write(f"{tables_text(tables, left=(0, 1))}\n{definition(preset.test)}{networks}\n{page}\n")
     return 0
 
 
@@ -124,21 +114,16 @@ def shown(normals: Sequence[Method]) -> list[str]:
 
 
 def evaluate(
-    wanted: Sequence[SceneSpec],
-    folder: Path,
-    config: TestConfig,
-    runners: Sequence[Runner],
-    evaluation: Evaluation,
-    pictured: Sequence[str],
+    bench: Workbench, wanted: Sequence[SceneSpec], folder: Path, pictured: Sequence[str]
 ) -> Iterator[SceneScores]:
     """Score every scene, averaged over the draws of random intensities; normal maps of the first draw are kept."""
     for scene in progress_bar(wanted, desc="evaluate", unit="scene"):
         draws: dict[str, list[dict[str, float]]] = {}
-        for repeat in range(config.repeats):
-            keep = [repeat == 0 and runner.method.name in pictured for runner in runners]
-            item = lit_object(scene, folder, config, repeat)
+        for repeat in range(bench.config.repeats):
+            item = lit_object(scene, folder, bench.config, repeat)
             scored: dict[str, dict[str, float]] = {}
-            for runner, result in zip(runners, evaluation.results(item, runners, keep), strict=True):
+            results = bench.evaluation.results(item, bench.runners, () if repeat else pictured)
+            for runner, result in zip(bench.runners, results, strict=True):
                 name = runner.method.name  # the constant predictor has a row in both tables
                 scored[name] = scored.get(name, {}) | result.scores
             for name, scores in scored.items():
@@ -159,20 +144,3 @@ def build_tables(results: list[SceneScores], lighting: list[Method], normals: li
     second = [method for method in normals if method.second]  # rows of both tables
     first = [lighting_table(results, [*lighting, *second], all_rows=True)] if whole else []
     return [*first, normal_table(results, normals, all_rows=whole)]
-
-
-def results_json(
-    results: list[SceneScores], tables: list[Table], preset: Preset, weights: dict[str, str], networks: str
-) -> dict:
-    """Collect everything a reader needs to judge the numbers."""
-    return {
-        "definition": definition(preset.test),
-        "networks": networks.strip(),
-        "weights": weights,
-        "config": to_plain(preset.test),
-        "tables": {table.title: {"header": table.header, "rows": table.rows} for table in tables},
-        "scenes": [
-            {"id": r.scene.id, "shape": r.scene.shape, "material": r.scene.material, "scores": r.scores}
-            for r in results
-        ],
-    }

@@ -6,8 +6,9 @@ code, so that a stopped evaluation goes on where it was, and what has changed is
 
 import hashlib
 import importlib.metadata
+import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -15,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.evaluate.score_cache import ScoreCache
 from render.shared.errors import InputError
-from render.shared.files import atomic_path, source_digest
+from render.shared.files import atomic_path, read_whole_lines, source_digest
 
 if TYPE_CHECKING:
     from sdps.inference.image_source import ImageSource
     from sdps.methods.runner import Runner
 
 _log = logging.getLogger(__name__)
-_FORMAT = "evaluation-2"
+_FORMAT = "evaluation-3"
+_NOTES = ("gbr", "candidates", "intersections")
 _LIBRARIES = ("torch", "numpy", "scipy", "opencv-python-headless")
 
 
@@ -64,6 +65,7 @@ class Result:
         light_directions: (L, 3) estimated or given directions; (0, 3) where there are none.
         intensities: (L,) the same for intensities.
         maps: File with the normal map, or None where it was not to be kept.
+        notes: What else a classical method says: the transformation it found, and from what.
     """
 
     scores: dict[str, float]
@@ -72,6 +74,7 @@ class Result:
     light_directions: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     intensities: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
     maps: Path | None = None
+    notes: dict[str, Any] = field(default_factory=dict)
 
     def normals(self) -> np.ndarray | None:  # (H, W, 3)
         """Return the estimated normals, or None where they were not kept or the method gives none."""
@@ -79,6 +82,42 @@ class Result:
             return None
         with np.load(self.maps) as stored:
             return stored["normals"].astype(np.float32)
+
+
+class ScoreCache:
+    """Results by key in a file of JSON lines, appended to one by one.
+
+    A line torn by a crash is skipped, and its result found again.
+
+    Args:
+        path: The file; it appears with its first line.
+        identity: What the results depend on besides their key. Lines written under another identity are ignored.
+
+    Raises:
+        InputError: the file cannot be read or written.
+    """
+
+    def __init__(self, path: Path, identity: str) -> None:
+        self.path, self.identity = path, identity
+        self._found: dict[tuple[str, ...], Any] = {}
+        for row in read_whole_lines(path):
+            if isinstance(row, dict) and row.get("identity") == identity and {"key", "value"} <= row.keys():
+                self._found[tuple(row["key"])] = row["value"]
+
+    def get(self, key: tuple[str, ...]) -> Any:
+        """Return the result of a key, or None."""
+        return self._found.get(key)
+
+    def add(self, key: tuple[str, ...], value: Any) -> None:
+        """Keep a result, in memory and at the end of the file."""
+        self._found[key] = value
+        row = {"identity": self.identity, "key": list(key), "value": value}
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a", encoding="utf-8") as handle:
+                handle.write(f"\n{json.dumps(row)}\n")  # the file may end in a torn line
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be written ({error.strerror or error})") from error
 
 
 class Evaluation:
@@ -95,35 +134,27 @@ class Evaluation:
         self.folder = folder
         self._cache = ScoreCache(folder / "scores.jsonl", code_identity())
 
-    def result(self, item: TestObject, runner: "Runner", *, keep_normals: bool = False) -> Result:
-        """Return what the method makes of the object, from the cache or by running it.
+    def results(self, item: TestObject, runners: "Sequence[Runner]", keep: Collection[str] = ()) -> list[Result]:
+        """Return what methods make of an object, from the cache or by running them.
+
+        Its images are read once, and only if they are needed; lights that several methods see alike are estimated once.
 
         Args:
             item: The object.
-            runner: The method.
-            keep_normals: Also keep the normal map (float16).
-        """
-        return self.results(item, [runner], [keep_normals])[0]
-
-    def results(self, item: TestObject, runners: "Sequence[Runner]", keep_normals: Sequence[bool]) -> list[Result]:
-        """Return what several methods make of an object.
-
-        Its images are read once, and only if they are needed; lights that several methods see alike are estimated once.
+            runners: The methods.
+            keep: Names of methods whose normal maps are kept (float16).
         """
         images, lights, found = None, {}, []
-        for runner, keep in zip(runners, keep_normals, strict=True):
-            key = (runner.method.name, runner.identity(), item.name, item.digest)
-            maps = self._maps(key)
+        for runner in runners:
+            key, kept = (runner.method.name, runner.identity(), item.name, item.digest), runner.method.name in keep
+            maps = self.folder / "maps" / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.npz"
             known = self._cache.get(key)
-            if known is None or (keep and known["normals"] and not maps.is_file()):
+            if known is None or (kept and known["normals"] and not maps.is_file()):
                 images = item.load() if images is None else images
-                known = self._run(item, images, runner, maps if keep else None, lights)
+                known = self._run(item, images, runner, maps if kept else None, lights)
                 self._cache.add(key, known)
             found.append(_result(known, maps))
         return found
-
-    def _maps(self, key: tuple[str, ...]) -> Path:
-        return self.folder / "maps" / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.npz"
 
     def _run(
         self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: dict[Any, Any]
@@ -133,7 +164,8 @@ class Evaluation:
             estimate = runner.estimate(images, item.mask, item.light_directions, item.intensities, lights)
         except InputError as error:  # such as least squares under lights that were all estimated alike
             _log.warning("%s, %s: no score (%s)", item.name, runner.method.name, error)
-            return {"scores": {}, "reason": str(error), "seconds": 0.0, "normals": False, "lights": [], "gains": []}
+            return {"scores": {}, "reason": str(error), "seconds": 0.0, "normals": False, "lights": [], "gains": [],
+                    "notes": {}}  # fmt: skip
         scores = runner.score(estimate, item.mask, item.normals, item.light_directions, item.intensities)
         if maps is not None and estimate.normals.size:
             with atomic_path(maps) as temporary, temporary.open("wb") as handle:
@@ -145,6 +177,7 @@ class Evaluation:
             "normals": bool(estimate.normals.size),
             "lights": np.round(np.asarray(estimate.light_directions, np.float64), 6).tolist(),
             "gains": np.round(np.asarray(estimate.intensities, np.float64), 6).tolist(),
+            "notes": {name: estimate.diagnostics[name] for name in _NOTES if name in estimate.diagnostics},
         }
 
 
@@ -160,4 +193,4 @@ def _result(known: dict[str, Any], maps: Path) -> Result:
     lights = np.array(known["lights"], np.float32).reshape(-1, 3)
     gains = np.array(known["gains"], np.float32)
     kept = maps if known["normals"] and maps.is_file() else None
-    return Result(known["scores"], known["seconds"], known["reason"], lights, gains, kept)
+    return Result(known["scores"], known["seconds"], known["reason"], lights, gains, kept, known["notes"])

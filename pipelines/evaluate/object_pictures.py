@@ -17,14 +17,21 @@ Found = dict[str, dict[str, Result]]
 """Results by method, then object."""
 
 
-def tiles(item: TestObject, found: Found, shown: Sequence[str]) -> list[tuple[str, Any]]:
-    """Return (caption, picture) of an object: input, true normals, each method's normals, errors and lights."""
+def tiles(item: TestObject, found: Found, shown: Sequence[str], truth: str = "true normals") -> list[tuple[str, Any]]:
+    """Return (caption, picture) of an object: input, true normals, each method's normals, errors and lights.
+
+    Args:
+        item: The object.
+        found: Results, with the normal maps of the methods shown.
+        shown: Methods.
+        truth: What the object's normals are called.
+    """
     mask = item.mask
     brightest = _brightest(item)
     exposure = pictures.auto_exposure(brightest[None], mask)
     result: list[tuple[str, Any]] = [("input", _fit(pictures.tone_map(brightest, exposure)))]
     if item.normals is not None:
-        result.append(("true normals", _fit(pictures.normal_map(item.normals, mask))))
+        result.append((truth, _fit(pictures.normal_map(item.normals, mask))))
     for name in shown:
         if item.name not in found.get(name, {}):
             continue
@@ -37,16 +44,16 @@ def tiles(item: TestObject, found: Found, shown: Sequence[str]) -> list[tuple[st
                 text = f"{name}: error {np.nanmean(errors):.1f}°"
                 result.append((text, _fit(pictures.error_map(errors, ERROR_LIMIT))))
         if "direction_mae" in one.scores:
-            text = f"{name}: lights, {one.scores['direction_mae']:.1f}° (circles: true)"
-            result.append((text, pictures.light_plot(item.light_directions, one.light_directions)))
+            gains = one.intensities if len(one.intensities) else np.ones(len(one.light_directions))
+            text = f"{name}: lights, {one.scores['direction_mae']:.1f}° (lines: to the true ones)"
+            result.append((text, pictures.light_plot(one.light_directions, gains, item.light_directions)))
     return result
 
 
 def _brightest(item: TestObject) -> np.ndarray:  # (H, W, 3)
     """Return the brightest of some images spread over all."""
     images = item.load()
-    places = np.unique(np.linspace(0, len(images) - 1, _LIT_CANDIDATES).round().astype(int))
-    candidates = [images[place : place + 1][0] for place in places]
+    candidates = [images[k : k + 1][0] for k in pictures.spread(range(len(images)), _LIT_CANDIDATES)]
     return max(candidates, key=lambda image: float(image[item.mask].mean()))
 
 

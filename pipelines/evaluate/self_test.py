@@ -6,15 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.evaluate.workbench import intensities, write_photographs
 from pipelines.rendering.render_data import render_planned
 from pipelines.shared.presets import Preset, TestConfig
 from pipelines.shared.scenes import test_scenes
 from pipelines.shared.text_tables import number
 from render.records.shards import read_shard
-from render.shared.errors import InputError
 from render.shared.files import read_text, write_json
-from render.shared.images import quantise, write_png
-from render.shared.seeds import generator
 
 if TYPE_CHECKING:
     from sdps.api import Inference
@@ -40,15 +38,9 @@ def photograph_bunny(folder: Path, material: str = "red-phenolic") -> Path:
     rendered = folder / TRUTH
     render_planned([scene], rendered, Preset(name="self-test", description="", test=test))
     shard = read_shard(rendered / scene.file, scene)
-    gains = generator(test.seed, scene.id, "intensities", 0).uniform(*test.intensity_range, len(shard.images))
-    images = shard.images.astype(np.float32) * gains[:, None, None, None].astype(np.float32)
-    exposed = images / np.percentile(images[:, shard.mask], _UNCLIPPED)
-    try:
-        for index, image in enumerate(exposed):
-            write_png(folder / f"{index:03d}.png", quantise(image, 16))
-        write_png(folder / "mask.png", shard.mask.astype(np.uint8) * 255)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another --out") from error
+    gains = intensities(scene, test, 0)
+    images = shard.images.astype(np.float32) * gains[:, None, None, None]
+    write_photographs(folder, images / np.percentile(images[:, shard.mask], _UNCLIPPED), shard.mask)
     truth = {"shard": scene.file, "intensities": gains.tolist(), "directions": scene.light_directions().tolist()}
     write_json(rendered / "lights.json", truth)
     return folder

@@ -2,11 +2,13 @@
 
 import argparse
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from pipelines.shared import pictures
+from pipelines.shared.flags import split_list
 from render.materials import library, surfaces
 from render.materials.model import Material
 from render.planning.plan import material_pool
@@ -56,17 +58,14 @@ def _about(surface: surfaces.Surface) -> str:
 def _chosen(category: str | None, wanted: list[str] | None) -> list[str]:
     """Return the built-in materials, of one category if given, or the `wanted` names, categories and files."""
     if wanted:
-        from pipelines.shared.lists import split_list
-
         if category is not None:
             raise InputError("--category and --materials: give one of them; --materials takes categories too")
         return material_pool(tuple(split_list(wanted)))
-    categories = library.categories()
     if category is None:
         return library.names()
-    if category not in categories:
-        raise unknown("category", category, categories)
-    return list(categories[category])
+    if category not in library.categories():
+        raise unknown("category", category, library.categories())
+    return list(library.categories()[category])
 
 
 def shapes_main(args: argparse.Namespace) -> int:
@@ -83,18 +82,11 @@ def shapes_main(args: argparse.Namespace) -> int:
 
 def _material_sheet(names: list[str]) -> pictures.Image.Image:
     """Render a sphere of each material under one light, exposed alike but for the nearly black."""
-    from render.kernel import many_lights, scene
-    from render.materials.kernels.packed import pack
-    from render.shapes import load
-
-    built = scene.build(load("sphere"))
     tiles = []
     for first in range(0, len(names), 16):
         part = names[first : first + 16]
-        packed = pack(part, built.mesh)
-        _, images = many_lights.render(built, View(scale=0.95), packed, _LIGHTS, size=120, spp=64, bounces=0, seed=0)
-        shown = (pictures.tone_map(stack[0], 1.2) for _, stack in images)
-        tiles += zip(map(_label, part), shown, strict=True)
+        shown = _rendered("sphere", part, View(scale=0.95), size=120, spp=64, bounces=0)
+        tiles += [(_label(name), pictures.tone_map(image, 1.2)) for name, image in zip(part, shown, strict=True)]
     return pictures.contact_sheet(tiles, columns=min(10, len(tiles)))
 
 
@@ -105,19 +97,23 @@ def _label(name: str) -> str:
 
 def _shape_sheet() -> pictures.Image.Image:
     """Render one view of each shape in white under one light."""
+    tiles = []
+    for name in _SHAPES:
+        view = View(scale=0.98) if name == "bunny" else _TURNED
+        (image,) = _rendered(name, ["lambertian:0.8"], view, size=160, spp=256, bounces=2)
+        tiles.append((name, pictures.tone_map(image)))
+    return pictures.contact_sheet(tiles, columns=8)
+
+
+def _rendered(shape: str, materials: list[str], view: View, **settings: int) -> Iterator[np.ndarray]:
+    """Yield an image (H, W, 3) of a shape in each material under one light."""
     from render.kernel import many_lights, scene
     from render.materials.kernels.packed import pack
     from render.shapes import load
 
-    packed = pack(["lambertian:0.8"])
-    tiles = []
-    for name in _SHAPES:
-        view = View(scale=0.98) if name == "bunny" else _TURNED
-        _, images = many_lights.render(
-            scene.build(load(name)), view, packed, _LIGHTS, size=160, spp=256, bounces=2, seed=0
-        )
-        tiles.append((name, pictures.tone_map(next(images)[1][0])))
-    return pictures.contact_sheet(tiles, columns=8)
+    built = scene.build(load(shape))
+    _, images = many_lights.render(built, view, pack(materials, built.mesh), _LIGHTS, seed=0, **settings)
+    return (stack[0] for _, stack in images)
 
 
 def _save(sheet: pictures.Image.Image, path: Path) -> None:

@@ -1,7 +1,6 @@
 """`sdps fit-material`: from a measured table to a material file of the built-in model."""
 
 import argparse
-import hashlib
 import re
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ from render.materials import merl, model
 from render.materials.fit import fitting, spheres
 from render.materials.merl import MerlTable
 from render.materials.model import Material
+from render.records.shards import file_hash
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, write_text
 
@@ -68,9 +68,7 @@ def fit(table: MerlTable, name: str) -> Material:
     Raises:
         InputError: the table is black.
     """
-    with open(table.path, "rb") as handle:
-        digest = hashlib.file_digest(handle, "sha256").hexdigest()
-    source = f"fit to {Path(table.path).name} (SHA-256 {digest})"
+    source = f"fit to {Path(table.path).name} (SHA-256 {file_hash(Path(table.path))})"
     try:
         return fitting.Fitter().fit(name, merl.as_brdf(table), family="measured", source=source, terms=TERMS)
     except InputError as error:

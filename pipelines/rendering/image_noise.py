@@ -13,14 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.shared.lists import split_list
+from pipelines.shared.flags import add_fields, split_list
 from render.planning import light_sets
 from render.planning.chunks import GROUP_SIZE
 from render.records.manifest import View
+from render.shared.config import build
 from render.shared.errors import InputError
 from render.shared.files import write_json, write_text
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
+from render.shared.templates import markdown_table
+
+_NUMBERS = ("reference", "lights", "size", "bounces", "seed")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,12 +120,12 @@ def table(rows: list[Row], config: NoiseConfig) -> str:
     order = sorted(by_name, key=lambda name: -max(row.error[last] for row in by_name[name].values()))
     heads = [f"{shape} {spp} spp" for shape in config.shapes for spp in config.spp]
     heads += [f"{shape} bias, {last} spp" for shape in config.shapes]
-    lines = ["| material | " + " | ".join(heads) + " |", "|" + "---|" * (len(heads) + 1)]
+    body = []
     for name in order:
-        cells = [f"{by_name[name][shape].error[spp]:.2f}" for shape in config.shapes for spp in config.spp]
-        cells += [f"{by_name[name][shape].bias[last]:+.2f}" for shape in config.shapes]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        shown = [by_name[name][shape] for shape in config.shapes]
+        errors = [f"{row.error[spp]:.2f}" for row in shown for spp in config.spp]
+        body.append([name, *errors, *(f"{row.bias[last]:+.2f}" for row in shown)])
+    return markdown_table(["material", *heads], body) + "\n"
 
 
 def summary(rows: list[Row], config: NoiseConfig) -> str:
@@ -139,25 +143,18 @@ def summary(rows: list[Row], config: NoiseConfig) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps noise`."""
-    default = NoiseConfig()
-    parser.add_argument("--shapes", action="append", help=f"commas or repeat (default: {','.join(default.shapes)})")
+    parser.add_argument("--shapes", action="append", help="commas or repeat (default: bunny)")
     parser.add_argument("--materials", action="append", help="names, categories, files (default: all)")
     parser.add_argument("--spp", action="append", help="sample counts to judge (default: 64,128)")
-    for name in ("reference", "lights", "size", "bounces", "seed"):
-        parser.add_argument(f"--{name}", type=int, default=getattr(default, name), help="(default %(default)s)")
+    add_fields(parser, NoiseConfig, _NUMBERS)
     parser.add_argument("--out", type=Path, help="also write noise.md and noise.json into this folder")
 
 
 def main(args: argparse.Namespace) -> int:
     """Measure, print the summary and the table."""
-    given = {name: tuple(split_list(getattr(args, name))) for name in ("shapes", "materials", "spp")}
-    try:
-        given["spp"] = tuple(int(count) for count in given["spp"])
-    except ValueError as error:
-        raise InputError(f"--spp: expected whole numbers, got {','.join(given['spp'])}") from error
-    chosen = {name: value for name, value in given.items() if value}
-    numbers = {name: getattr(args, name) for name in ("reference", "lights", "size", "bounces", "seed")}
-    config = NoiseConfig(**chosen, **numbers)
+    given = {name: split_list(getattr(args, name)) for name in ("shapes", "materials", "spp")}
+    numbers = {name: getattr(args, name) for name in _NUMBERS}
+    config = build(NoiseConfig, {name: value for name, value in given.items() if value} | numbers)
     rows = list(measure(config))
     text = summary(rows, config) + "\n" + table(rows, config)
     sys.stdout.write(text)

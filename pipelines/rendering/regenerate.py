@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pipelines.rendering.render_data import render_planned
 from pipelines.shared import presets, scenes
-from pipelines.shared.lists import split_list
+from pipelines.shared.flags import split_list
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar

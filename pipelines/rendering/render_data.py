@@ -52,14 +52,9 @@ def run_options(args: argparse.Namespace) -> RunOptions:
     if not (slash and part.isdecimal() and parts.isdecimal()):
         raise InputError(f"--shard {args.shard}: expected I/N, for instance 1/4")
     return RunOptions(
-        workers=args.workers,
-        timeout=args.timeout,
-        part=int(part),
-        parts=int(parts),
-        retry_failed=args.retry_failed,
-        verify=args.verify,
-        keep_free=round(args.keep_free * 1e9),
-    )
+        workers=args.workers, timeout=args.timeout, part=int(part), parts=int(parts), retry_failed=args.retry_failed,
+        verify=args.verify, keep_free=round(args.keep_free * 1e9),
+    )  # fmt: skip
 
 
 def main(args: argparse.Namespace) -> int:

@@ -1,6 +1,7 @@
 """The look of the charts: colours that colour-blind readers and printers tell apart, names beside the lines."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -34,6 +35,45 @@ def short(name: str) -> str:
     before, bracket, _ = name.partition(" (")
     shipped = " (shipped)"
     return before + (shipped if bracket and name.endswith(shipped) else "")
+
+
+class LineChart:
+    """Lines of methods with their names beside the ends, published figures in grey.
+
+    Args:
+        axes: Where they are drawn.
+    """
+
+    def __init__(self, axes: Axes) -> None:
+        self.axes = axes
+        self._ends: list[tuple[str, float, str]] = []
+
+    def line(self, number: int, name: str, x: Sequence[float], y: Sequence[float], **style: Any) -> None:
+        """Draw the line of the method of this number."""
+        self.axes.plot(x, y, color=colour(number), **{"marker": marker(number), "ms": 4, **style})
+        self.end(name, y, colour(number))
+
+    def point(self, name: str, x: float, y: float | None) -> None:
+        """Draw a published figure, if there is one."""
+        if y is not None:
+            self.axes.plot([x], [y], color=PUBLISHED, marker="D", ms=6, ls="", mfc="none", zorder=5)
+            self.end(name, [y], PUBLISHED)
+
+    def end(self, name: str, y: Sequence[float], shade: str) -> None:
+        """Write a name beside the last figure of a line."""
+        self._ends.append((name, next((value for value in reversed(y) if np.isfinite(value)), np.nan), shade))
+
+    def ticks(self, x: Sequence[float], names: Sequence[str], base: float = 10.0) -> None:
+        """Make x logarithmic, with these ticks."""
+        self.axes.set_xscale("log", base=base)
+        self.axes.set_xticks(x, names, fontsize=8)
+        self.axes.minorticks_off()
+
+    def finish(self, gap: float = 0.06) -> None:
+        """Let y begin at 0, and write the names, at least `gap` heights of the axes apart."""
+        self.axes.set_ylim(bottom=0)
+        tidy(self.axes)
+        label_ends(self.axes, self._ends, gap)
 
 
 def tidy(axes: Axes) -> None:

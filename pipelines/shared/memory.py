@@ -1,19 +1,35 @@
-"""Work in a process of its own and the most memory it has held, for the benchmarks that tell it."""
+"""What work takes, in seconds and memory, and work in a process of its own, for the benchmarks that tell it."""
 
-import multiprocessing
+import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from render.shared.errors import InputError
 
-def peak_bytes() -> int | None:
-    """Return the largest resident size this process has had; None where there is no /proc."""
-    # Not getrusage, whose maximum a child inherits from the process that started it.
+
+def timed(action: Callable[[], object]) -> float:
+    """Return the seconds that an action takes."""
+    start = time.perf_counter()
+    action()
+    return time.perf_counter() - start
+
+
+def resident_bytes(entry: str = "VmRSS") -> int | None:
+    """Return the resident memory of this process now, or another entry of its status; None where there is no /proc."""
     try:
         lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     except OSError:
         return None
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM")), None)
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(entry)), None)
+
+
+def peak_bytes() -> int | None:
+    """Return the largest resident size this process has had; None where there is no /proc."""
+    return resident_bytes("VmHWM")  # not getrusage, whose maximum a child inherits from the process that started it
 
 
 def peak_gib() -> float | None:
@@ -22,22 +38,23 @@ def peak_gib() -> float | None:
     return None if peak is None else peak / 2**30
 
 
-def apart(work: Callable[..., None], *arguments: Any) -> dict:
-    """Return what a function sends from a fresh process, or {"error": ...} where the process died before it did.
+def apart(work: Callable[..., Any], *arguments: Any) -> Any:
+    """Return what a function of a module returns in a fresh process, whose memory and compiled kernels are its own.
 
-    Args:
-        work: Called with `arguments` and a connection, to which it sends one dictionary; a function of a module.
-        arguments: What it needs; picklable.
+    Raises:
+        InputError: the function's own, or the process died.
     """
-    context = multiprocessing.get_context("spawn")  # a forked child would count its parent's memory as its own
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=work, args=(*arguments, sender))
-    process.start()
-    sender.close()
+    # Spawned: a forked child would count its parent's memory as its own.
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        try:
+            return pool.submit(work, *arguments).result()
+        except BrokenProcessPool as error:
+            raise InputError("the process died before it was done; there may be too little memory") from error
+
+
+def measured(work: Callable[..., dict], *arguments: Any) -> dict:
+    """Return what `work` returns in a fresh process and an empty `error`, or its complaint as `error` alone."""
     try:
-        return receiver.recv()
-    except EOFError:
-        process.join()
-        return {"error": f"the process ended with code {process.exitcode}"}
-    finally:
-        process.join()
+        return {**apart(work, *arguments), "error": ""}
+    except InputError as error:
+        return {"error": str(error)}

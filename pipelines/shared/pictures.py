@@ -4,11 +4,11 @@ import base64
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 from PIL import Image, ImageDraw
 
 from pipelines.shared.charts import light_disc
@@ -16,6 +16,7 @@ from render.records.manifest import SceneSpec
 from render.records.shards import Shard, read_shard
 from sdps.photos.response import display
 
+T = TypeVar("T")
 _PAPER = (255, 255, 255)
 
 
@@ -50,11 +51,10 @@ def preview_strip(shard: Shard, lights: int = 4) -> np.ndarray:  # (H, W * (1 + 
     Spatially-varying scenes show their material weights in the place of one image.
     """
     tiles = [normal_map(shard.normals, shard.mask)]
-    weights = shard.weights
-    if weights is not None:
-        tiles.append(weight_map(weights, shard.mask))
-    chosen = np.linspace(0, len(shard.images) - 1, max(1, lights + 1 - len(tiles))).round().astype(int)
+    if shard.weights is not None:
+        tiles.append(weight_map(shard.weights, shard.mask))
     exposure = auto_exposure(shard.images, shard.mask)
+    chosen = np.linspace(0, len(shard.images) - 1, max(1, lights + 1 - len(tiles))).round().astype(int)
     tiles += [tone_map(shard.images[number], exposure) for number in chosen]
     return np.concatenate(tiles, axis=1)
 
@@ -97,37 +97,33 @@ def scene_sheet(scenes: Sequence[SceneSpec], folder: Path, count: int = 24) -> I
     Raises:
         InputError: a shard is missing or damaged.
     """
-    places = np.unique(np.linspace(0, len(scenes) - 1, count).round().astype(int))
-    chosen = [scenes[place] for place in places]
-    tiles = [
-        (
-            f"{scene.shape if len(scene.shape) < 20 else scene.shape.split(':')[0]}, {scene.material}"[:60],
-            preview_strip(read_shard(folder / scene.file, scene), lights=3),
-        )
-        for scene in chosen
-    ]
-    return contact_sheet(tiles, columns=3 if len(tiles) > 2 else len(tiles))
+    tiles = []
+    for scene in spread(scenes, count):
+        shape = scene.shape if len(scene.shape) < 20 else scene.shape.split(":")[0]
+        strip = preview_strip(read_shard(folder / scene.file, scene), lights=3)
+        tiles.append((f"{shape}, {scene.material}"[:60], strip))
+    return contact_sheet(tiles, columns=min(3, len(tiles)))
 
 
-def light_plot(truth: np.ndarray, estimate: np.ndarray) -> Figure:
-    """Plot true (circles) and estimated (crosses) light directions on the unit disc, joined by lines."""
-    figure = Figure(figsize=(2.6, 2.6), dpi=100, layout="tight")
-    axes = figure.add_subplot()
-    axes.add_patch(Circle((0, 0), 1, fill=False, color="0.6", lw=0.8))
-    axes.plot(np.stack([truth[:, 0], estimate[:, 0]]), np.stack([truth[:, 1], estimate[:, 1]]), color="0.75", lw=0.6)
-    axes.scatter(truth[:, 0], truth[:, 1], s=14, facecolors="none", edgecolors="tab:blue", lw=0.8, label="true")
-    axes.scatter(estimate[:, 0], estimate[:, 1], s=12, c="tab:red", marker="x", lw=0.8, label="estimated")
-    axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal", xticks=[], yticks=[])
-    axes.axis("off")
-    return figure
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """Return up to `count` items, spread evenly over a sequence from its first to its last."""
+    places = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
+    return [items[place] for place in places]
 
 
-def light_intensity_plot(directions: np.ndarray, intensities: np.ndarray) -> Figure:
-    """Plot light directions (L, 3) on the unit disc, coloured by intensity (L,) or (L, 3) over the strongest."""
+def light_plot(directions: np.ndarray, intensities: np.ndarray, truth: np.ndarray | None = None) -> Figure:
+    """Plot light directions (L, 3) on the unit disc, coloured by intensity over the strongest, joined to true ones.
+
+    Args:
+        directions: (L, 3).
+        intensities: (L,) or (L, 3).
+        truth: (L, 3) true directions, or None.
+    """
     grey = intensities if intensities.ndim == 1 else intensities.mean(1)
     figure = Figure(figsize=(3.0, 2.6), dpi=100, layout="tight")
     axes = figure.add_subplot()
-    figure.colorbar(light_disc(axes, directions, grey), ax=axes, shrink=0.7, label="intensity / strongest")
+    points = light_disc(axes, directions, grey, truth)
+    figure.colorbar(points, ax=axes, shrink=0.7, label="intensity / strongest")
     return figure
 
 

@@ -8,6 +8,7 @@ import multiprocessing
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from pipelines.rendering.render_data import planned_scenes
 from pipelines.shared.presets import Preset
@@ -50,13 +51,9 @@ class RenderStream:
         """Start a process at the next scene, unless the stream has been closed meanwhile."""
         config = self._config
         worker = StreamWorkerConfig(
-            scenes=self._scenes,
-            seed=self._seed,
-            start=self._number,
-            count=config.recycle,
-            depth=config.depth,
+            scenes=self._scenes, seed=self._seed, start=self._number, count=config.recycle, depth=config.depth,
             threads=config.threads or max(1, budget.cores() // 2),
-        )
+        )  # fmt: skip
         context = multiprocessing.get_context("spawn")  # a fork would inherit torch and its threads
         with self._lock:
             if self._closed:
@@ -116,14 +113,7 @@ def _end(code: int | None) -> str:
 
 
 def open_streamed(
-    scenes: Sequence[SceneSpec],
-    options: SampleOptions,
-    config: StreamConfig,
-    *,
-    batch: int,
-    pin_memory: bool = False,
-    rank: int = 0,
-    world: int = 1,
+    scenes: Sequence[SceneSpec], options: SampleOptions, config: StreamConfig, *, batch: int, **places: Any
 ) -> StreamedScenes:
     """Return the source of batches that renders the training scenes of a plan; its renderer starts with `batches`.
 
@@ -132,30 +122,19 @@ def open_streamed(
         options: How samples are made of scenes; the seed orders the scenes, too.
         config: How scenes are rendered and kept.
         batch: Samples per batch, of all processes together.
-        pin_memory: Hand out page-locked tensors.
-        rank: Number of this process among those that train together.
-        world: Number of processes that train together.
+        places: Options of `StreamedScenes` about this process and those that train with it.
 
     Raises:
         InputError: no training scene, or what `StreamedScenes` refuses.
     """
     scenes = [scene for scene in scenes if scene.split == "train"]
     return StreamedScenes(
-        scenes,
-        lambda start: RenderStream(scenes, options.seed, start, config),
-        options,
-        batch=batch,
-        window=min(config.window, max(len(scenes), batch)),
-        fresh=config.fresh,
-        pin_memory=pin_memory,
-        rank=rank,
-        world=world,
-    )
+        scenes, lambda start: RenderStream(scenes, options.seed, start, config), options, batch=batch,
+        window=min(config.window, max(len(scenes), batch)), fresh=config.fresh, **places,
+    )  # fmt: skip
 
 
-def streamed(
-    preset: Preset, data: Path, stage: Stage, here: Team, config: StreamConfig | None = None
-) -> StreamedScenes:
+def streamed(preset: Preset, data: Path, stage: Stage, here: Team, config: StreamConfig) -> StreamedScenes:
     """Return the source that renders a preset's training scenes while `stage` learns from them.
 
     Only the plan is written to `data`, and the shards of the scenes held out for validation, if the stage validates.
@@ -174,14 +153,9 @@ def streamed(
         _prepare(preset, data, validate=stage.config.validation_scenes > 0)
     here.wait()
     return open_streamed(
-        read_manifest(data),
-        stage.sample_options(),
-        config or StreamConfig(),
-        batch=stage.config.batch_scenes,
-        pin_memory=here.device.type == "cuda",
-        rank=here.rank,
-        world=here.world,
-    )
+        read_manifest(data), stage.sample_options(), config, batch=stage.config.batch_scenes,
+        pin_memory=here.device.type == "cuda", rank=here.rank, world=here.world,
+    )  # fmt: skip
 
 
 def _prepare(preset: Preset, data: Path, *, validate: bool) -> None:

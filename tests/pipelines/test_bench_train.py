@@ -49,7 +49,7 @@ def test_scenes_are_whole_shards_and_seeded(folder: Path, tmp_path: Path) -> Non
 
 
 def test_normals_of_a_sphere_point_outwards() -> None:
-    normals, mask = ellipsoid(64, np.full(3, 0.9))
+    normals, mask = ellipsoid((64, 64), np.full(3, 0.9))
     places = (np.arange(64) + 0.5) / 32 - 1.0
     np.testing.assert_allclose(normals[..., 0][mask], (np.broadcast_to(places, (64, 64)) / 0.9)[mask], atol=1e-6)
     assert normals[3, 32, 1] > 0.9  # y is up

@@ -9,7 +9,7 @@ import yaml
 
 from pipelines.cli import main
 from pipelines.shared import pictures, presets, scenes
-from pipelines.shared.lists import split_list
+from pipelines.shared.flags import split_list
 from render.records.manifest import read_manifest
 from render.records.shards import file_hash, read_shard
 from render.shared.errors import InputError

@@ -10,15 +10,15 @@ from typing import Any
 
 from PIL import Image
 
-from pipelines.evaluate.evaluation import Evaluation
 from pipelines.evaluate.figures import light_distributions, number_of_classes, number_of_images, per_material, pf14
-from pipelines.evaluate.figures.workbench import Drawn, LeftOut, Workbench
+from pipelines.evaluate.figures.drawn import Drawn, LeftOut
+from pipelines.evaluate.results import tables_text
+from pipelines.evaluate.workbench import Workbench
 from pipelines.report.sections import Section, SectionWriter, save_picture
 from pipelines.shared import presets
-from pipelines.shared.lists import split_list
-from pipelines.shared.text_tables import render_text
+from pipelines.shared.flags import picked, split_list
 from render.shared.config import to_plain
-from render.shared.errors import InputError, unknown
+from render.shared.errors import InputError
 from render.shared.files import atomic_path, read_text, write_json
 from sdps.inference.inference_config import inference_config
 from sdps.methods import pretrained
@@ -58,15 +58,12 @@ def main(args: argparse.Namespace) -> int:
         0, or 1 where a figure was left out.
     """
     preset, out = presets.from_arguments(args)
-    names = split_list(args.figures) or list(FIGURES)
-    for name in names:
-        if name not in FIGURES:
-            raise unknown("figure", name, FIGURES)
+    names = picked("figure", args.figures, FIGURES)
     if args.draws < 1:
         raise InputError(f"--draws must be at least 1, got {args.draws}")
     config = inference_config(preset.test)
     runners = tuple(Runner(item, finder(out), config) for item in wanted_methods(split_list(args.methods), out))
-    bench = Workbench(preset, out, runners, Evaluation(out / "eval"), args.draws)
+    bench = Workbench(preset, out, runners, args.draws)
     left_out = 0
     for name in names:
         try:
@@ -77,8 +74,7 @@ def main(args: argparse.Namespace) -> int:
             continue
         write(name, drawn, bench)
         for table in drawn.tables:
-            sys.stdout.write(render_text(f"\n{table.title}", list(table.header), [list(row) for row in table.rows]))
-            sys.stdout.write(f"{table.note}\n")
+            sys.stdout.write(f"{tables_text([table])}{table.note}\n")
     if left_out == len(names):
         raise InputError("no figure could be made of these methods, shapes and materials")
     sys.stdout.write(f"\n{out / FOLDER / 'results.json'}\n")
@@ -132,17 +128,12 @@ def write(name: str, drawn: Drawn, bench: Workbench) -> None:
 
 
 def _plain(drawn: Drawn, bench: Workbench) -> dict[str, Any]:
-    tables = [{"title": t.title, "header": t.header, "rows": t.rows, "note": t.note} for t in drawn.tables]
     return {
-        "title": drawn.title,
-        "definition": drawn.text,
-        "config": to_plain(bench.config),
-        "draws": bench.draws,
+        "title": drawn.title, "definition": drawn.text, "config": to_plain(bench.config), "draws": bench.draws,
         "methods": {r.method.name: {key: str(file) for key, file in r.files.items()} for r in bench.runners},
-        "charts": [f"{file}.png" for file, _, _ in drawn.charts],
-        "tables": tables,
+        "charts": [f"{file}.png" for file, _, _ in drawn.charts], "tables": to_plain(drawn.tables),
         "values": drawn.values,
-    }
+    }  # fmt: skip
 
 
 def _earlier(path: Path) -> dict[str, Any]:

@@ -3,22 +3,15 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from pipelines.evaluate.figures.workbench import Drawn, LeftOut, Workbench, finds
+from pipelines.evaluate.figures.drawn import Drawn, LeftOut, finds
+from pipelines.evaluate.workbench import Workbench
 from pipelines.report.sections import Table
 from pipelines.shared import charts
+from pipelines.shared.pictures import spread
 from pipelines.shared.text_tables import number
-from render.records.manifest import SceneSpec
-from render.shared.progress import progress_bar
 
 SCENES = 3  # per shape
 COLUMNS = 3  # methods shown; all are in the table
-
-
-def choose(wanted: list[SceneSpec], shape: str, count: int) -> list[SceneSpec]:
-    """Return scenes of a shape, spread evenly over the list."""
-    mine = [scene for scene in wanted if scene.shape == shape]
-    places = np.unique(np.linspace(0, len(mine) - 1, min(count, len(mine))).round().astype(int))
-    return [mine[place] for place in places]
 
 
 def make(bench: Workbench) -> Drawn:
@@ -35,17 +28,15 @@ def make(bench: Workbench) -> Drawn:
     drawings, rows, values = [], [], {}
     shapes = tuple(dict.fromkeys(scene.shape for scene in wanted))
     for shape in shapes:
-        chosen = choose(wanted, shape, min(SCENES, bench.config.pictures))
-        panels = []
-        for scene, item in zip(chosen, bench.objects(chosen, folder, bench.config), strict=True):
-            found = []
-            for runner in progress_bar(runners, desc=f"lights, {scene.id}", unit="map"):
-                found.append((runner.method.name, bench.results(item, [runner])[0]))
-            panels.append((scene, item, found))
-            for name, result in found:
-                angle, gain = (result.scores.get(metric) for metric in ("direction_mae", "intensity_error"))
-                rows.append((shape, scene.material, name, *("-" if v is None else number(v) for v in (angle, gain))))
-                values[f"{scene.id} | {name}"] = {"direction_mae": angle, "intensity_error": gain}
+        chosen = spread([scene for scene in wanted if scene.shape == shape], min(SCENES, bench.config.pictures))
+        panels: dict[str, list] = {}  # scene: its object, and the results of the methods
+        objects = (((scene, item), item) for scene, item in bench.objects(chosen, folder, bench.config))
+        for (scene, item), runner, result in bench.evaluated(objects, runners, len(chosen), f"lights, {shape}"):
+            name = runner.method.name
+            panels.setdefault(scene.material, [item]).append((name, result))
+            angle, gain = (result.scores.get(metric) for metric in ("direction_mae", "intensity_error"))
+            rows.append((shape, scene.material, name, *("-" if v is None else number(v) for v in (angle, gain))))
+            values[f"{scene.id} | {name}"] = {"direction_mae": angle, "intensity_error": gain}
         caption = f"{shape.capitalize()}: lights as (x, y) on the unit disc, coloured by intensity over the highest."
         drawings.append((f"lights-{shape}", caption, _chart(panels)))
     text = (
@@ -65,14 +56,14 @@ def make(bench: Workbench) -> Drawn:
     )
 
 
-def _chart(panels: list) -> Figure:
-    """Draw a row per scene: the true lights, then those of each method."""
-    columns = 1 + min(COLUMNS, len(panels[0][2]))
+def _chart(panels: dict[str, list]) -> Figure:
+    """Draw a row per material: the true lights, then those of each method."""
+    columns = min(1 + COLUMNS, *map(len, panels.values()))
     figure = charts.new_figure(2.5 * columns + 0.6, 2.75 * len(panels))
     grid = figure.subplots(len(panels), columns, squeeze=False)
-    for line, (scene, item, found) in zip(grid, panels, strict=True):
+    for line, (material, (item, *found)) in zip(grid, panels.items(), strict=True):
         points = charts.light_disc(line[0], item.light_directions, item.intensities)
-        line[0].set_title(f"{scene.material}\ntrue lights", fontsize=8)
+        line[0].set_title(f"{material}\ntrue lights", fontsize=8)
         for axes, (name, result) in zip(line[1:], found, strict=False):
             if len(result.light_directions) == 0:
                 axes.axis("off")
@@ -81,8 +72,7 @@ def _chart(panels: list) -> Figure:
                 gains = result.intensities if len(result.intensities) else np.ones(len(result.light_directions))
                 charts.light_disc(axes, result.light_directions, gains, item.light_directions)
             angle = result.scores.get("direction_mae")
-            axes.set_title(
-                charts.short(name) + (f"\n{angle:.1f}° off" if angle is not None else "\nrefused"), fontsize=8
-            )
+            told = "refused" if angle is None else f"{angle:.1f}° off"
+            axes.set_title(f"{charts.short(name)}\n{told}", fontsize=8)
     figure.colorbar(points, ax=grid, shrink=0.6, label="intensity / highest", aspect=30)
     return figure

@@ -13,15 +13,17 @@ from matplotlib.figure import Figure
 
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
-from pipelines.evaluate.figures.workbench import Drawn, LeftOut, Mean, Workbench, mean, paper_row
+from pipelines.evaluate.figures.drawn import Drawn, LeftOut, paper_row
+from pipelines.evaluate.results import Mean, mean
+from pipelines.evaluate.workbench import Workbench
 from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
 from render.planning import light_sets
-from render.shared.progress import progress_bar
 from sdps.core.lighting import LightClasses, azimuth_elevation, unit_direction
 from sdps.core.metrics import angle_degrees
 from sdps.methods.runner import Runner
+from sdps.models.registry import TRUE_LIGHTS
 
 BINS = (2, 4, 6, 10, 18, 30, 36, 60, 90, 180)
 CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
@@ -70,19 +72,21 @@ def make(bench: Workbench) -> Drawn:
         LeftOut: no method that is told the lights.
         InputError: scenes that cannot be rendered or read.
     """
-    runners = bench.calibrated()
+    runners = [runner for runner in bench.runners if runner.method.lights == TRUE_LIGHTS]
     if not runners:
         raise LeftOut("bins needs a method that is told the lights; add psfcn or least-squares to --methods")
     wanted, folder = bench.merltest()
-    found: dict[tuple[str, str, int], list[list]] = {}  # (method, shape, bins): results per corner
-    with progress_bar(total=len(wanted) * len(runners) * (4 * len(BINS) + 1), desc="bins", unit="map") as bar:
-        for scene, item in zip(wanted, bench.objects(wanted, folder, bench.config), strict=True):
-            for count in (_EXACT, *BINS):
-                for place, variant in enumerate(_variants(item, count)):
-                    for runner, result in zip(runners, bench.results(variant, runners), strict=True):
-                        key = (runner.method.name, scene.shape, count)
-                        found.setdefault(key, [[] for _ in CORNERS])[place].append(result)
-                        bar.update()
+    found: dict[tuple[str, str, int], list[list]] = {}  # (method, shape, bins): scores per corner
+    objects = (
+        ((scene.shape, count, place), variant)
+        for scene, item in bench.objects(wanted, folder, bench.config)
+        for count in (_EXACT, *BINS)
+        for place, variant in enumerate(_variants(item, count))
+    )
+    total = len(wanted) * (4 * len(BINS) + 1)
+    for (shape, count, place), runner, result in bench.evaluated(objects, runners, total, "bins"):
+        corners = found.setdefault((runner.method.name, shape, count), [[] for _ in CORNERS])
+        corners[place].append(result.scores)
     errors = {key: _worst([mean(part, "normal_mae") for part in parts if part]) for key, parts in found.items()}
     shapes = tuple(dict.fromkeys(scene.shape for scene in wanted))
     directions = light_sets.load(bench.config.lights)
@@ -154,28 +158,18 @@ def _table(
 
 def _chart(runners: list[Runner], shapes: tuple[str, ...], errors: dict[tuple[str, str, int], Mean]) -> Figure:
     figure = charts.new_figure(8.0, 4.4)
-    axes = figure.add_subplot()
-    x, ends = [*BINS, _INFINITY_AT], []
+    axes, x = figure.add_subplot(), [*BINS, _INFINITY_AT]
+    chart = charts.LineChart(axes)
     for place, runner in enumerate(runners):
         for style, shape in enumerate(shapes):
             y = [errors[runner.method.name, shape, count].value for count in (*BINS, _EXACT)]
-            shade = charts.colour(place)
-            axes.plot(x[:-1], y[:-1], color=shade, ls=charts.LINE_STYLES[style % 4], marker=charts.marker(place), ms=4)
-            axes.plot(x[-2:], y[-2:], color=shade, ls=":", lw=0.8)
-            axes.plot(x[-1:], y[-1:], color=shade, marker=charts.marker(place), ms=5, ls="")
-            ends.append((f"{charts.short(runner.method.name)}, {shape}", y[-1], shade))
-            figure_of_paper = _published(runner, shape)
-            if figure_of_paper is not None:
-                axes.plot(x[-1:], [figure_of_paper], color=charts.PUBLISHED, marker="D", ms=5, ls="", mfc="none")
-                ends.append((f"PS-FCN, {shape}: published", figure_of_paper, charts.PUBLISHED))
+            axes.plot(x[:-1], y[:-1], color=charts.colour(place), ls=charts.LINE_STYLES[style % 4])
+            chart.line(place, f"{charts.short(runner.method.name)}, {shape}", x, y, ls=":", lw=0.8)
+            chart.point(f"PS-FCN, {shape}: published", x[-1], _published(runner, shape))
     axes.axvline(36, color="0.8", lw=0.8)
-    axes.set_xscale("log")
-    axes.set_xticks(x, [*map(str, BINS), "∞"], fontsize=8)
-    axes.minorticks_off()
+    chart.ticks(x, [*map(str, BINS), "∞"])
     axes.set(xlabel="bins of azimuth and of elevation, $K_d$ (∞: true lights)", xlim=(1.8, _INFINITY_AT * 1.08))
     axes.set(ylabel="normals, mean angular error (degrees),\nworst of four deviations")
-    axes.set_ylim(bottom=0)
+    chart.finish()
     axes.text(36, axes.get_ylim()[1], "the paper's 36", fontsize=7, color="0.4", ha="center", va="bottom")
-    charts.tidy(axes)
-    charts.label_ends(axes, ends)
     return figure

@@ -13,11 +13,12 @@ from matplotlib.figure import Figure
 
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
-from pipelines.evaluate.figures.workbench import METRICS, Drawn, Mean, Workbench, finds, mean, paper_row
+from pipelines.evaluate.figures.drawn import METRICS, Drawn, finds, paper_row
+from pipelines.evaluate.results import Mean, mean
+from pipelines.evaluate.workbench import Workbench
 from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
-from render.shared.progress import progress_bar
 from render.shared.seeds import generator
 from sdps.methods.method import Method
 
@@ -41,13 +42,9 @@ def part_of(item: TestObject, count: int, draw: int, places: np.ndarray) -> Test
         return item
     digest = hashlib.sha256(item.digest.encode() + places.astype(np.int64).tobytes()).hexdigest()[:24]
     return replace(
-        item,
-        name=f"{item.name}, {count} images, draw {draw}",
-        digest=digest,
-        load=lambda: item.load()[places],
-        light_directions=item.light_directions[places],
-        intensities=item.intensities[places],
-    )
+        item, name=f"{item.name}, {count} images, draw {draw}", digest=digest, load=lambda: item.load()[places],
+        light_directions=item.light_directions[places], intensities=item.intensities[places],
+    )  # fmt: skip
 
 
 def make(bench: Workbench) -> Drawn:
@@ -58,19 +55,19 @@ def make(bench: Workbench) -> Drawn:
     """
     wanted, folder = bench.merltest()
     chosen = subsets(len(wanted[0].lights), bench.draws, bench.config.seed)
+    objects = (
+        ((scene.shape, count, draw), part_of(item, count, draw, places))
+        for scene, item in bench.objects(wanted, folder, bench.config)
+        for count, draw, places in chosen
+    )
     found: dict[tuple[str, str, int, int], list] = {}
-    with progress_bar(total=len(wanted) * len(chosen) * len(bench.runners), desc="images", unit="map") as bar:
-        for scene, item in zip(wanted, bench.objects(wanted, folder, bench.config), strict=True):
-            for count, draw, places in chosen:
-                results = bench.results(part_of(item, count, draw, places), bench.runners)
-                for runner, result in zip(bench.runners, results, strict=True):
-                    found.setdefault((runner.method.name, scene.shape, count, draw), []).append(result)
-                    bar.update()
+    for key, runner, result in bench.evaluated(objects, bench.runners, len(wanted) * len(chosen), "images"):
+        found.setdefault((runner.method.name, *key), []).append(result.scores)
     points: Points = {}
-    for (method, shape, count, _), results in found.items():
+    for (method, shape, count, _), scores in found.items():
         kept = points.setdefault((method, shape, count), {metric: [] for metric in METRICS})
         for metric in METRICS:
-            kept[metric].append(mean(results, metric))
+            kept[metric].append(mean(scores, metric))
     methods = [runner.method for runner in bench.runners]
     shapes = tuple(dict.fromkeys(scene.shape for scene in wanted))
     counts = tuple(dict.fromkeys(count for count, _, _ in sorted(chosen, key=lambda part: part[0])))
@@ -136,25 +133,19 @@ def _chart(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
     shown = {m: item for m, item in METRICS.items() if any(finds(method, m) for method in methods)}
     figure = charts.new_figure(8.0, 2.9 * len(shown))
     for row, (metric, (title, unit)) in enumerate(shown.items()):
-        axes, ends = figure.add_subplot(len(shown), 1, row + 1), []
+        axes = figure.add_subplot(len(shown), 1, row + 1)
+        chart = charts.LineChart(axes)
         for place, method in enumerate(methods):
             if not finds(method, metric):
                 continue
             drawn = [_average(points[method.name, shape, count][metric]) for count in counts]
             middle, low, high = (np.array(part) for part in list(zip(*drawn, strict=True))[:3])
-            shade = charts.colour(place)
-            axes.fill_between(counts, low, high, color=shade, alpha=0.18, lw=0)
-            axes.plot(counts, middle, color=shade, marker=charts.marker(place), ms=4)
-            ends.append((charts.short(method.name), middle[-1], shade))
-            beside = _published(method, shape, metric)
-            if beside is not None and counts[-1] == 100:
-                axes.plot([100], [beside], color=charts.PUBLISHED, marker="D", ms=6, mfc="none", ls="", zorder=5)
-                ends.append((f"{published.NORMALS[paper_row(method)][0]}, published", beside, charts.PUBLISHED))
-        axes.set_xscale("log", base=2)
-        axes.set_xticks(counts, map(str, counts))
-        axes.minorticks_off()
+            axes.fill_between(counts, low, high, color=charts.colour(place), alpha=0.18, lw=0)
+            chart.line(place, charts.short(method.name), counts, middle)
+            if counts[-1] == 100:
+                paper = published.NORMALS.get(paper_row(method), ("",))[0]
+                chart.point(f"{paper}, published", 100, _published(method, shape, metric))
+        chart.ticks(counts, list(map(str, counts)), base=2)
         axes.set(ylabel=unit, title=f"{title}, {shape}", xlabel="images")
-        axes.set_ylim(bottom=0)
-        charts.tidy(axes)
-        charts.label_ends(axes, ends, gap=0.09)
+        chart.finish(gap=0.09)
     return figure

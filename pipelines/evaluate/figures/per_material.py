@@ -8,14 +8,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
-from pipelines.evaluate.figures.workbench import Drawn, LeftOut, Workbench, paper_row
-from pipelines.evaluate.lit import lit_object
+from pipelines.evaluate.figures.drawn import Drawn, LeftOut, paper_row
+from pipelines.evaluate.workbench import Workbench, lit_object
 from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
 from render.shared.errors import InputError
 from render.shared.files import read_text
-from render.shared.progress import progress_bar
 from sdps.methods.method import Method
 
 SHAPE = "bunny"
@@ -82,14 +81,10 @@ def make(bench: Workbench) -> Drawn:
     wanted, folder = bench.merltest()
     wanted = [scene for scene in wanted if scene.shape == SHAPE]
     found: dict[str, dict[str, list[float]]] = {runner.method.name: {} for runner in runners}
-    with progress_bar(total=len(wanted) * bench.config.repeats * len(runners), desc="materials", unit="map") as bar:
-        for scene in wanted:
-            for repeat in range(bench.config.repeats):
-                results = bench.results(lit_object(scene, folder, bench.config, repeat), runners)
-                for runner, result in zip(runners, results, strict=True):
-                    error = result.scores.get("normal_mae", float("nan"))
-                    found[runner.method.name].setdefault(scene.material, []).append(error)
-                    bar.update()
+    repeats = range(bench.config.repeats)
+    objects = ((s.material, lit_object(s, folder, bench.config, repeat)) for s in wanted for repeat in repeats)
+    for material, runner, result in bench.evaluated(objects, runners, len(wanted) * len(repeats), "materials"):
+        found[runner.method.name].setdefault(material, []).append(result.scores.get("normal_mae", np.nan))
     curves = [_curve(runner.method, found[runner.method.name]) for runner in runners]
     names = [scene.material for scene in wanted]
     reference = published["SDPS_Net"]
@@ -105,15 +100,12 @@ def make(bench: Workbench) -> Drawn:
         charts=(("materials", "Mean angular error of normals per material.", _chart(curves, order, published)),),
         tables=(_summary(curves, published), _hardest(curves, published)),
         values={
-            curve.method: {"rank_correlation": _or_none(curve.rank_correlation(published)[0]), "beside": curve.beside,
+            curve.method: {"rank_correlation": rho if np.isfinite(rho) else None, "beside": curve.beside,
                            "normal_mae": curve.errors}
             for curve in curves
+            for rho in curve.rank_correlation(published)[:1]
         },
     )  # fmt: skip
-
-
-def _or_none(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def _curve(method: Method, errors: dict[str, list[float]]) -> Curve:
@@ -152,24 +144,16 @@ def _hardest(curves: list[Curve], published: dict[str, dict[str, float]]) -> Tab
 
 def _chart(curves: list[Curve], order: list[str], published: dict[str, dict[str, float]]) -> Figure:
     figure = charts.new_figure(max(7.0, 2.6 + 0.105 * len(order)), 5.2)
-    axes, x, ends = figure.add_subplot(), np.arange(len(order)), []
+    axes, x = figure.add_subplot(), np.arange(len(order))
+    chart = charts.LineChart(axes)
     for style, (name, column) in enumerate(published.items()):
         y = [column.get(material, np.nan) for material in order]
         axes.plot(x, y, color=charts.PUBLISHED, lw=1.6 if style == 0 else 0.9, ls=charts.LINE_STYLES[style], zorder=1)
-        ends.append((f"{LABELS[name]}, published", _last(y), "0.35"))
+        chart.end(f"{LABELS[name]}, published", y, "0.35")
     for place, curve in enumerate(curves):
         y = [curve.errors.get(material, np.nan) for material in order]
-        shade = charts.colour(place)
-        axes.plot(x, y, color=shade, marker=charts.marker(place), ms=3.5, lw=0.9, zorder=3)
-        ends.append((charts.short(curve.method), _last(y), shade))
+        chart.line(place, charts.short(curve.method), x, y, ms=3.5, lw=0.9, zorder=3)
     axes.set_xticks(x, order, rotation=90, fontsize=6 if len(order) > 40 else 8)
     axes.set(ylabel="normals, mean angular error (degrees)", xlim=(-0.5, len(order) - 0.5))
-    axes.set_ylim(bottom=0)
-    charts.tidy(axes)
-    charts.label_ends(axes, ends, gap=0.05)
+    chart.finish(gap=0.05)
     return figure
-
-
-def _last(values: list[float]) -> float:
-    """Return the last number that is one."""
-    return next((value for value in reversed(values) if np.isfinite(value)), float("nan"))

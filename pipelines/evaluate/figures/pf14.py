@@ -6,13 +6,15 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from pipelines.evaluate.figures.workbench import METRICS, Drawn, LeftOut, Mean, Workbench, finds, mean, paper_row
+from pipelines.evaluate.figures.drawn import METRICS, Drawn, LeftOut, finds, paper_row
+from pipelines.evaluate.results import Mean, mean
+from pipelines.evaluate.workbench import Workbench
 from pipelines.report.sections import Table
 from pipelines.shared import charts, scenes
+from pipelines.shared.pictures import spread
 from render.materials import library
 from render.planning import light_sets
 from render.planning.plan import material_pool
-from render.shared.progress import progress_bar
 from sdps.methods.method import Method
 from sdps.methods.runner import Runner
 
@@ -64,9 +66,8 @@ def groups(chosen: tuple[str, ...]) -> dict[str, list[str]]:
         raise LeftOut(f"pf14 needs materials of {', '.join(GROUPS[1:])}; add some to test.materials")
     named = [name for name in pool if name.startswith("lambertian:")]
     share = kept / sum(len(kinds[group]) for group in GROUPS[1:])
-    spread = albedos()
-    places = np.unique(np.linspace(0, LAMBERTIAN - 1, max(1, round(share * LAMBERTIAN))).round().astype(int))
-    return {"lambertian": named or [spread[place] for place in places]} | {g: m for g, m in found.items() if m}
+    some = spread(albedos(), max(1, round(share * LAMBERTIAN)))
+    return {"lambertian": named or some} | {group: names for group, names in found.items() if names}
 
 
 def make(bench: Workbench) -> Drawn:
@@ -76,7 +77,7 @@ def make(bench: Workbench) -> Drawn:
         LeftOut: no method that finds lights and normals itself, or no material of the groups.
         InputError: scenes that cannot be rendered or read.
     """
-    runners = [r for r in bench.uncalibrated() if r.method.normals and finds(r.method, "direction_mae")]
+    runners = [runner for runner in bench.runners if all(finds(runner.method, metric) for metric in METRICS)]
     if not runners:
         raise LeftOut("pf14 needs methods that find lights and normals; add sdps or pf14 to --methods")
     shape = SHAPE if SHAPE in bench.config.shapes else bench.config.shapes[-1]
@@ -116,13 +117,13 @@ def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[s
     wanted, folder = bench.rendered(config, bench.out / "figures" / scenes.slug(lights))
     group_of = {name: group for group, names in kinds.items() for name in names}
     found: dict[tuple[str, str], list] = {}
-    with progress_bar(total=len(wanted) * len(runners), desc=lights, unit="map") as bar:
-        for scene, item in zip(wanted, bench.objects(wanted, folder, config), strict=True):
-            named = replace(item, name=f"{item.name}, {lights}")
-            for runner, result in zip(runners, bench.results(named, runners), strict=True):
-                found.setdefault((runner.method.name, group_of[scene.material]), []).append(result)
-                bar.update()
-    return {(m, lights, group, metric): mean(r, metric) for (m, group), r in found.items() for metric in METRICS}
+    objects = (
+        (scene.material, replace(item, name=f"{item.name}, {lights}"))
+        for scene, item in bench.objects(wanted, folder, config)
+    )
+    for material, runner, result in bench.evaluated(objects, runners, len(wanted), lights):
+        found.setdefault((runner.method.name, group_of[material]), []).append(result.scores)
+    return {(m, lights, group, metric): mean(s, metric) for (m, group), s in found.items() for metric in METRICS}
 
 
 def published(method: Method, metric: str, group: str, lights: str, shape: str) -> float | None:

@@ -6,7 +6,7 @@ import pytest
 
 from pipelines import cli
 from pipelines.bench import bench_classical
-from pipelines.evaluate.score_cache import ScoreCache
+from pipelines.evaluate.evaluation import ScoreCache
 
 SMALL = ["--set", "test.shapes=[sphere]", "--set", "test.materials=['lambertian:0.5', red-phenolic]",
          "--set", "test.size=32", "--set", "test.spp=4", "--set", "test.bounces=0"]  # fmt: skip
@@ -60,8 +60,8 @@ def test_scores_outlive_a_torn_line(tmp_path):
     with path.open("a") as handle:
         handle.write('{"identity": "a", "key": ["met')
     cache = ScoreCache(path, "a")
-    assert cache["method", "scene"] == [1.0]
+    assert cache.get(("method", "scene")) == [1.0]
     cache.add(("other", "scene"), 2)
     again = ScoreCache(path, "a")
-    assert again["other", "scene"] == 2 and ("method", "scene") in again
-    assert ("method", "scene") not in ScoreCache(path, "b")
+    assert again.get(("other", "scene")) == 2 and again.get(("method", "scene")) == [1.0]
+    assert ScoreCache(path, "b").get(("method", "scene")) is None

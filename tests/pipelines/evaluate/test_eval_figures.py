@@ -12,16 +12,16 @@ from PIL import Image
 from sdps_scenes import hemisphere_lights, shade, sphere_normals
 
 from pipelines.evaluate import evaluation, published
-from pipelines.evaluate.evaluation import Evaluation, Result
 from pipelines.evaluate.figures import (
+    drawn,
     eval_figures,
-    light_distributions,
     number_of_classes,
     number_of_images,
     per_material,
     pf14,
-    workbench,
 )
+from pipelines.evaluate.results import mean
+from pipelines.evaluate.workbench import Workbench
 from pipelines.report.sections import read_sections
 from pipelines.shared import charts, presets, scenes
 from render.planning import light_sets
@@ -148,7 +148,7 @@ def test_the_groups_of_the_pf14_figure_have_the_published_sizes():
     few = pf14.groups(("red-phenolic", "blue-fabric", "pink-plastic", "chrome"))
     assert [len(names) for names in few.values()] == [1, 1, 1, 1]
     assert pf14.groups(("red-phenolic", "lambertian:0.5"))["lambertian"] == ["lambertian:0.5"]
-    with pytest.raises(workbench.LeftOut, match=r"test\.materials"):
+    with pytest.raises(drawn.LeftOut, match=r"test\.materials"):
         pf14.groups(("chrome",))
 
 
@@ -172,14 +172,14 @@ def test_methods_are_read_and_told_apart(tmp_path):
     found = {m.name: m for m in eval_figures.wanted_methods(["least-squares", "pf14", "pf14"], tmp_path)}
     assert set(found) == {"least-squares, true lights", "pf14"}
     least, maxima = found["least-squares, true lights"], found["pf14"]
-    assert least.lights == "true" and not workbench.finds(least, "direction_mae")
-    assert workbench.finds(maxima, "intensity_error") and workbench.paper_row(maxima) == "PF14"
+    assert least.lights == "true" and not drawn.finds(least, "direction_mae")
+    assert drawn.finds(maxima, "intensity_error") and drawn.paper_row(maxima) == "PF14"
     pair = Method(name="x", lights="shipped:lcnet", normals="shipped:nenet")
-    assert workbench.paper_row(pair) == "B1" and workbench.finds(pair, "direction_mae")
-    assert workbench.paper_row(replace(pair, intensities="true")) == ""
-    assert not workbench.finds(replace(pair, intensities="true"), "intensity_error")
+    assert drawn.paper_row(pair) == "B1" and drawn.finds(pair, "direction_mae")
+    assert drawn.paper_row(replace(pair, intensities="true")) == ""
+    assert not drawn.finds(replace(pair, intensities="true"), "intensity_error")
     blind = Method(name="x", normals="upsfcn")
-    assert workbench.paper_row(blind) == "B9" and not workbench.finds(blind, "direction_mae")
+    assert drawn.paper_row(blind) == "B9" and not drawn.finds(blind, "direction_mae")
     assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "bunny") == 6.9
     assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "sphere") is None
     with pytest.raises(InputError, match="want METHOD, LIGHTS"):
@@ -198,10 +198,10 @@ def test_default_methods_are_those_with_weights(tmp_path, monkeypatch, caplog):
 
 
 def test_a_mean_says_what_failed():
-    results = [Result({"normal_mae": 4.0}), Result({}, reason="too dark"), Result({"normal_mae": 6.0})]
-    found = workbench.mean(results, "normal_mae")
+    scores = [{"normal_mae": 4.0}, {}, {"normal_mae": 6.0}]
+    found = mean(scores, "normal_mae")
     assert found.cell(3.5) == "5.00 (3.50) [1 of 3 failed]" and found.plain() == 5.0
-    nothing = workbench.mean(results[1:2], "normal_mae")
+    nothing = mean(scores[1:2], "normal_mae")
     assert nothing.cell() == "-" and nothing.plain() is None
 
 
@@ -261,9 +261,8 @@ def test_what_cannot_be_drawn_is_left_out(run, caplog):
 def test_materials_need_the_bunny(tmp_path):
     preset = presets.load("smoke", ["test.shapes=[sphere]"])
     runner = Runner(Method(name="constant", normals="constant"), finder(None), InferenceConfig())
-    bench = workbench.Workbench(preset, tmp_path, (runner,), Evaluation(tmp_path))
-    with pytest.raises(workbench.LeftOut, match="bunny"):
+    bench = Workbench(preset, tmp_path, (runner,))
+    with pytest.raises(drawn.LeftOut, match="bunny"):
         per_material.make(bench)
-    with pytest.raises(workbench.LeftOut, match="told the lights"):
+    with pytest.raises(drawn.LeftOut, match="told the lights"):
         number_of_classes.make(bench)
-    assert light_distributions.choose(scenes.test_scenes(preset.test), "sphere", 1)[0].shape == "sphere"

@@ -44,12 +44,15 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_reads_an_object_cropped_and_linear(photos: Path) -> None:
     assert psm_photos.list_objects(photos) == ["hill"]
-    read = psm_photos.read_photos(photos, "hill")
+    read = psm_photos.read_photos(photos, "hill", LIGHTS)
+    images = read.load().opened()
     normals, mask = scenes.hills(80)
     assert read.mask.sum() == mask.sum()
-    assert read.images.shape == (8, *read.mask.shape, 3)
+    assert images.shape == (8, *read.mask.shape, 3)
     truth = scenes.lambertian(normals, mask, LIGHTS, albedo=0.9).images[:, mask]
-    np.testing.assert_allclose(read.images[:, read.mask], np.clip(truth, 0, 1), atol=0.6 / 255)
+    np.testing.assert_allclose(images[:, read.mask], np.clip(truth, 0, 1), atol=0.6 / 255)
+    with pytest.raises(InputError, match="8 images but 7 lights"):
+        psm_photos.read_photos(photos, "hill", LIGHTS[1:])
 
 
 def test_lights_come_from_the_sphere_or_the_file(photos: Path) -> None:
@@ -120,10 +123,10 @@ def test_bad_folders_are_one_line(photos: Path, tmp_path: Path) -> None:
     shutil.copytree(photos, copy)
     (copy / "hill" / "hill.3.tga").write_bytes(b"no picture")
     with pytest.raises(InputError, match=r"hill\.3\.tga: cannot be read"):
-        psm_photos.read_photos(copy, "hill")
+        psm_photos.read_photos(copy, "hill", LIGHTS).load().opened()
     (copy / "hill" / "hill.3.tga").unlink()
     with pytest.raises(InputError, match="without gaps"):
-        psm_photos.read_photos(copy, "hill")
+        psm_photos.read_photos(copy, "hill", LIGHTS)
     (copy / "lights.txt").write_text("8\n0 0 1\n")
     with pytest.raises(InputError, match="want a count"):
         psm_photos.read_lights(copy, "file")

@@ -153,11 +153,11 @@ def test_lights_that_methods_share_are_estimated_once(
     named = [parse(text, find) for text in ("lcnet", "lcnet+nenet", "lcnet+psfcn", "lcnet+least-squares", "true+nenet")]
     named += [replace(named[1], name="two views", light_views=2), combine("lcnet", "nenet", None, "true", find)]
     runners = [Runner(method, find, InferenceConfig()) for method in named]
-    alone = [Evaluation(tmp_path / "alone").result(item, runner) for runner in runners]
+    alone = [Evaluation(tmp_path / "alone").results(item, [runner])[0] for runner in runners]
     asked = []
     whole = Estimator.estimate_lights
     monkeypatch.setattr(Estimator, "estimate_lights", lambda *given: asked.append(given) or whole(*given))
-    together = Evaluation(tmp_path / "together").results(item, runners, [False] * len(runners))
+    together = Evaluation(tmp_path / "together").results(item, runners)
     assert len(asked) == 3  # LCNet, over two views, and with the intensities given
     for one, other in zip(together, alone, strict=True):
         assert one.scores == other.scores
@@ -167,7 +167,7 @@ def test_lights_that_methods_share_are_estimated_once(
 def test_results_are_kept_until_something_changes(tmp_path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     item = hills()
     runner = Runner(parse("least-squares", pretrained.require), pretrained.require, InferenceConfig())
-    first = Evaluation(tmp_path).result(item, runner, keep_normals=True)
+    first = Evaluation(tmp_path).results(item, [runner], ["least-squares, true lights"])[0]
     assert first.scores["normal_mae"] < 10 and first.normals().shape == (40, 40, 3)
 
     def refuse(*_: object) -> None:
@@ -175,12 +175,12 @@ def test_results_are_kept_until_something_changes(tmp_path: Path, runs: Path, mo
 
     with monkeypatch.context() as patched:
         patched.setattr(Runner, "estimate", refuse)
-        again = Evaluation(tmp_path).result(item, runner)
+        again = Evaluation(tmp_path).results(item, [runner])[0]
         assert again.scores == first.scores
         np.testing.assert_array_equal(again.normals(), first.normals())
         changed = TestObject("hills", "2", item.load, item.mask, item.normals, LIGHTS, np.ones(12))
         with pytest.raises(AssertionError, match="ran again"):
-            Evaluation(tmp_path).result(changed, runner)
+            Evaluation(tmp_path).results(changed, [runner])
     find = finder(runs)
     options = ({}, {"read_out": "centre"}, {"light_views": 8}, {"normal_views": 2}, {"margin": None},
                {"precision": "float32" if arithmetic().precision == "bfloat16" else "bfloat16"})  # fmt: skip
@@ -208,7 +208,7 @@ def test_rendered_scenes_are_seen_whole_and_photographs_cut(
     rendered = replace(item, mask=np.pad(item.mask, 44), normals=None, load=lambda: framed)
     for one in (rendered, item):
         for config in (InferenceConfig(), InferenceConfig(margin=4), InferenceConfig(margin=None)):
-            Evaluation(tmp_path / str(one.mask.shape)).result(one, Runner(parse("lcnet", find), find, config))
+            Evaluation(tmp_path / str(one.mask.shape)).results(one, [Runner(parse("lcnet", find), find, config)])
     assert seen == [None, 4, None, 15, 4, None]
     with pytest.raises(InputError, match="margin must be at least 0 pixels, auto, or null"):
         replace(preset.test, margin=-1)
@@ -220,9 +220,9 @@ def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCap
     item = hills()
     dark = TestObject("dark", "1", lambda: np.zeros((12, 40, 40, 3), np.float32), item.mask, item.normals, LIGHTS)
     runner = Runner(Method(name="pf14", normals="pf14"), pretrained.require, InferenceConfig())
-    result = Evaluation(tmp_path).result(dark, runner)
+    result = Evaluation(tmp_path).results(dark, [runner])[0]
     assert result.scores == {} and "black inside the mask" in result.reason
-    assert Evaluation(tmp_path).result(dark, runner).reason == result.reason
+    assert Evaluation(tmp_path).results(dark, [runner])[0].reason == result.reason
     assert evaluation._FORMAT in (tmp_path / "scores.jsonl").read_text()
 
 
@@ -297,13 +297,13 @@ def test_what_is_asked_for_comes_before_what_a_combination_says(runs: Path) -> N
 
 def test_results_of_other_code_are_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     item, runner = hills(), Runner(parse("least-squares", pretrained.require), pretrained.require)
-    Evaluation(tmp_path).result(item, runner)
+    Evaluation(tmp_path).results(item, [runner])
     asked = []
     monkeypatch.setattr(Runner, "estimate", lambda *given: asked.append(given) or constant_estimate(12, item.mask))
-    Evaluation(tmp_path).result(item, runner)
+    Evaluation(tmp_path).results(item, [runner])
     assert not asked
     monkeypatch.setattr(evaluation, "code_identity", lambda: "other code")
-    Evaluation(tmp_path).result(item, runner)
+    Evaluation(tmp_path).results(item, [runner])
     assert len(asked) == 1
 
 

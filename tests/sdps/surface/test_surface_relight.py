@@ -1,7 +1,6 @@
 """Albedo, relit pictures, cast shadows, residuals, and views of the depth."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -190,10 +189,8 @@ def test_the_bench_scores_scenes_and_times_steps(tmp_path, capsys):
     assert row["residual"] < 0.01 and row["shadows"] == {}
     assert found["steps"]["albedo"]["seconds"] > 0
     for step in bench_surface.STEPS:  # all of them, without a process each
-        sent = []
-        config = bench_surface.BenchClassicalConfig(height=32, width=40, lights=12)
-        bench_surface._work(step, config, SimpleNamespace(send=sent.append))
-        assert sent[0]["pixels"] > 500 and sent[0]["seconds"] > 0
+        took = bench_surface._work(step, bench_surface.BenchClassicalConfig(height=32, width=40, lights=12))
+        assert took["pixels"] > 500 and took["seconds"] > 0
     assert "pixels of object, 12 images" in capsys.readouterr().out
     assert main(["bench-surface", str(tmp_path / "nowhere"), *flags]) == 2
     assert main(["bench-surface", "--steps", "albdo"]) == 2
