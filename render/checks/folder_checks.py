@@ -2,7 +2,7 @@
 
 import os
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +66,7 @@ def check_folder(folder: Path, scenes: Sequence[SceneSpec], present: set[str], s
     return findings
 
 
-def _kind(scene: SceneSpec) -> tuple:
+def _kind(scene: SceneSpec) -> tuple[Hashable, ...]:
     """Return what makes a scene a sample of its own; nothing says that imported scenes of one name show one view."""
     imported = scene.id if family(scene.shape) == IMPORTED else ""
     return scene.shape, scene.material, scene.view, scene.lights, scene.size, imported

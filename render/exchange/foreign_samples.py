@@ -65,7 +65,7 @@ class Source:
         Raises:
             InputError: a missing or damaged picture, or one of another size or depth than the others.
         """
-        result, bits = np.empty((len(self.images), *size, 3), np.float32), None
+        result, bits = np.empty((len(self.images), *size, 3), np.float32), 0
         for index, name in enumerate(self.images):
             pixels = read_image(self.folder / name)
             if pixels.shape[:2] != size:

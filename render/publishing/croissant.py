@@ -122,7 +122,7 @@ def describe(folder: Path, text: Description, splits: Sequence[str], files: Mapp
         splits: Splits the manifest has.
         files: {file name: description} of the single files to list, present in the folder; `manifest.jsonl` among them.
     """
-    optional = {"url": text.url, "citeAs": text.cite}
+    optional: dict[str, Any] = {"url": text.url, "citeAs": text.cite}
     if text.creator:
         optional["creator"] = {"@type": "sc:Person", "name": text.creator}
     return {
@@ -201,7 +201,7 @@ def _scene_field(field: FieldSpec) -> dict[str, Any]:
     }
     if field.path:
         source["transform"] = {"jsonPath": field.path}
-    entry = {
+    entry: dict[str, Any] = {
         "@type": "cr:Field",
         "@id": f"scenes/{field.name}",
         "name": field.name,

@@ -101,7 +101,7 @@ def _front_matter(text: Description, counts: Composition) -> str:
     return f"---\n{yaml.safe_dump(values, sort_keys=False)}---\n"
 
 
-def _spelled(values: Mapping) -> str:
+def _spelled(values: Mapping[Any, int]) -> str:
     """Spell counts: the value alone when there is one, else each with its number of scenes."""
     if len(values) == 1:
         return str(next(iter(values)))

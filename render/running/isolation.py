@@ -21,6 +21,7 @@ from typing import Any
 
 from render.planning.chunks import Chunk
 from render.records.ledger import now
+from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 
 TAIL = 12  # lines of a traceback that are kept
@@ -90,7 +91,7 @@ def settle(orders: Orders) -> None:
 class Work:
     """Rendering one chunk, scene by scene, telling the parent what happens."""
 
-    def __init__(self, send: Callable[[tuple], Any], chunk: Chunk, orders: Orders) -> None:
+    def __init__(self, send: Callable[[tuple[Any, ...]], Any], chunk: Chunk, orders: Orders) -> None:
         from render.running import worker
 
         self.send, self.chunk, self.orders = send, chunk, orders
@@ -117,7 +118,7 @@ class Work:
                 break
         return self.sound
 
-    def _view(self, built: Any, group: Collection) -> None:
+    def _view(self, built: Any, group: Collection[SceneSpec]) -> None:
         """Render one view; a material that fails is left out, anything else fails the view."""
         left = [scene.id for scene in group if scene.id in self.chunk.wanted]
         while left and self.sound:

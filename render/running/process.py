@@ -14,7 +14,7 @@ from render.running.isolation import TAIL, Orders
 class Worker:
     """A rendering process and what it is working on."""
 
-    def __init__(self, serve: Callable, orders: Orders) -> None:
+    def __init__(self, serve: Callable[..., None], orders: Orders) -> None:
         context = multiprocessing.get_context("spawn")  # forking would copy the state of a started backend
         self.connection, theirs = context.Pipe()
         self.errors = orders.errors
@@ -45,8 +45,9 @@ class Worker:
 
     def abort(self) -> None:
         """Stop a process that hangs; its fault handler first writes where it hung."""
-        with suppress(OSError):
-            os.kill(self.process.pid, signal.SIGABRT)
+        if self.process.pid is not None:
+            with suppress(OSError):
+                os.kill(self.process.pid, signal.SIGABRT)
         self.process.join(2)
         if self.process.is_alive():
             self.process.kill()

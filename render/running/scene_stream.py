@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from itertools import groupby, islice
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -120,7 +120,7 @@ def serve(connection: Connection, orders: StreamOrders) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    outbox: queue.Queue[tuple | None] = queue.Queue(orders.depth)
+    outbox: queue.Queue[tuple[Any, ...] | None] = queue.Queue(orders.depth)
     sender = threading.Thread(target=_send, args=(connection, outbox), daemon=True)
     sender.start()
     outbox.put(_render(orders, outbox))
@@ -128,7 +128,7 @@ def serve(connection: Connection, orders: StreamOrders) -> None:
     sender.join()
 
 
-def _render(orders: StreamOrders, outbox: queue.Queue) -> tuple:
+def _render(orders: StreamOrders, outbox: queue.Queue[tuple[Any, ...] | None]) -> tuple[str, ...]:
     """Put the ordered scenes into the outbox; return the last message."""
     try:
         import drjit as dr
@@ -148,7 +148,7 @@ def _render(orders: StreamOrders, outbox: queue.Queue) -> tuple:
     return ("end",)
 
 
-def _send(connection: Connection, outbox: queue.Queue) -> None:
+def _send(connection: Connection, outbox: queue.Queue[tuple[Any, ...] | None]) -> None:
     while (message := outbox.get()) is not None:
         try:
             connection.send(message)

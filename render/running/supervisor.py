@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from pathlib import Path
+from typing import Any
 
 from render.backend import variant
 from render.planning import budget
@@ -80,8 +81,8 @@ class RunSummary:
 
     scenes: int
     done: int
-    lines: list[dict]
-    failed: list[dict]
+    lines: list[dict[str, Any]]
+    failed: list[dict[str, Any]]
     skipped: int
     seconds: float
     workers: int
@@ -98,8 +99,8 @@ def render_supervised(
     folder: str | Path,
     options: RunOptions | None = None,
     *,
-    on_shard: Callable[[dict], None] | None = None,
-    serve: Callable = serve,
+    on_shard: Callable[[dict[str, Any]], None] | None = None,
+    serve: Callable[..., None] = serve,
 ) -> RunSummary:
     """Render every scene that has no whole shard yet and did not fail before; go on after failures.
 
@@ -153,16 +154,16 @@ class _Run:
         options: RunOptions,
         ledger: Ledger,
         errors: Path,
-        serve: Callable,
-        on_shard: Callable[[dict], None] | None,
+        serve: Callable[..., None],
+        on_shard: Callable[[dict[str, Any]], None] | None,
     ) -> None:
         self.folder, self.options, self.ledger = folder, options, ledger
         self.errors, self.serve, self.on_shard = errors, serve, on_shard
         self.total, self.initial = len(scenes), len(scenes) - len(wanted)
         self.wanted = {scene.id: scene for scene in wanted}
         self.attempts = {id: len(rows) for id, rows in found.failed.items()}
-        self.lines: list[dict] = []
-        self.failed: list[dict] = []
+        self.lines: list[dict[str, Any]] = []
+        self.failed: list[dict[str, Any]] = []
         self.workers: list[Worker] = []
         self.started = 0
         choice = variant.choose() if wanted else None
@@ -245,7 +246,7 @@ class _Run:
     def _on_begin(self, worker: Worker, ids: list[str]) -> None:
         worker.current, worker.view_start = list(ids), worker.since
 
-    def _on_done(self, worker: Worker, line: dict) -> None:
+    def _on_done(self, worker: Worker, line: dict[str, Any]) -> None:
         worker.finished(line["id"])
         worker.rendered += 1
         self.lines.append(line)

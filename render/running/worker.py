@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from functools import cache
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 
@@ -57,7 +58,7 @@ class Stages:
         finally:
             self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - start
 
-    def each(self, stage: str, items: Iterator) -> Iterator:
+    def each(self, stage: str, items: Iterator[Any]) -> Iterator[Any]:
         """Iterate over `items`, counting the time they take to appear as `stage`."""
         while True:
             with self.time(stage):
@@ -150,7 +151,7 @@ def group_shards(
     with stages.time("render"):
         surfaces = pack([scene.material for scene in group], built.mesh)
         truth, images = many_lights.render(
-            built, first.view, surfaces, first.light_directions(), size=first.size, spp=first.spp,
+            built, first.view, surfaces, first.light_directions(), size=first.resolution[0], spp=first.spp,
             bounces=first.bounces, seed=first.seed, only=only,
         )  # fmt: skip
     if not truth.mask.any():

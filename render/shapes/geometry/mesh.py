@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -171,7 +172,9 @@ def load_mesh(path: str | Path) -> TriangleMesh:
         raise InputError(f"{path}: cannot be read as a mesh ({reason})") from error
     if not sum(len(part.faces) for part in geometry):
         raise InputError(f"{path}: contains no triangles; export it as a surface mesh")
-    mesh = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in geometry])
+    mesh: Any = trimesh.util.concatenate(
+        [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in geometry]
+    )
     if not np.isfinite(mesh.vertices).all():
         raise InputError(f"{path}: contains vertices that are not finite; repair the file")
     mesh.merge_vertices()
