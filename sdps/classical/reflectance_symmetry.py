@@ -87,8 +87,8 @@ def reflectance_symmetry(
         if lowest > _POOR:
             _log.warning("the highlights keep an energy of %.2f: they are not symmetric, expect large errors", lowest)
         diagnostics |= {"energy": lowest, "energy_of_equal_intensities": energy(start), "evaluations": count}
-    diagnostics["gbr"] = (gbr.mu, gbr.nu, gbr.lam)
-    return conclude(prepared, prepared.factors.transformed(gbr), diagnostics)
+    found = {"gbr": (gbr.mu, gbr.nu, gbr.lam)}
+    return conclude(prepared, prepared.factors.transformed(gbr), diagnostics | found)
 
 
 def highlight_images(prepared: Prepared, views: int) -> tuple[float, np.ndarray]:

@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixe
 from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
 from sdps.inference.inference_config import InferenceConfig
 from sdps.inference.symmetry import SYMMETRIES, KeptView, TurnedView, mean_lights, turned_context
-from sdps.models.base import Lights
+from sdps.models.base import Lights, NormalNetwork
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
 from sdps.models.lighting_variants import LCNetSecond
@@ -86,7 +86,13 @@ class Estimator(InferenceConfig):
     @property
     def needs_lights(self) -> bool:
         """Whether the normal model is told the lights; otherwise it works without a lighting model."""
-        return self.normals.role == "pixels" or self.normals.network.needs_lights
+        model = self._normal_model()
+        return model.role == "pixels" or cast(NormalNetwork, model.network).needs_lights
+
+    def _normal_model(self) -> TrainedModel:
+        if self.normals is None:
+            raise InputError("no normal model was loaded, so only lights can be estimated; load one")
+        return self.normals
 
     @torch.inference_mode()
     def estimate(
@@ -122,8 +128,7 @@ class Estimator(InferenceConfig):
             InputError: sizes that do not fit, non-finite values, an empty mask, lights wanted without a lighting
                 model, or lights found though they are given.
         """
-        if self.normals is None:
-            raise InputError("no normal model was loaded, so only lights can be estimated; load one")
+        model = self._normal_model()
         if self.needs_lights and self.lighting is None and lights is None:
             raise InputError("no lighting model was loaded, so light directions must be given")
         began = time.perf_counter()
@@ -136,12 +141,12 @@ class Estimator(InferenceConfig):
             began -= found.diagnostics["seconds"]
         elif self.lighting is not None and (lights is None or intensities is None):
             lit = self._estimate_lights(scene, known, diagnostics)
-        elif self.needs_lights:
+        elif self.needs_lights and known.directions is not None:
             equal = np.full(len(images), self._mean_intensity(), np.float32)
             lit = self._lights(known.directions, equal if known.intensities is None else known.intensities)
         else:
             lit = None
-        multiple = 1 if self.normals.role == "pixels" else self.normals.network.size_multiple
+        multiple = 1 if model.role == "pixels" else cast(NormalNetwork, model.network).size_multiple
         view = self._view(scene, "normals", known.balance, pad_to(multiple), scene.mask.size, diagnostics)
         normals = np.zeros((*mask.shape, 3), np.float32)
         box = self._normals(view, lit)[0].permute(1, 2, 0).cpu().numpy()  # padded (h, w, 3)
@@ -216,10 +221,9 @@ class Estimator(InferenceConfig):
     ) -> Lights:
         """Return the lights (1, L, ...) that the lighting network in `place` finds, the mean over the views."""
         network = getattr(self, place).network
-        view = self._view(scene, place, None, self._shrink, INPUT_SIZE**2, diagnostics)
+        read = self._view(scene, place, None, self._shrink, INPUT_SIZE**2, diagnostics)
         views = self.light_views or 1
-        if views > 1:
-            view = KeptView(view)
+        view = KeptView(read) if views > 1 else read
         found = []
         for symmetry in SYMMETRIES[:views]:
             turned, extra = TurnedView(view, symmetry), turned_context(symmetry, context)
@@ -229,10 +233,11 @@ class Estimator(InferenceConfig):
 
     def _normals(self, view: View, lights: Lights | None) -> Tensor:
         """Return normals (1, 3, h, w) of a view, the mean over the views it is turned into."""
-        network = self.normals.network
-        if self.normals.role == "pixels":
-            return pixel_normal_map(network, view, lights, self.arithmetic.autocast, rotations=self.rotations)
-        found = []
+        model = self._normal_model()
+        if model.role == "pixels":
+            assert lights is not None
+            return pixel_normal_map(model.network, view, lights, self.arithmetic.autocast, rotations=self.rotations)
+        network, found = cast(NormalNetwork, model.network), []
         for symmetry in SYMMETRIES[: self.normal_views or 1]:
             turned = normal_map(network, TurnedView(view, symmetry), symmetry.lights(lights), self.arithmetic.autocast)
             found.append(symmetry.back.vectors(symmetry.back.images(turned), dim=1))
@@ -259,6 +264,7 @@ class Estimator(InferenceConfig):
 
     def _mean_intensity(self) -> float:
         model = self.lighting if self.normals is None else self.normals
+        assert model is not None
         return float(np.mean(model.augmentation().intensity_range))
 
     def _known(self, lights: np.ndarray | None, intensities: np.ndarray | None) -> _Known:
@@ -306,7 +312,9 @@ def load_estimator(
     """
     device = default_device(device)
     files = {"lighting": lighting, "normals": normals, "second": second}
-    models = {place: None if file is None else load_model(file, device, _ROLES[place]) for place, file in files.items()}
+    models: dict[str, Any] = {
+        place: None if file is None else load_model(file, device, _ROLES[place]) for place, file in files.items()
+    }
     return Estimator(**models, device=device, **options)
 
 
@@ -322,7 +330,8 @@ def load_model(file: str | Path, device: torch.device, role: str | tuple[str, ..
         InputError: the file is missing, damaged, or of a model of another role.
     """
     model = load_weights(file, role)
-    model.network.to(device, memory_format=torch.channels_last)  # a third faster on CPUs
+    # A third faster on CPUs. The stubs of torch lack `memory_format`.
+    model.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model
 
 

@@ -124,7 +124,7 @@ def estimate_normals(
     chunk = (64 if device.type == "cpu" else 2048) if chunk is None else chunk
     if chunk < 1:
         raise InputError(f"chunk must be at least 1 pixel, got {chunk}")
-    lights = torch.from_numpy(lights).to(device)
+    told = torch.from_numpy(lights).to(device)
     normals = np.zeros((*mask.shape, 3), np.float32)
     rows, columns = np.nonzero(mask)
     training = network.training
@@ -137,7 +137,7 @@ def estimate_normals(
                 raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
             values = torch.from_numpy(np.ascontiguousarray(grey)).to(device)
             valid = torch.ones_like(values, dtype=torch.bool)
-            normals[place] = predict_normals(network, values, lights, valid, rotations=rotations).cpu().numpy()
+            normals[place] = predict_normals(network, values, told, valid, rotations=rotations).cpu().numpy()
             if progress is not None:
                 progress(len(grey))
     finally:

@@ -9,7 +9,7 @@ Legend: B scenes, Q lights, P pixels of a scene, N = B P.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,6 +51,7 @@ class PixelStage(NormalStage):
     """
 
     config: PixelTraining
+    network: Any  # a CNNPS, which is no `NormalNetwork`
 
     def __init__(
         self,
@@ -69,6 +70,7 @@ class PixelStage(NormalStage):
         """
         config = self.config
         lights = self.training_lights(batch)
+        assert lights is not None  # a pixel network is always told them
         pixels = draw_pixels(
             batch, lights, batch.seed.tolist(), count=config.pixels_per_scene, min_lights=config.min_lights
         )
@@ -79,6 +81,7 @@ class PixelStage(NormalStage):
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return loss and normal MAE over an even sample of the object's pixels, each given all lights."""
         lights = self.lights(batch)
+        assert lights is not None  # a pixel network is always told them
         pixels = sample_pixels(batch, lights, VALIDATION_PIXELS)
         rotations = min(self.config.rotations, VALIDATION_ROTATIONS)
         normals = predict_normals(self.network, *pixels[:3], rotations=rotations)
