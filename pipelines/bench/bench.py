@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -87,7 +88,7 @@ RATIOS = {
 }
 
 
-def run(config: BenchConfig) -> dict:
+def run(config: BenchConfig) -> dict[str, Any]:
     """Time the ways of rendering the scene of `config`.
 
     Returns:
@@ -102,7 +103,7 @@ def run(config: BenchConfig) -> dict:
     mi = variant.load()
     import drjit as dr
 
-    found: dict = {}
+    found: dict[str, Any] = {}
     ways = _ways(config, found)
     with progress_bar(total=len(ways) * (config.repeats + 2) + config.path_repeats, unit="run", desc="bench") as bar:
         times = _interleaved(ways, config.repeats, bar)
@@ -124,7 +125,7 @@ def run(config: BenchConfig) -> dict:
     }
 
 
-def _ways(config: BenchConfig, found: dict) -> dict[str, Callable[[], None]]:
+def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], None]]:
     """Return the ways of rendering that are timed in turn, but for `path`."""
     import drjit as dr
 
@@ -135,9 +136,9 @@ def _ways(config: BenchConfig, found: dict) -> dict[str, Callable[[], None]]:
     view, built = View(scale=config.scale), scene.build(shapes.load(config.shape))
     lights = _lights(config, 2 * config.lights)
     one, two, mirror = pack([config.material]), pack([config.material, config.second]), pack([config.mirror])
-    settings = {"size": config.size, "spp": config.spp, "bounces": config.bounces, "seed": config.seed}
+    settings: dict[str, Any] = {"size": config.size, "spp": config.spp, "bounces": config.bounces, "seed": config.seed}
 
-    def all_lights(surfaces=one, count=config.lights, **changes: int) -> None:
+    def all_lights(surfaces: Any = one, count: int = config.lights, **changes: int) -> None:
         truth, images = many_lights.render(built, view, surfaces, lights[:count], **settings | changes)
         means = [float(image[0].mean()) for _, image in images]
         if surfaces is one and not changes and count == config.lights:
@@ -163,7 +164,7 @@ def _lights(config: BenchConfig, count: int) -> np.ndarray:
     return drawn.astype(np.float32)
 
 
-def _path(config: BenchConfig, found: dict, bar: tqdm) -> float:
+def _path(config: BenchConfig, found: dict[str, Any], bar: "tqdm[Any]") -> float:
     """Time Mitsuba's `path` over all lights of a scene loaded once."""
     from render import shapes
     from render.kernel import reference
@@ -180,7 +181,7 @@ def _path(config: BenchConfig, found: dict, bar: tqdm) -> float:
     return elapsed
 
 
-def _interleaved(ways: dict[str, Callable[[], None]], repeats: int, bar: tqdm) -> dict[str, list[float]]:
+def _interleaved(ways: dict[str, Callable[[], None]], repeats: int, bar: "tqdm[Any]") -> dict[str, list[float]]:
     """Run the ways in turn, so that a change of the machine's load meets all; two rounds warm up."""
     times: dict[str, list[float]] = {name: [] for name in ways}
     for number in range(repeats + 2):
@@ -198,7 +199,7 @@ def _timed(action: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def table(result: dict) -> str:
+def table(result: dict[str, Any]) -> str:
     """Format the result of `run` as Markdown tables with a line about the scene and the machine."""
     config, machine, seconds, spread = (result[key] for key in ("config", "machine", "seconds", "spread"))
     lines = [

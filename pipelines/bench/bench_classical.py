@@ -10,6 +10,7 @@ import sys
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -74,7 +75,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def measure(name: str, config: BenchClassicalConfig) -> dict:
+def measure(name: str, config: BenchClassicalConfig) -> dict[str, Any]:
     """Run a method in a fresh process: seconds, peak_gib, input_gib, pixels, normal_mae, error.
 
     The two sizes are None where the system does not tell them.
@@ -126,7 +127,7 @@ def scene(config: BenchClassicalConfig) -> tuple[np.ndarray, ...]:
     return images, mask, normals.astype(np.float32), lights.astype(np.float32), gains.astype(np.float32)
 
 
-def table(found: dict[str, dict], config: BenchClassicalConfig) -> str:
+def table(found: dict[str, dict[str, Any]], config: BenchClassicalConfig) -> str:
     """Lay the figures out as text, with the limits."""
     base = found.get("least-squares", {}).get("seconds")
     rows = []

@@ -2,15 +2,17 @@
 
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pipelines.shared import presets
 from render.planning import budget
 from render.planning.plan import plan
+from render.records.manifest import SceneSpec
 from render.running.supervisor import RunOptions, RunSummary, render_supervised
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
@@ -19,7 +21,7 @@ _WARM_UP = 12  # views, after which every kernel a run needs has been met
 _VIEWS = 40
 
 
-def run(part: str, scenes: int, out: Path | None) -> tuple[dict, str]:
+def run(part: str, scenes: int, out: Path | None) -> tuple[dict[str, Any], str]:
     """Run one part.
 
     Args:
@@ -33,7 +35,7 @@ def run(part: str, scenes: int, out: Path | None) -> tuple[dict, str]:
     return PARTS[part](scenes, out)
 
 
-def steady_state(_: int, __: Path | None) -> tuple[dict, str]:
+def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
     """Count the kernels compiled while shapes, views, materials and lights change."""
     from render.backend import variant
 
@@ -73,7 +75,7 @@ def steady_state(_: int, __: Path | None) -> tuple[dict, str]:
     )
 
 
-def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
+def memory(scenes: int, out: Path | None) -> tuple[dict[str, Any], str]:
     """Render many small scenes in this process and follow its memory."""
     from render.running import worker
 
@@ -88,7 +90,7 @@ def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
         pairs = zip(range(0, half, 8), range(half, len(planned), 8), strict=False)
         planned = [scene for pair in pairs for first in pair for scene in planned[first : first + 8]][:scenes]
 
-        def record(scene: object) -> None:
+        def record(scene: SceneSpec) -> None:
             sizes.append(_resident())
             (Path(folder) / scene.file).unlink()
 
@@ -107,7 +109,7 @@ def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
     )
 
 
-def workers(_: int, __: Path | None) -> tuple[dict, str]:
+def workers(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
     """Render the same part of the `paper` preset on one core and on all; profile its stages."""
     base = presets.load("paper").data
     whole = sum(base.families.values()) * base.views * base.materials_per_view
@@ -134,7 +136,7 @@ def workers(_: int, __: Path | None) -> tuple[dict, str]:
     return values, "\n".join(lines) + "\n"
 
 
-def _run(planned: list, processes: int, cores: int) -> RunSummary:
+def _run(planned: Sequence[SceneSpec], processes: int, cores: int) -> RunSummary:
     """Render a plan into a temporary folder on the first `cores` of this machine's cores."""
     allowed = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, set(allowed[:cores]))
@@ -170,7 +172,7 @@ def _plot(megabytes: np.ndarray, path: Path) -> None:
         figure.savefig(temporary)
 
 
-PARTS: dict[str, Callable[[int, Path | None], tuple[dict, str]]] = {
+PARTS: dict[str, Callable[[int, Path | None], tuple[dict[str, Any], str]]] = {
     "steady": steady_state,
     "memory": memory,
     "workers": workers,

@@ -12,6 +12,7 @@ import tempfile
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -55,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
     folders = {args.images: photograph(args.out / "photographs", config)}
     if args.many:
         folders[args.many] = repeated(args.out / "many", folders[args.images], args.many)
-    found: dict[str, dict[str, dict]] = {}
+    found: dict[str, dict[str, dict[str, Any]]] = {}
     for kind in kinds():
         with hold(kind):
             found[kind] = {
@@ -99,7 +100,7 @@ def repeated(folder: Path, source: Path, count: int) -> Path:
     return folder
 
 
-def measure(folder: Path, method: str, models: Path | None, config: InferenceConfig) -> dict:
+def measure(folder: Path, method: str, models: Path | None, config: InferenceConfig) -> dict[str, Any]:
     """Infer a folder in a fresh process: seconds per step and in all, peak_gib, pixels, precision, error."""
     return apart(_work, folder, method, models, config)
 
@@ -136,7 +137,7 @@ def _work(folder: Path, method: str, models: Path | None, config: InferenceConfi
     )
 
 
-def table(found: dict[str, dict], config: BenchClassicalConfig, machine: str) -> str:
+def table(found: dict[str, dict[str, Any]], config: BenchClassicalConfig, machine: str) -> str:
     """Lay the figures of one kind of machine out as text, with the limits."""
     rows = []
     for name, item in found.items():

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from sdps.surface.views import strip
 GRAZING, DARK = 0.1, 0.5
 """A pixel is in cast shadow where n . l is over the first, and its radiance under the second times Lambert's."""
 STEPS = ("integrate", "discontinuities", "mesh", ".ply", ".glb", ".obj", "views", "cast shadows", "albedo", "residuals")
-LOW_LIGHT = (0.9, 0.2, 0.3)
+LOW_LIGHT = np.array((0.9, 0.2, 0.3))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
     if wrong is not None:
         raise unknown("step", wrong, STEPS)
     scenes = [(folder, spec) for folder in args.folders for spec in read_manifest(folder)]
-    shapes: dict[str, list[dict]] = {}
+    shapes: dict[str, list[dict[str, Any]]] = {}
     rows = []
     for folder, spec in progress_bar(scenes, desc="score", unit="scene"):
         shard = read_shard(folder / spec.file, spec)
@@ -73,7 +74,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def judge(spec: SceneSpec, shard: Shard) -> dict:
+def judge(spec: SceneSpec, shard: Shard) -> dict[str, Any]:
     """Score depth from least-squares normals; albedo, residuals and cast shadows from the true normals of a scene."""
     images, gains = shard.images.astype(np.float32), np.ones(len(shard.images), np.float32)
     lights, mask = shard.light_directions, shard.mask
@@ -89,7 +90,7 @@ def judge(spec: SceneSpec, shard: Shard) -> dict:
     }
 
 
-def _depth_row(name: str, source: str, shard: Shard, normals: np.ndarray) -> dict:
+def _depth_row(name: str, source: str, shard: Shard, normals: np.ndarray) -> dict[str, Any]:
     """Integrate normals in both ways; errors in pixels after the mean over each component."""
     truth = _true_depth(shard)
     row = {"scene": name, "normals": source, "range": float(np.ptp(truth[shard.mask])),
@@ -142,7 +143,8 @@ def _work(step: str, config: BenchClassicalConfig, results: Connection) -> None:
     images, mask, normals, lights, gains = scene(config)
     if step not in ("albedo", "residuals"):
         images = images[:1]
-    depth = surface = None
+    depth: Any = None
+    surface: Any = None
     if step in ("mesh", "views", "cast shadows", *(name for name in STEPS if name.startswith("."))):
         depth = integrate(normals, mask)
         surface = mesh(depth, normals=normals) if step.startswith(".") else None
@@ -167,7 +169,7 @@ def _work(step: str, config: BenchClassicalConfig, results: Connection) -> None:
     results.send({"seconds": seconds, "before_gib": before, "peak_gib": peak_gib(), "pixels": int(mask.sum())})
 
 
-def _depth_table(depths: Sequence[dict]) -> str:
+def _depth_table(depths: Sequence[dict[str, Any]]) -> str:
     ways = ("plain", "discontinuities")
     body = [
         [row["scene"], row["normals"], f"{row['mae']:.1f}", f"{row['range']:.0f}",
@@ -179,7 +181,7 @@ def _depth_table(depths: Sequence[dict]) -> str:
     return render_text("Depth: mean error in pixels (largest); residual in degrees", header, body, (0, 1)) + "\n"
 
 
-def _picture_table(rows: Sequence[dict]) -> str:
+def _picture_table(rows: Sequence[dict[str, Any]]) -> str:
     body = []
     for row in rows:
         colour = " ".join(f"{value:.3f}" for value in row["albedo"])
@@ -192,7 +194,7 @@ def _picture_table(rows: Sequence[dict]) -> str:
     return render_text("Pictures, from true normals and lights", header, body, (0, 3)) + "\n"
 
 
-def _step_table(found: dict[str, dict], config: BenchClassicalConfig) -> str:
+def _step_table(found: dict[str, dict[str, Any]], config: BenchClassicalConfig) -> str:
     body = []
     for step, item in found.items():
         if "error" in item:

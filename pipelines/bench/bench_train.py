@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -122,7 +123,7 @@ def run(config: BenchTrainConfig) -> dict[str, Any]:
     return result
 
 
-def _apart(function: Callable, *arguments: Any) -> Any:
+def _apart(function: Callable[..., Any], *arguments: Any) -> Any:
     """Call a function in a fresh process, whose memory and compiled kernels are its own."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
@@ -142,7 +143,9 @@ def machine() -> dict[str, Any]:
     for name in ("float32", "bfloat16"):
         left, right = (torch.ones(2048, 2048, dtype=getattr(torch, name)) for _ in range(2))
         left @ right
-        rates[name] = float(np.median([2 * 2048**3 / 1e9 / _timed(lambda a=left, b=right: a @ b)[0] for _ in range(5)]))
+        rates[name] = float(
+            np.median([2 * 2048**3 / 1e9 / _timed(partial(torch.matmul, left, right))[0] for _ in range(5)])
+        )
     return {
         "processor": processor(),
         "precision": chosen.precision,
@@ -216,8 +219,9 @@ def _ways(
             continue
         trainer = make_trainer(replace(training(config, model), **changes), model, folder, scratch / name)
         if name == MUON:
-            trainer.optimiser.step = clock.timed(trainer.optimiser.step)
-        ways[name] = lambda trainer=trainer: trainer.take_step(batch, 0.5)
+            optimiser: Any = trainer.optimiser
+            optimiser.step = clock.timed(optimiser.step)
+        ways[name] = partial(trainer.take_step, batch, 0.5)
     threads = torch.get_num_threads()
     if threads > 1:
 
@@ -264,7 +268,7 @@ def training(config: BenchTrainConfig, model: str) -> "TrainingConfig":
     from sdps.training.training_config import LightingTraining, NormalTraining
 
     lighting = registry.entry(model).role == "lighting"
-    values = {"lights": "true"} if registry.entry(model).lights else {}
+    values: dict[str, Any] = {"lights": "true"} if registry.entry(model).lights else {}
     return (LightingTraining if lighting else NormalTraining)(
         seed=config.seed, batch_scenes=config.scenes, images=config.images, size=config.size, optimiser="adamw",
         validation_scenes=0, **({} if lighting else values),
@@ -296,6 +300,11 @@ def first_batch(config: BenchTrainConfig, model: str, folder: Path) -> "Batch":
     source = StoredScenes(SceneDataset(folder, "train", options, cache=False), batch=config.scenes)
     batch = next(source.batches(0))
     source.close()
+    return _sound(batch)
+
+
+def _sound(batch: "Batch | InputError") -> "Batch":
+    """Return a batch, or raise what came in its place."""
     if isinstance(batch, InputError):
         raise batch
     return batch
@@ -309,7 +318,7 @@ def plain_loop(model: str, batch: "Batch") -> Callable[[], object]:
     from sdps.models import registry
     from sdps.models.base import Lights
 
-    network = registry.create(model)
+    network: Any = registry.create(model)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-4)
 
     def step() -> float:
@@ -353,11 +362,11 @@ def _waiting(config: BenchTrainConfig, model: str, folder: Path, scratch: Path, 
     batches = trainer.source.batches(0)
     try:
         for _ in range(2 + _SCENES // config.scenes):  # starts the loader, decodes every scene once, warms up
-            trainer.take_step(next(batches), 0.5)
+            trainer.take_step(_sound(next(batches)), 0.5)
         meter, began = Meter(), time.perf_counter()
         while time.perf_counter() - began < config.seconds / 2:
             with meter.waiting():
-                batch = next(batches)
+                batch = _sound(next(batches))
             meter.add(trainer.take_step(batch, 0.5), batch.images.shape[0] * batch.images.shape[1])
         values = meter.summary()
         return {"share": values["waiting_share"], "images_per_second": values["images_per_second"]}

@@ -7,6 +7,7 @@ benchmark"). Every number carries its protocol: bits, crop, mask, images of bear
 import argparse
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from pipelines.benchmarks import published_real, suite
 from pipelines.benchmarks.diligent import OBJECTS, DiligentConfig, diligent_objects
@@ -60,7 +61,7 @@ def main(args: argparse.Namespace) -> int:
 def build_tables(items: Sequence[TestObject], found: suite.Found, chosen: Sequence[Method]) -> list[Table]:
     """Return tables (a), (b) and (c)."""
     names, lights = [item.name for item in items], suite.lighting_only(found, chosen)
-    common = {"present": names, "known": OBJECTS, "note": _PRINTED}
+    common: dict[str, Any] = {"present": names, "known": OBJECTS, "note": _PRINTED}
     tables = [
         object_table("DiLiGenT (a), light directions, degrees", lights, "direction_mae",
                      published=published_real.DILIGENT_DIRECTIONS, digits=2, **common),
@@ -74,7 +75,7 @@ def build_tables(items: Sequence[TestObject], found: suite.Found, chosen: Sequen
 
 def definition(items: Sequence[TestObject], config: DiligentConfig) -> str:
     """Say what the numbers are of."""
-    counts = sorted({len(item.light_directions) for item in items})
+    counts = sorted({len(item.true_directions) for item in items})
     images = " or ".join(str(count) for count in counts)
     own = sum(item.name in OBJECTS for item in items)
     others = f" and {len(items) - own} others" if own < len(items) else ""

@@ -8,6 +8,8 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from pipelines.benchmarks import gourd_apple, light_stage, published_real, suite
 from pipelines.benchmarks.object_tables import object_table
@@ -119,7 +121,7 @@ def _refuse_given(given: Sequence[Method]) -> None:
         raise InputError(f"--methods: {given[0].name} is given the lights, so there is nothing to score")
 
 
-def default_methods(models: object) -> list[Method]:
+def default_methods(models: Path | None) -> list[Method]:
     """Return every method that finds lights, and the paper's pair for its normals."""
     pairs = [method for method in select.every_method(models) if method.paper == "B1" or method.second]
     return [*select.lighting_rows(models), *pairs, *select.classical_rows(calibrated=False)]
@@ -130,7 +132,7 @@ def build_tables(
 ) -> list[Table]:
     """Return the tables of directions and intensities."""
     lights = suite.lighting_only(found, chosen)
-    common = {"present": [item.name for item in items], "known": bench.known}
+    common: dict[str, Any] = {"present": [item.name for item in items], "known": bench.known}
     return [
         object_table(f"{bench.title}, light directions, degrees", lights, "direction_mae",
                      published=bench.directions, digits=2, **common),
@@ -141,7 +143,7 @@ def build_tables(
 
 def definition(bench: Benchmark, items: Sequence[TestObject], args: argparse.Namespace) -> str:
     """Say what the numbers are of."""
-    images = ", ".join(f"{item.name} {len(item.light_directions)}" for item in items)
+    images = ", ".join(f"{item.name} {len(item.true_directions)}" for item in items)
     size = f", crops averaged down to {args.longest_side} pixels" if args.longest_side else ""
     return (
         f"{bench.title}: images of {images}; {bench.about(args)}; cropped to the mask's box with 15 pixels of margin, "

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -127,7 +128,7 @@ def photographed(
     intensities: np.ndarray,
     *,
     files: Sequence[Path],
-    settings: tuple,
+    settings: tuple[Any, ...],
     longest: int,
 ) -> TestObject:
     """Return an object of which the lights are known and the normals are not; its images stay on disk.

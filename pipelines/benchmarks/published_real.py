@@ -5,6 +5,7 @@ DiLiGenT's are means over mask pixels or images, of all 96 images, from 8-bit da
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 from pipelines.benchmarks import diligent, gourd_apple, light_stage
 
@@ -31,7 +32,7 @@ class PublishedRow:
     figures: dict[str, float]
 
 
-def _rows(names: tuple[str, ...], rows: tuple[tuple, ...]) -> tuple[PublishedRow, ...]:
+def _rows(names: tuple[str, ...], rows: tuple[tuple[Any, ...], ...]) -> tuple[PublishedRow, ...]:
     return tuple(
         PublishedRow(method, source, average, dict(zip(names, figures, strict=True)) if figures else {})
         for method, source, average, figures in rows

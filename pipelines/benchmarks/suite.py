@@ -78,14 +78,14 @@ def write(
     })  # fmt: skip
     writer = SectionWriter(section)
     for item in items:
-        writer.strip(f"{item.name}, {len(item.light_directions)} images", tiles(item, found, shown))
+        writer.strip(f"{item.name}, {len(item.true_directions)} images", tiles(item, found, shown))
     writer.write(out)
 
 
 def _about(item: TestObject) -> dict[str, Any]:
     height, width = item.mask.shape
     return {
-        "images": len(item.light_directions), "pixels": int(item.mask.sum()), "height": height, "width": width,
+        "images": len(item.true_directions), "pixels": int(item.mask.sum()), "height": height, "width": width,
         "digest": item.digest,
     }  # fmt: skip
 

@@ -2,10 +2,10 @@
 
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -69,7 +69,7 @@ def render(
     )
 
 
-def _config(folder: Path) -> dict:
+def _config(folder: Path) -> dict[str, Any]:
     """Read the resolved preset, if the folder has one."""
     try:
         return read_yaml(folder / "config.yaml")
@@ -92,7 +92,7 @@ def _facts(scenes: Sequence[SceneSpec], there: Sequence[SceneSpec], counts: Comp
     return "".join(f"<div><b>{html.escape(value)}</b><span>{html.escape(name)}</span></div>" for value, name in pairs)
 
 
-def _size(count: float) -> str:
+def _size(count: float | np.floating) -> str:
     for unit in ("B", "kB", "MB", "GB"):
         if count < 1000:
             return f"{count:.3g} {unit}"
@@ -130,7 +130,7 @@ def _composition(counts: Composition) -> str:
     return _table(["shape family", "scenes", "shapes", "views", "share"], rows) + "<p></p>" + _table(None, shared)
 
 
-def _spelled(values: dict) -> str:
+def _spelled(values: Mapping[Any, int]) -> str:
     """Spell counts: the value alone when there is one, else each with its number of scenes."""
     if len(values) == 1:
         return str(next(iter(values)))

@@ -10,6 +10,7 @@ import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -163,7 +164,7 @@ def build_tables(results: list[SceneScores], lighting: list[Method], normals: li
 
 def results_json(
     results: list[SceneScores], tables: list[Table], preset: Preset, weights: dict[str, str], networks: str
-) -> dict:
+) -> dict[str, Any]:
     """Collect everything a reader needs to judge the numbers."""
     return {
         "definition": definition(preset.test),

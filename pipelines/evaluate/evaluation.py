@@ -52,6 +52,12 @@ class TestObject:
     light_directions: np.ndarray | None = None
     intensities: np.ndarray | None = None
 
+    @property
+    def true_directions(self) -> np.ndarray:
+        """The true directions (L, 3) of an object that has them."""
+        assert self.light_directions is not None, self.name
+        return self.light_directions
+
 
 @dataclass(frozen=True, eq=False)
 class Result:
@@ -110,7 +116,9 @@ class Evaluation:
 
         Its images are read once, and only if they are needed; lights that several methods see alike are estimated once.
         """
-        images, lights, found = None, {}, []
+        images: ImageSource | None = None
+        lights: dict[Any, Any] = {}
+        found = []
         for runner, keep in zip(runners, keep_normals, strict=True):
             key = (runner.method.name, runner.identity(), item.name, item.digest)
             maps = self._maps(key)

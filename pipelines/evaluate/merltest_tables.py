@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -98,7 +99,9 @@ def cell(results: Sequence[SceneScores], shape: str, name: str, metric: str, pap
     return text + (f" [{len(scored) - len(values)} of {len(scored)} failed]" if len(values) < len(scored) else "")
 
 
-def _missing(table: dict[str, tuple], methods: Sequence[Method], shapes: Sequence[str], count: int) -> list[list[str]]:
+def _missing(
+    table: dict[str, tuple[Any, ...]], methods: Sequence[Method], shapes: Sequence[str], count: int
+) -> list[list[str]]:
     """Return a row for each of the paper's that no method fills."""
     filled = {method.paper for method in methods}
     rows = []

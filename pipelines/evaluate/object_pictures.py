@@ -38,7 +38,7 @@ def tiles(item: TestObject, found: Found, shown: Sequence[str]) -> list[tuple[st
                 result.append((text, _fit(pictures.error_map(errors, ERROR_LIMIT))))
         if "direction_mae" in one.scores:
             text = f"{name}: lights, {one.scores['direction_mae']:.1f}° (circles: true)"
-            result.append((text, pictures.light_plot(item.light_directions, one.light_directions)))
+            result.append((text, pictures.light_plot(item.true_directions, one.light_directions)))
     return result
 
 

@@ -88,7 +88,7 @@ def _material_sheet(names: list[str]) -> pictures.Image.Image:
     from render.shapes import load
 
     built = scene.build(load("sphere"))
-    tiles = []
+    tiles: list[tuple[str, np.ndarray]] = []
     for first in range(0, len(names), 16):
         part = names[first : first + 16]
         packed = pack(part, built.mesh)
@@ -110,7 +110,7 @@ def _shape_sheet() -> pictures.Image.Image:
     from render.shapes import load
 
     packed = pack(["lambertian:0.8"])
-    tiles = []
+    tiles: list[tuple[str, np.ndarray]] = []
     for name in _SHAPES:
         view = View(scale=0.98) if name == "bunny" else _TURNED
         _, images = many_lights.render(

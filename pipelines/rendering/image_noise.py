@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -86,7 +87,9 @@ def measure(config: NoiseConfig) -> Iterator[Row]:
                 part = names[first : first + GROUP_SIZE]
                 packed = pack(part, built.mesh)
 
-                def images(spp: int, seed: int, probe: bool, packed=packed, built=built) -> tuple:
+                def images(
+                    spp: int, seed: int, probe: bool, packed: Any = packed, built: Any = built
+                ) -> tuple[Any, list[np.ndarray]]:
                     truth, stacks = many_lights.render(
                         built, View(scale=config.scale), packed, directions.astype(np.float32), size=config.size,
                         spp=spp, bounces=config.bounces, seed=seed, probe=probe,
@@ -152,10 +155,10 @@ def main(args: argparse.Namespace) -> int:
     """Measure, print the summary and the table."""
     given = {name: tuple(split_list(getattr(args, name))) for name in ("shapes", "materials", "spp")}
     try:
-        given["spp"] = tuple(int(count) for count in given["spp"])
+        counts = tuple(int(count) for count in given["spp"])
     except ValueError as error:
         raise InputError(f"--spp: expected whole numbers, got {','.join(given['spp'])}") from error
-    chosen = {name: value for name, value in given.items() if value}
+    chosen: dict[str, Any] = {name: value for name, value in (given | {"spp": counts}).items() if value}
     numbers = {name: getattr(args, name) for name in ("reference", "lights", "size", "bounces", "seed")}
     config = NoiseConfig(**chosen, **numbers)
     rows = list(measure(config))

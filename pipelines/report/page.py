@@ -138,7 +138,7 @@ def _figure(picture: Picture, folder: Path) -> str:
 
 def _curves(out: Path) -> str:
     """Plot the training curves found in a run's folder."""
-    series: dict[str, list] = {key: [] for key, _ in CURVES}
+    series: dict[str, list[tuple[str, np.ndarray, np.ndarray]]] = {key: [] for key, _ in CURVES}
     for path in sorted((out / "models").glob("*/metrics.jsonl")):
         rows, minutes = [], 0.0
         for row in read_jsonl(path):

@@ -22,7 +22,7 @@ def peak_gib() -> float | None:
     return None if peak is None else peak / 2**30
 
 
-def apart(work: Callable[..., None], *arguments: Any) -> dict:
+def apart(work: Callable[..., None], *arguments: Any) -> dict[str, Any]:
     """Return what a function sends from a fresh process, or {"error": ...} where the process died before it did.
 
     Args:

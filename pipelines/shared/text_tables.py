@@ -1,9 +1,9 @@
 """Tables as aligned text."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 
-def render_text(title: str, header: list[str], rows: list[list[str]], left: Collection[int] = (0,)) -> str:
+def render_text(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> str:
     """Lay out a table with aligned columns under its title; columns in `left` are set flush left."""
     widths = [max(len(line[column]) for line in [header, *rows]) for column in range(len(header))]
     lines = [

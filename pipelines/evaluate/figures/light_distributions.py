@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.figures.workbench import Drawn, LeftOut, Workbench, finds
 from pipelines.report.sections import Table
 from pipelines.shared import charts
@@ -65,13 +66,14 @@ def make(bench: Workbench) -> Drawn:
     )
 
 
-def _chart(panels: list) -> Figure:
+def _chart(panels: list[tuple[SceneSpec, TestObject, list[tuple[str, Result]]]]) -> Figure:
     """Draw a row per scene: the true lights, then those of each method."""
     columns = 1 + min(COLUMNS, len(panels[0][2]))
     figure = charts.new_figure(2.5 * columns + 0.6, 2.75 * len(panels))
     grid = figure.subplots(len(panels), columns, squeeze=False)
     for line, (scene, item, found) in zip(grid, panels, strict=True):
-        points = charts.light_disc(line[0], item.light_directions, item.intensities)
+        assert item.intensities is not None, item.name
+        points = charts.light_disc(line[0], item.true_directions, item.intensities)
         line[0].set_title(f"{scene.material}\ntrue lights", fontsize=8)
         for axes, (name, result) in zip(line[1:], found, strict=False):
             if len(result.light_directions) == 0:

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pipelines.evaluate import published
-from pipelines.evaluate.evaluation import TestObject
+from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.figures.workbench import Drawn, LeftOut, Mean, Workbench, mean, paper_row
 from pipelines.report.sections import Table
 from pipelines.shared import charts
@@ -74,7 +74,7 @@ def make(bench: Workbench) -> Drawn:
     if not runners:
         raise LeftOut("bins needs a method that is told the lights; add psfcn or least-squares to --methods")
     wanted, folder = bench.merltest()
-    found: dict[tuple[str, str, int], list[list]] = {}  # (method, shape, bins): results per corner
+    found: dict[tuple[str, str, int], list[list[Result]]] = {}  # (method, shape, bins): results per corner
     with progress_bar(total=len(wanted) * len(runners) * (4 * len(BINS) + 1), desc="bins", unit="map") as bar:
         for scene, item in zip(wanted, bench.objects(wanted, folder, bench.config), strict=True):
             for count in (_EXACT, *BINS):
@@ -113,7 +113,7 @@ def _variants(item: TestObject, count: int) -> list[TestObject]:
     found = []
     for corner in CORNERS:
         name = f"{item.name}, K_d {count} {corner[0]:+d}{corner[1]:+d}"
-        lights = deviated(item.light_directions, count, corner)
+        lights = deviated(item.true_directions, count, corner)
         digest = hashlib.sha256(item.digest.encode() + lights.tobytes()).hexdigest()[:24]
         found.append(replace(item, name=name, digest=digest, light_directions=lights))
     return found

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pipelines.evaluate import published
-from pipelines.evaluate.evaluation import TestObject
+from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.figures.workbench import METRICS, Drawn, Mean, Workbench, finds, mean, paper_row
 from pipelines.report.sections import Table
 from pipelines.shared import charts
@@ -37,16 +37,16 @@ def subsets(total: int, draws: int, seed: int) -> list[tuple[int, int, np.ndarra
 
 def part_of(item: TestObject, count: int, draw: int, places: np.ndarray) -> TestObject:
     """Return an object, whose images are an array, seen in some of them only."""
-    if count == len(item.light_directions):
+    if count == len(item.true_directions):
         return item
     digest = hashlib.sha256(item.digest.encode() + places.astype(np.int64).tobytes()).hexdigest()[:24]
     return replace(
         item,
         name=f"{item.name}, {count} images, draw {draw}",
         digest=digest,
-        load=lambda: item.load()[places],
-        light_directions=item.light_directions[places],
-        intensities=item.intensities[places],
+        load=lambda: np.asarray(item.load())[places],
+        light_directions=item.true_directions[places],
+        intensities=None if item.intensities is None else item.intensities[places],
     )
 
 
@@ -58,7 +58,7 @@ def make(bench: Workbench) -> Drawn:
     """
     wanted, folder = bench.merltest()
     chosen = subsets(len(wanted[0].lights), bench.draws, bench.config.seed)
-    found: dict[tuple[str, str, int, int], list] = {}
+    found: dict[tuple[str, str, int, int], list[Result]] = {}
     with progress_bar(total=len(wanted) * len(chosen) * len(bench.runners), desc="images", unit="map") as bar:
         for scene, item in zip(wanted, bench.objects(wanted, folder, bench.config), strict=True):
             for count, draw, places in chosen:
@@ -102,7 +102,9 @@ def _average(draws: Sequence[Mean]) -> tuple[float, float, float, int]:
     """Return mean, lowest and highest over the draws, and how many objects failed in all of them."""
     values = [item.value for item in draws if np.isfinite(item.value)]
     failed = sum(item.failed for item in draws)
-    return (float(np.mean(values)), min(values), max(values), failed) if values else (*[float("nan")] * 3, failed)
+    if not values:
+        return np.nan, np.nan, np.nan, failed
+    return float(np.mean(values)), min(values), max(values), failed
 
 
 def _published(method: Method, shape: str, metric: str) -> float | None:

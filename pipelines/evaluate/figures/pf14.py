@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
+from pipelines.evaluate.evaluation import Result
 from pipelines.evaluate.figures.workbench import METRICS, Drawn, LeftOut, Mean, Workbench, finds, mean, paper_row
 from pipelines.report.sections import Table
 from pipelines.shared import charts, scenes
@@ -115,7 +116,7 @@ def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[s
     config = replace(bench.config, shapes=(shape,), materials=materials, lights=lights)
     wanted, folder = bench.rendered(config, bench.out / "figures" / scenes.slug(lights))
     group_of = {name: group for group, names in kinds.items() for name in names}
-    found: dict[tuple[str, str], list] = {}
+    found: dict[tuple[str, str], list[Result]] = {}
     with progress_bar(total=len(wanted) * len(runners), desc=lights, unit="map") as bar:
         for scene, item in zip(wanted, bench.objects(wanted, folder, config), strict=True):
             named = replace(item, name=f"{item.name}, {lights}")
