@@ -147,6 +147,7 @@ test-gpu: $(ASSETS_READY)
 lint: $(READY)
 	$(VENV)/bin/ruff check --no-cache .
 	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
 
 bench: OUT = out/bench
 bench: $(ASSETS_READY)

@@ -5,7 +5,7 @@ import importlib
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 from render.shared.errors import InputError, unknown
 
@@ -81,7 +81,7 @@ COMMANDS: dict[str, Command | Group] = {
 class _Parser(argparse.ArgumentParser):
     """An argument parser whose complaints are one line."""
 
-    def error(self, message: str) -> None:
+    def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; see `{self.prog} --help`")
 
 
@@ -107,7 +107,12 @@ def _add_commands(
     wanted = words[0] if words else None
     if wanted is not None and wanted not in commands:
         raise unknown(kind, wanted, commands)
-    parser.set_defaults(run=lambda args: parser.print_help() or 0)
+
+    def show_help(_: argparse.Namespace) -> int:
+        parser.print_help()
+        return 0
+
+    parser.set_defaults(run=show_help)
     children = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
     for name, command in commands.items():
         about = command.about

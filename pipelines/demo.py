@@ -11,12 +11,16 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 from pipelines.shared import presets
 from pipelines.shared.presets import Preset
 from render.shared.config import build, to_plain
 from render.shared.errors import InputError
 from render.shared.files import read_text, write_json
+
+if TYPE_CHECKING:
+    from sdps.training.training_config import NormalTraining
 
 PLAN = "plan.json"
 _TIMED_STEPS = 3
@@ -171,7 +175,8 @@ def make_plan(preset: Preset, rates: dict[str, float]) -> Plan:
     }
     # A scene is 100 images: LCNet sees them in eight views, NENet once, in 16 times the pixels of its crops.
     seconds = 100 * (preset.test.light_views or 1) / rates["lcnet-soft"] / _FORWARD
-    seconds += 100 * (preset.data.size / preset.run("nenet-plus").config.crop) ** 2 / rates["nenet-plus"] / _FORWARD
+    crop = cast("NormalTraining", preset.run("nenet-plus").config).crop
+    seconds += 100 * (preset.data.size / crop) ** 2 / rates["nenet-plus"] / _FORWARD
     for materials, shipped in _EVALUATIONS:
         evaluation = materials * len(preset.test.shapes) * (1 + len(shipped)) * seconds / 60.0
         if evaluation <= _EVALUATION_MINUTES:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from pipelines.report import page as report
 from pipelines.report.sections import Section, SectionWriter, Table
@@ -121,7 +122,11 @@ def _section(result: "Inference") -> SectionWriter:
     exposure = pictures.auto_exposure(lit[None], mask)
     shown = pictures.tone_map(lit, exposure)
     normals = pictures.normal_map(result.normals, mask)
-    tiles = [("a photograph", shown), (f"mask ({photos.mask_origin})", _masked(shown, mask)), ("normals", normals)]
+    tiles: list[tuple[str, np.ndarray | Figure]] = [
+        ("a photograph", shown),
+        (f"mask ({photos.mask_origin})", _masked(shown, mask)),
+        ("normals", normals),
+    ]
     tiles.append(("depth, near is bright", _depth_picture(result)))
     if len(result.light_directions):
         tiles.append(("lights, seen from the camera", pictures.light_plot(result.light_directions, result.gains)))

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -89,7 +90,7 @@ RATIOS = {
 }
 
 
-def run(config: BenchConfig) -> dict:
+def run(config: BenchConfig) -> dict[str, Any]:
     """Time the ways of rendering the scene of `config`.
 
     Returns:
@@ -104,7 +105,7 @@ def run(config: BenchConfig) -> dict:
     mi = variant.load()
     import drjit as dr
 
-    found: dict = {}
+    found: dict[str, Any] = {}
     ways = _ways(config, found)
     with progress_bar(total=len(ways) * (config.repeats + 2) + config.path_repeats, unit="run", desc="bench") as bar:
         times = _interleaved(ways, config.repeats, bar)
@@ -121,7 +122,7 @@ def run(config: BenchConfig) -> dict:
     }  # fmt: skip
 
 
-def _ways(config: BenchConfig, found: dict) -> dict[str, Callable[[], None]]:
+def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], None]]:
     """Return the ways of rendering that are timed in turn, but for `path`."""
     import drjit as dr
 
@@ -132,9 +133,9 @@ def _ways(config: BenchConfig, found: dict) -> dict[str, Callable[[], None]]:
     view, built = View(scale=config.scale), scene.build(shapes.load(config.shape))
     lights = _lights(config, 2 * config.lights)
     one, two, mirror = pack([config.material]), pack([config.material, config.second]), pack([config.mirror])
-    settings = {"size": config.size, "spp": config.spp, "bounces": config.bounces, "seed": config.seed}
+    settings: dict[str, Any] = {"size": config.size, "spp": config.spp, "bounces": config.bounces, "seed": config.seed}
 
-    def all_lights(surfaces=one, count=config.lights, **changes: int) -> None:
+    def all_lights(surfaces: Any = one, count: int = config.lights, **changes: int) -> None:
         truth, images = many_lights.render(built, view, surfaces, lights[:count], **settings | changes)
         means = [float(image[0].mean()) for _, image in images]
         if surfaces is one and not changes and count == config.lights:
@@ -160,7 +161,7 @@ def _lights(config: BenchConfig, count: int) -> np.ndarray:
     return drawn.astype(np.float32)
 
 
-def _path(config: BenchConfig, found: dict, bar: tqdm) -> float:
+def _path(config: BenchConfig, found: dict[str, Any], bar: "tqdm[Any]") -> float:
     """Time Mitsuba's `path` over all lights of a scene loaded once."""
     from render import shapes
     from render.kernel import reference
@@ -177,7 +178,7 @@ def _path(config: BenchConfig, found: dict, bar: tqdm) -> float:
     return elapsed
 
 
-def _interleaved(ways: dict[str, Callable[[], None]], repeats: int, bar: tqdm) -> dict[str, list[float]]:
+def _interleaved(ways: dict[str, Callable[[], None]], repeats: int, bar: "tqdm[Any]") -> dict[str, list[float]]:
     """Run the ways in turn, so that a change of the machine's load meets all; two rounds warm up."""
     times: dict[str, list[float]] = {name: [] for name in ways}
     for number in range(repeats + 2):

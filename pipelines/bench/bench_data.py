@@ -2,9 +2,10 @@
 
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from pipelines.shared.charts import new_figure, tidy
 from pipelines.shared.memory import resident_bytes
 from render.planning import budget
 from render.planning.plan import plan
+from render.records.manifest import SceneSpec
 from render.running.supervisor import RunOptions, RunSummary, render_supervised
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
@@ -61,7 +63,7 @@ def steady_state(_: int, __: Path | None) -> tuple[dict, str]:
     )
 
 
-def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
+def memory(scenes: int, out: Path | None) -> tuple[dict[str, Any], str]:
     """Render many small scenes in this process and follow its memory."""
     from render.running import worker
 
@@ -103,7 +105,7 @@ def memory(scenes: int, out: Path | None) -> tuple[dict, str]:
     )
 
 
-def workers(_: int, __: Path | None) -> tuple[dict, str]:
+def workers(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
     """Render the same part of the `paper` preset on one core and on all; profile its stages."""
     base = presets.load("paper").data
     whole = sum(base.families.values()) * base.views * base.materials_per_view
@@ -130,7 +132,7 @@ def workers(_: int, __: Path | None) -> tuple[dict, str]:
     return values, "\n".join(lines) + "\n"
 
 
-def _run(planned: list, processes: int, cores: int) -> RunSummary:
+def _run(planned: Sequence[SceneSpec], processes: int, cores: int) -> RunSummary:
     """Render a plan into a temporary folder on the first `cores` of this machine's cores."""
     allowed = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, set(allowed[:cores]))

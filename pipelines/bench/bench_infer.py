@@ -49,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
     folders = {args.images: photograph(args.out / "photographs", config)}
     if args.many:
         folders[args.many] = repeated(args.out / "many", folders[args.images], args.many)
-    found: dict[str, dict[str, dict]] = {}
+    found: dict[str, dict[str, dict[str, Any]]] = {}
     for kind in kinds():
         with hold(kind):
             found[kind] = {
@@ -108,7 +108,7 @@ def _work(folder: Path, method: str, models: Path | None, config: InferenceConfi
     }
 
 
-def table(found: dict[str, dict], config: BenchClassicalConfig, machine: str) -> str:
+def table(found: dict[str, dict[str, Any]], config: BenchClassicalConfig, machine: str) -> str:
     """Lay the figures of one kind of machine out as text, with the limits."""
     rows = []
     for name, item in found.items():

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from sdps.surface.views import strip
 GRAZING, DARK = 0.1, 0.5
 """A pixel is in cast shadow where n . l is over the first, and its radiance under the second times Lambert's."""
 STEPS = ("integrate", "discontinuities", "mesh", ".ply", ".glb", ".obj", "views", "cast shadows", "albedo", "residuals")
-LOW_LIGHT = (0.9, 0.2, 0.3)
+LOW_LIGHT = np.array((0.9, 0.2, 0.3))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
     """Score every scene, time every step, print the tables and write bench_surface.json."""
     config, steps = size_from(args), picked("step", args.steps, STEPS)
     scenes = [(folder, spec) for folder in args.folders for spec in read_manifest(folder)]
-    shapes: dict[str, list[dict]] = {}
+    shapes: dict[str, list[dict[str, Any]]] = {}
     rows = []
     for folder, spec in progress_bar(scenes, desc="score", unit="scene"):
         shard = read_shard(folder / spec.file, spec)
@@ -62,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def judge(spec: SceneSpec, shard: Shard) -> dict:
+def judge(spec: SceneSpec, shard: Shard) -> dict[str, Any]:
     """Score depth from least-squares normals; albedo, residuals and cast shadows from the true normals of a scene."""
     images, gains = shard.images.astype(np.float32), np.ones(len(shard.images), np.float32)
     lights, mask = shard.light_directions, shard.mask
@@ -78,7 +79,7 @@ def judge(spec: SceneSpec, shard: Shard) -> dict:
     }
 
 
-def _depth_row(name: str, source: str, shard: Shard, normals: np.ndarray) -> dict:
+def _depth_row(name: str, source: str, shard: Shard, normals: np.ndarray) -> dict[str, Any]:
     """Integrate normals in both ways; errors in pixels after the mean over each component."""
     truth = _true_depth(shard)
     row = {"scene": name, "normals": source, "range": float(np.ptp(truth[shard.mask])),
@@ -151,7 +152,7 @@ def _work(step: str, config: BenchClassicalConfig) -> dict:
     return {"seconds": seconds, "before_gib": before, "peak_gib": peak_gib(), "pixels": int(mask.sum())}
 
 
-def _depth_table(depths: Sequence[dict]) -> str:
+def _depth_table(depths: Sequence[dict[str, Any]]) -> str:
     ways = ("plain", "discontinuities")
     body = [
         [row["scene"], row["normals"], f"{row['mae']:.1f}", f"{row['range']:.0f}",
@@ -163,7 +164,7 @@ def _depth_table(depths: Sequence[dict]) -> str:
     return render_text("Depth: mean error in pixels (largest); residual in degrees", header, body, (0, 1)) + "\n"
 
 
-def _picture_table(rows: Sequence[dict]) -> str:
+def _picture_table(rows: Sequence[dict[str, Any]]) -> str:
     body = []
     for row in rows:
         colour = " ".join(f"{value:.3f}" for value in row["albedo"])
@@ -176,7 +177,7 @@ def _picture_table(rows: Sequence[dict]) -> str:
     return render_text("Pictures, from true normals and lights", header, body, (0, 3)) + "\n"
 
 
-def _step_table(found: dict[str, dict], config: BenchClassicalConfig) -> str:
+def _step_table(found: dict[str, dict[str, Any]], config: BenchClassicalConfig) -> str:
     body = []
     for step, item in found.items():
         more = "-" if item["peak_gib"] is None else f"{1024 * (item['peak_gib'] - item['before_gib']):.0f}"

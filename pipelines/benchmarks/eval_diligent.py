@@ -95,7 +95,7 @@ def main(args: argparse.Namespace) -> int:
 
 def definition(items: Sequence[TestObject], config: DiligentConfig) -> str:
     """Say what the numbers are of."""
-    counts = sorted({len(item.light_directions) for item in items})
+    counts = sorted({len(item.true_directions) for item in items})
     images = " or ".join(str(count) for count in counts)
     own = sum(item.name in OBJECTS for item in items)
     others = f" and {len(items) - own} others" if own < len(items) else ""

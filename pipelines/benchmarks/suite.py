@@ -138,7 +138,7 @@ def build_tables(
 def _about(item: TestObject) -> dict[str, Any]:
     height, width = item.mask.shape
     return {
-        "images": len(item.light_directions), "pixels": int(item.mask.sum()), "height": height, "width": width,
+        "images": len(item.true_directions), "pixels": int(item.mask.sum()), "height": height, "width": width,
         "digest": item.digest,
     }  # fmt: skip
 

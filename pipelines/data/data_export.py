@@ -3,6 +3,7 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import Literal
 
 from render.exchange.layouts import LAYOUTS
 from render.exchange.rules import RuleReport, check_tree
@@ -61,10 +62,10 @@ def main(args: argparse.Namespace) -> int:
     return _report(check_tree(args.out, args.layout, source=args.folder), args.out) if args.check else 0
 
 
-def _exposure(text: str | None) -> float | str | None:
+def _exposure(text: str | None) -> float | Literal["auto"] | None:
     """Read the flag: a number, `auto`, or nothing."""
     try:
-        return text if text in (None, "auto") else float(text)
+        return "auto" if text == "auto" else None if text is None else float(text)
     except ValueError as error:
         raise InputError(f"--exposure {text}: expected a positive number or 'auto'") from error
 

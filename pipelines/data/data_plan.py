@@ -6,6 +6,7 @@ import tempfile
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -88,11 +89,12 @@ def render_sample(scenes: list[SceneSpec], options: RunOptions) -> Sample:
     ids, sampled = {scene.id for scene in scenes}, set(by_id)
     loads = len(cut(scenes, ids, workers)) / len(scenes) / (len(cut(picked, sampled, workers)) / len(picked))
     pace = budget.sampled_pace(_settled(summary.lines, by_id), loads, workers)
+    assert pace is not None  # there are lines
     failures = [line["reason"] for line in summary.failed]
     return Sample(len(views), len(summary.lines), pace, measured, failures)
 
 
-def _settled(lines: list[dict], by_id: dict[str, SceneSpec]) -> list[dict]:
+def _settled(lines: list[dict[str, Any]], by_id: dict[str, SceneSpec]) -> list[dict[str, Any]]:
     """Leave out the first view of every process, which loads libraries and compiles kernels, if others are left."""
     first = {line["worker"]: by_id[line["id"]].seed for line in reversed(lines)}
     return [line for line in lines if by_id[line["id"]].seed != first[line["worker"]]] or lines

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from render.planning import budget
 from render.records import ledger
@@ -32,7 +33,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def status(folder: Path, *, verify: bool = False) -> dict:
+def status(folder: Path, *, verify: bool = False) -> dict[str, Any]:
     """Collect the state of a data folder; plain values, ready for JSON.
 
     Args:
@@ -48,7 +49,7 @@ def status(folder: Path, *, verify: bool = False) -> dict:
     if verify:
         done = ledger.survey(folder, read_manifest(folder), verify=True).done
     else:
-        done = {id for id in ids if id in sizes and lines.get(id, {}).get("bytes", sizes[id]) == sizes[id]}
+        done = frozenset(id for id in ids if id in sizes and lines.get(id, {}).get("bytes", sizes[id]) == sizes[id])
     failed = {id: rows for id, rows in failures.items() if id in set(ids) - done}
     left = len(ids) - len(done) - len(failed)
     used = sum(sizes[id] for id in done)
@@ -90,7 +91,7 @@ def scene_ids(folder: Path) -> list[str]:
     return [scene.id for scene in read_manifest(folder)]  # written by other means
 
 
-def scene_rates(runs: Sequence[Sequence[dict]]) -> dict[str, float | None]:
+def scene_rates(runs: Sequence[Sequence[dict[str, Any]]]) -> dict[str, float | None]:
     """Return scenes per hour over the last scenes and over all, without the time between runs."""
     spans, times = [], []
     for lines in runs:
@@ -117,7 +118,7 @@ def covered(spans: Sequence[tuple[float, float]]) -> float:
     return total
 
 
-def render_text(state: dict) -> str:
+def render_text(state: dict[str, Any]) -> str:
     """Lay out a state for people."""
     lines = [
         f"{state['folder']}: {state['done']:,} of {state['scenes']:,} scenes done, {state['failed']:,} failed, "

@@ -4,17 +4,19 @@ import html
 import io
 import re
 from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
 
 from pipelines.shared.charts import new_figure
 
 _INK, _FILL = "#010203", "#040506"  # replaced by CSS colours
-_STYLE = {
+_STYLE: Any = {
     "svg.fonttype": "none", "svg.hashsalt": "sdps", "font.size": 8, "font.family": "sans-serif",
     "text.color": _INK, "axes.edgecolor": _INK, "axes.labelcolor": _INK, "xtick.color": _INK, "ytick.color": _INK,
     "axes.spines.top": False, "axes.spines.right": False, "figure.facecolor": "none", "axes.facecolor": "none",
@@ -36,7 +38,7 @@ def _svg(figure: Figure, title: str) -> str:
 
 
 def histogram(
-    values: Sequence[float], title: str, *, log: bool = False, bounds: tuple[float, float] | None = None
+    values: Sequence[float] | np.ndarray, title: str, *, log: bool = False, bounds: tuple[float, float] | None = None
 ) -> str:
     """Plot a histogram of at least one value; `log` spaces the bins by factors and drops what is not positive."""
     array = np.asarray(values, np.float64)
@@ -51,9 +53,9 @@ def histogram(
         else:
             low, high = bounds or (array.min(), array.max())
             bins = np.linspace(low, high if high > low else low + 1, 31)
-        axes.hist(array, bins=bins, color=_FILL)
+        axes.hist(array, bins=bins.tolist(), color=_FILL)
         axes.set(xlabel=title, ylabel="number")
-        axes.yaxis.get_major_locator().set_params(integer=True)
+        cast(MaxNLocator, axes.yaxis.get_major_locator()).set_params(integer=True)
         return _svg(figure, title)
 
 
@@ -73,7 +75,7 @@ def bars(counts: dict[str, int], title: str) -> str:
         axes.set_ylim(len(items) - 0.5, -0.5)
         figure.supxlabel(title, fontsize="medium")  # below the names as well, where there is room
         axes.margins(x=0.12)
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        cast(MaxNLocator, axes.xaxis.get_major_locator()).set_params(integer=True)
         return _svg(figure, title)
 
 

@@ -53,6 +53,12 @@ class TestObject:
     light_directions: np.ndarray | None = None
     intensities: np.ndarray | None = None
 
+    @property
+    def true_directions(self) -> np.ndarray:
+        """The true directions (L, 3) of an object that has them."""
+        assert self.light_directions is not None, self.name
+        return self.light_directions
+
 
 @dataclass(frozen=True, eq=False)
 class Result:

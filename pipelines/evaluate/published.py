@@ -3,6 +3,8 @@
 Each row: (row of the paper, model) and its figures on sphere and bunny.
 """
 
+from typing import Any
+
 LIGHTING = {  # (direction in degrees, intensity) on sphere, on bunny
     "A0": ("LCNet", (3.47, 0.082), (5.38, 0.089)),
     "A1": ("LCNet_reg", (4.10, 0.104), (5.46, 0.094)),
@@ -24,7 +26,7 @@ NORMALS = {  # MAE in degrees on sphere, on bunny
 SHAPES = ("sphere", "bunny")
 
 
-def figures(table: dict[str, tuple], row: str, shape: str, count: int = 1) -> tuple[float | None, ...]:
+def figures(table: dict[str, tuple[Any, ...]], row: str, shape: str, count: int = 1) -> tuple[float | None, ...]:
     """Return the paper's `count` figures of a row and shape, None where it has none."""
     if row not in table or shape not in SHAPES:
         return (None,) * count

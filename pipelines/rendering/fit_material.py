@@ -4,8 +4,10 @@ import argparse
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipelines.shared import pictures
@@ -79,7 +81,8 @@ def comparison(table: MerlTable, material: Material) -> Figure:
     """Draw spheres of table and fit side by side under five lights, their difference, and slices through both."""
     figure = Figure(figsize=(10.4, 9.6), dpi=100, layout="constrained")
     figure.suptitle(f"{material.name}: error {material.fit_error:.1%}", fontsize=11)
-    upper, lower = figure.subfigures(2, 1, height_ratios=(2, 1.1))
+    parts: Any = figure.subfigures(2, 1, height_ratios=(2, 1.1))
+    upper, lower = parts
     rows, captions = sphere_images(table, material), ("measured", "fitted", f"difference x {_GAIN}")
     for axes, images, caption in zip(upper.subplots(3, len(_LIGHTS)), rows, captions, strict=True):
         for axis, image, light in zip(axes, images, _LIGHTS, strict=True):
@@ -110,10 +113,10 @@ def sphere_images(table: MerlTable, material: Material) -> list[np.ndarray]:
     return shown
 
 
-def _plot_slice(axis, table: MerlTable, material: Material, theta_d: float) -> None:  # axis: matplotlib Axes
+def _plot_slice(axis: Axes, table: MerlTable, material: Material, theta_d: float) -> None:
     """Plot log BRDF over theta_h at one theta_d and phi_d = 90 degrees: table solid, gaps unmeasured; fit dashed."""
     theta_h = np.linspace(0, np.sqrt(89), 400) ** 2
-    wi, wo = merl.directions(np.radians(theta_h), np.radians(theta_d), np.pi / 2)
+    wi, wo = merl.directions(np.radians(theta_h), np.radians(theta_d), np.asarray(np.pi / 2))
     data, fitted = merl.as_brdf(table)(wi, wo), model.evaluate(material, wi, wo)
     for channel, colour in enumerate(_COLOURS):
         axis.plot(theta_h, np.where(data[:, channel] > 0, data[:, channel], np.nan), color=colour, lw=1.4, alpha=0.6)

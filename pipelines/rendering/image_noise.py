@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -90,7 +91,9 @@ def measure(config: NoiseConfig) -> Iterator[Row]:
                 part = names[first : first + GROUP_SIZE]
                 packed = pack(part, built.mesh)
 
-                def images(spp: int, seed: int, probe: bool, packed=packed, built=built) -> tuple:
+                def images(
+                    spp: int, seed: int, probe: bool, packed: Any = packed, built: Any = built
+                ) -> tuple[Any, list[np.ndarray]]:
                     truth, stacks = many_lights.render(
                         built, View(scale=config.scale), packed, directions.astype(np.float32), size=config.size,
                         spp=spp, bounces=config.bounces, seed=seed, probe=probe,

@@ -136,7 +136,7 @@ def load(name: str, overrides: list[str] | None = None) -> Preset:
     return build(Preset, values)
 
 
-def _apply(values: dict, override: str) -> None:
+def _apply(values: dict[str, Any], override: str) -> None:
     """Set one `section.field=value` (the value is YAML) in a nested mapping."""
     key, equals, text = override.partition("=")
     if not equals or not key:

@@ -26,7 +26,8 @@ def test_scenes(config: TestConfig) -> list[SceneSpec]:
         surfaces.load(name)
     for shape in config.shapes:
         load_shape(shape)
-    directions = tuple(tuple(round(float(c), 6) for c in row) for row in light_sets.load(config.lights))
+    loaded = light_sets.load(config.lights).tolist()
+    directions = tuple((round(x, 6), round(y, 6), round(z, 6)) for x, y, z in loaded)
     scenes = [
         SceneSpec(
             id=f"{slug(shape)}-{slug(material)}",

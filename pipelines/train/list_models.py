@@ -18,13 +18,13 @@ def main(args: argparse.Namespace) -> int:
 
     models = {name: item for name, item in MODELS.items() if args.role in (None, item.role)}
     if args.json:
-        rows = [
+        listed = [
             {"name": name, "role": item.role, "parameters": item.parameters, "paper": item.paper,
              "lights": item.lights, "normals": item.normals, "summary": item.summary,
              "reconstruction": item.reconstruction, "recipe": dict(item.recipe)}
             for name, item in models.items()
         ]  # fmt: skip
-        sys.stdout.write(json.dumps(rows, indent=2) + "\n")
+        sys.stdout.write(json.dumps(listed, indent=2) + "\n")
         return 0
     rows = [
         [name, f"{item.parameters:,}", item.role, item.paper or "-", item.lights or "-", item.summary]

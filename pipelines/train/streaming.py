@@ -40,7 +40,12 @@ class RenderStream:
     """
 
     def __init__(
-        self, scenes: Sequence[SceneSpec], seed: int, start: int, config: StreamConfig, serve: Callable = serve
+        self,
+        scenes: Sequence[SceneSpec],
+        seed: int,
+        start: int,
+        config: StreamConfig,
+        serve: Callable[..., None] = serve,
     ) -> None:
         self._scenes, self._by_id = scenes, {scene.id: scene for scene in scenes}
         self._seed, self._number, self._config, self._serve = seed, start, config, serve
@@ -79,7 +84,7 @@ class RenderStream:
         self._number += 1
         return self._by_id[id], StoredScene(*arrays)
 
-    def _receive(self) -> tuple:
+    def _receive(self) -> tuple[Any, ...]:
         """Wait for the next message of the process."""
         timeout = self._config.timeout
         try:

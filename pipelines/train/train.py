@@ -106,8 +106,9 @@ def document(folder: Path, data: Path, result: "TrainingResult") -> None:
     from sdps.training.trainer import METRICS
 
     write_curves(folder / METRICS, folder / "curves.png")
-    for name, weights in result.weights.items():
-        card = "MODEL_CARD.md" if len(result.weights) == 1 else f"MODEL_CARD-{name}.md"
+    files = result.weights or {}
+    for name, weights in files.items():
+        card = "MODEL_CARD.md" if len(files) == 1 else f"MODEL_CARD-{name}.md"
         write_model_card(folder / card, weights, data)
 
 
@@ -125,5 +126,5 @@ def describe(name: str, result: "TrainingResult") -> str:
     return (
         f"{name}: {result.steps} steps in {result.seconds / 60:.1f} min, "
         f"{100 * result.waiting_share:.1f} % of it waiting for data; validation: {metrics}; "
-        f"{', '.join(str(path) for path in result.weights.values())}\n"
+        f"{', '.join(str(path) for path in (result.weights or {}).values())}\n"
     )

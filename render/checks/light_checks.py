@@ -97,8 +97,8 @@ def unresolved(shard: Shard, limits: Limits) -> Complaints:
 
 def black_images(shard: Shard, limits: Limits) -> Complaints:
     """No image is black on the object though its light faces a good part of it (n.l > 0.3 on 30 % of the mask)."""
-    facing = (shard.normals[shard.mask] @ shard.light_directions.T > 0.3).mean(axis=0) > 0.3  # (L,)
-    black = ~(shard.images[:, shard.mask] > 0).any(axis=(1, 2))
+    facing = np.mean(shard.normals[shard.mask] @ shard.light_directions.T > 0.3, axis=0) > 0.3  # (L,)
+    black = ~np.any(shard.images[:, shard.mask] > 0, axis=(1, 2))
     if black.all():
         yield "every image is black on the object", 2.0
         return

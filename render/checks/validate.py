@@ -158,7 +158,7 @@ def check_one(task: tuple[str, SceneSpec, Limits, str | None]) -> ShardResult:
         scene=scene.id,
         findings=(*findings, *checked),
         statistics=measure(shard, path.stat().st_size) if finite else None,
-        pixels=hashlib.sha256(shard.images).hexdigest(),
+        pixels=hashlib.sha256(shard.images.data).hexdigest(),
         varying=shard.weights is not None,
     )
 
@@ -168,7 +168,7 @@ def _without_remedy(error: InputError, path: Path) -> str:
     return str(error).removeprefix(f"{path}: ").split(";")[0]
 
 
-def _results(tasks: Sequence[tuple], workers: int) -> Iterator[ShardResult]:
+def _results(tasks: Sequence[tuple[str, SceneSpec, Limits, str | None]], workers: int) -> Iterator[ShardResult]:
     """Check the shards here or in several processes, in order."""
     if workers == 1 or len(tasks) < 2:
         yield from map(check_one, tasks)

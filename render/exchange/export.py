@@ -70,7 +70,7 @@ def export(folder: str | Path, out: str | Path, options: ExportOptions, scenes: 
     markers = {scene.id: _marker(root, layout, place, scene) for scene, place in done}
     done = [(scene, place) for scene, place in done if markers[scene.id]]
     layout.lists(root, done)
-    found = {scene.id: _entry(layout, place, markers[scene.id]) for scene, place in done}
+    found = {scene.id: _entry(layout, place, marker) for scene, place in done if (marker := markers[scene.id])}
     write_json(root / RECORD, record | {"scenes": found})
     return ExportReport(written, len(scenes) - written, found)
 

@@ -29,7 +29,7 @@ def silhouette_fit(normals: np.ndarray, mask: np.ndarray) -> tuple[float, float]
     border[:, [0, 1, width - 2, width - 1]] = False
     if border.sum() < _LEAST_BORDER:
         return None
-    blurred = ndimage.gaussian_filter(mask.astype(np.float64), 2.0)
+    blurred: np.ndarray = ndimage.gaussian_filter(mask.astype(np.float64), 2.0)
     rows, columns = np.gradient(blurred)
     outward = np.stack([-columns[border], rows[border]], axis=-1)
     outward /= np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)
@@ -53,7 +53,7 @@ def shading_fit(images: np.ndarray, normals: np.ndarray, mask: np.ndarray, light
         the lights, which removes the albedo.
     """
     rows, columns = np.nonzero(mask)
-    chosen = np.linspace(0, len(rows) - 1, min(len(rows), _PIXELS)).astype(int) if len(rows) else []
+    chosen = np.linspace(0, max(len(rows) - 1, 0), min(len(rows), _PIXELS)).astype(int)
     rows, columns = rows[chosen], columns[chosen]
     grey = np.asarray(images[:, rows, columns], np.float64).mean(-1)  # (L, P)
     grey = grey / np.maximum(grey.mean(0), 1e-9)

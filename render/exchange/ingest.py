@@ -137,7 +137,7 @@ def _scenes(sources: Sequence[Source], boxes: Sequence[Box], options: ImportOpti
                 shape=f"imported:{source.shape}",
                 material=f"imported:{source.material}",
                 view=View(),
-                lights=tuple(tuple(float(c) for c in row) for row in directions.round(8)),
+                lights=tuple((float(x), float(y), float(z)) for x, y, z in directions.round(8)),
                 size=box.height if box.height == box.width else (box.height, box.width),
                 spp=0,
                 bounces=0,
@@ -181,7 +181,7 @@ def _shard(source: Source, box: Box, scene: SceneSpec, options: ImportOptions) -
     images = box.cut(images, 1) / np.float32(exposure or 1.0)
     normals, mask = box.cut(truth.normals), box.cut(truth.mask)
     if options.y_down:
-        normals = normals * np.float32([1.0, -1.0, 1.0])
+        normals = normals * np.array([1.0, -1.0, 1.0], np.float32)
     found = frame.faults(images, normals, mask, scene.light_directions())
     provenance = _provenance(source, truth, box, scene, options, bits, exposure)
     shard = Shard(

@@ -141,7 +141,8 @@ def write_diligent(folder: Path, _final: Path, _place: Place, sample: Sample) ->
     write_png(folder / "Normal_gt.png", encode_normals(sample.normals))
     # In memory first: savemat would leave a full disk's OSError to a destructor.
     buffer = io.BytesIO()
-    savemat(buffer, {"Normal_gt": sample.normals.astype(np.float64)}, do_compression=True)
+    normals = {"Normal_gt": sample.normals.astype(np.float64)}
+    savemat(buffer, normals, do_compression=True)  # type: ignore[arg-type]  # the stubs know of paths alone
     (folder / "Normal_gt.mat").write_bytes(buffer.getvalue())
     # One number per line and none after the last line's end: CNN-PS converts every line to a number.
     numbers = [f"{value:.6f}" if value else "0" for value in sample.normals.ravel().tolist()]

@@ -1,6 +1,7 @@
 """Reading each layout the way its loaders do, and noting what would make them stumble or misread."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,7 +36,7 @@ def _psfcn_samples(root: Path, note: Note) -> Samples:
     for name in ("train_mtrl.txt", "val_mtrl.txt"):
         if not (root / name).is_file():
             note(f"{root / name}: missing; training opens both lists")
-    return [lambda source=source: _psfcn_pictures(source, note) for source in psfcn_sources(root, note)]
+    return [partial(_psfcn_pictures, source, note) for source in psfcn_sources(root, note)]
 
 
 def _psfcn_pictures(source: Source, note: Note) -> Pictures:
@@ -68,7 +69,7 @@ def _check_background(path: Path, coded: np.ndarray, mask: np.ndarray, note: Not
 def _custom_samples(root: Path, note: Note) -> Samples:
     """Check the list of a custom folder."""
     folders = [root / name for name in read_names(root / "objects.txt")]
-    return [lambda folder=folder: _custom_pictures(folder, note) for folder in folders]
+    return [partial(_custom_pictures, folder, note) for folder in folders]
 
 
 def _custom_pictures(folder: Path, note: Note) -> Pictures:
@@ -92,11 +93,11 @@ def _diligent_samples(root: Path, note: Note) -> Samples:
         if not (base / name).is_file():
             note(f"{base / name}: missing; SDPS-Net lists objects and images by it")
     common = read_names(base / "names.txt") if (base / "names.txt").is_file() else None
-    samples = []
+    samples: Samples = []
     for source in diligent_sources(root, note):
         if common is not None and list(source.images) != common:
             note(f"{source.folder / 'filenames.txt'}: differs from {base / 'names.txt'}; name the images alike")
-        samples.append(lambda source=source: _diligent_pictures(source, note))
+        samples.append(partial(_diligent_pictures, source, note))
     return samples
 
 
@@ -117,7 +118,7 @@ def _unips_samples(root: Path, note: Note) -> Samples:
     folders = sorted(root.glob("*.data"), key=lambda path: natural_key(path.name))
     if not folders:
         raise InputError(f"{root}: no <object>.data folder; give the folder that holds them")
-    return [lambda folder=folder: _unips_pictures(folder, note) for folder in folders]
+    return [partial(_unips_pictures, folder, note) for folder in folders]
 
 
 def _unips_pictures(folder: Path, note: Note) -> Pictures:

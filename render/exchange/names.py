@@ -7,7 +7,7 @@ exporting some scenes first and the others later ends in the same tree.
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
 from render.records.manifest import SceneSpec
@@ -60,15 +60,15 @@ def view_places(scenes: Sequence[SceneSpec]) -> dict[str, Place]:
     Such scenes have one normal map; the view's name is what their ids have in common before `-m<number>`, else the
     name of the shape.
     """
-    views: dict[tuple, list[SceneSpec]] = {}
+    views: dict[tuple[Hashable, ...], list[SceneSpec]] = {}
     for scene in scenes:
         # The seed and the samples decide the rounding of the normals, so they are part of what is common.
-        key = (scene.shape, scene.view, scene.size, scene.seed, scene.spp)
+        key: tuple[Hashable, ...] = (scene.shape, scene.view, scene.size, scene.seed, scene.spp)
         if scene.shape.startswith("imported:"):
             key += (scene.id,)  # nothing says that two imported scenes of one name are one view
         views.setdefault(key, []).append(scene)
     shapes = unique_names([_view_name(group) for group in views.values()])
-    places = {}
+    places: dict[str, Place] = {}
     for shape, group in zip(shapes, views.values(), strict=True):
         materials = unique_names([legal_name(scene.material) for scene in group])
         places |= {scene.id: Place(shape, name) for scene, name in zip(group, materials, strict=True)}

@@ -28,7 +28,8 @@ def psfcn_sources(tree: str | Path, note: Note | None = None) -> list[Source]:
     if not any(path.is_file() for path in lists.values()):
         refuse_several(root, "*/train_mtrl.txt", 1)
         raise InputError(f"{root}: no train_mtrl.txt or val_mtrl.txt; give the folder that holds them and Images/")
-    sources, seen = [], {}
+    sources: list[Source] = []
+    seen: dict[str, Path] = {}
     for split, path in lists.items():
         if not path.is_file() or not read_text(path).strip():
             continue

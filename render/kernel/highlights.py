@@ -107,12 +107,14 @@ def find(scene: Any, camera: Any, directions: Any, surfaces: Any, spp: int, seed
     halves = dr.normalize(directions + towards)
     dr.eval(towards, halves)
     candidates = _candidates(scene, towards, halves, normals(spp))
+    if candidates is None:
+        return None
     found = []
     for chosen in _chunks(candidates):
         drawn = _drawn(scene, camera, halves, candidates, chosen, normals(spp), stream(seed, 77 + first))
-        drawn = drawn and _unhidden(scene, camera, directions, towards, drawn, spp)
-        if drawn:
-            found.append(drawn)
+        seen = drawn and _unhidden(scene, camera, directions, towards, drawn, spp)
+        if seen:
+            found.append(seen)
     if not found:
         return None
     # Joined by NumPy: the number of chunks would be in Dr.Jit's code.
@@ -211,10 +213,8 @@ def _share(s: Any) -> Any:
     return (1 - dr.rsqrt(1 + dr.minimum(s, _RIM) * (1 / _CORE))) * (1 / _TAIL)
 
 
-def _chunks(candidates: _Candidates | None) -> Iterator[tuple]:
+def _chunks(candidates: _Candidates) -> Iterator[tuple]:
     """Yield (pair, normal) numbers of all that is to be tried, as UInt32 arrays of bounded length."""
-    if candidates is None:
-        return
     counts = candidates.end - candidates.begin
     total = np.cumsum(counts)
     pair = 0

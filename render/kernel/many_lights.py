@@ -107,7 +107,7 @@ def _averaged(image: np.ndarray, spp: int) -> np.ndarray:
 
 def _ground_truth(passes: list[Paths], size: int, spp: int) -> GroundTruth:
     """Average the passes; a pixel belongs to the mask when at least half of its samples hit the object."""
-    hits = sum(paths.hits for paths in passes).astype(np.float64)
+    hits = np.asarray(sum(paths.hits for paths in passes), np.float64)
     normals = sum(paths.normal_sum for paths in passes)
     depth = sum(paths.depth_sum for paths in passes) / np.maximum(hits, 1)
     length = np.linalg.norm(normals, axis=1)

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ mi = variant.load()
 
 def scene_dict(
     mesh: TriangleMesh, view: View, material: str, size: int, spp: int, bounces: int, shape: str | None = None
-) -> dict:
+) -> dict[str, Any]:
     """Describe the scene for `mi.load_dict`: orthographic camera, box filter, one directional emitter.
 
     The camera stands at +z and looks along -z, which makes image-right +x (see the frame tests).

@@ -52,7 +52,7 @@ class Scene:
         )
 
 
-def build_mesh(mesh: TriangleMesh, bsdf: dict | None = None) -> "mi.Mesh":
+def build_mesh(mesh: TriangleMesh, bsdf: dict[str, Any] | None = None) -> "mi.Mesh":
     """Turn a triangle mesh into a Mitsuba mesh with its vertex normals.
 
     Args:

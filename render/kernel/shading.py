@@ -165,7 +165,7 @@ def _camera_rows(paths: Paths, vertices: Vertices, surfaces: PackedSurfaces, num
     """Return per material of a surface its family, rows, factor S, and S(theta_i) times its weight at the hits."""
     parts, weights = [], vertices.weights[number]
     for k, part in enumerate(surfaces.parts[number]):
-        family, index = surfaces.families[part.family], opaque(mi.UInt32(part.index))
+        family, index = surfaces.families[part.family], opaque(mi.UInt32(part.member))
         scale = family.shadow(index, bsdf.shadow_cell(dr.dot(vertices.normal, wi)))
         if weights is not None:
             scale *= weights[k]

@@ -60,8 +60,8 @@ def probed_visibility(
     tested = dr.compress(probes)
     if len(tested) == 0 or len(tested) == count:
         return visibility(scene, position, normal, facet, directions, lights, True)
-    at = [dr.gather(type(value), value, tested) for value in (position, normal, facet)]
-    lit, facing = _cast(scene, *at, directions, lights, True)
+    at = tuple(dr.gather(type(value), value, tested) for value in (position, normal, facet))
+    lit, facing = _cast(scene, at[0], at[1], at[2], directions, lights, True)
     groups, total = -(-lights // WORD), opaque(mi.UInt32(count))
     bitmask = dr.zeros(mi.UInt32, count * groups)
     lane = dr.arange(mi.UInt32, len(tested) * groups)
@@ -141,7 +141,7 @@ def _complete(
         return bitmask
     asked, target, first, vertex = (dr.gather(mi.UInt32, value, kept) for value in (asked, target, group, vertex))
     first *= WORD
-    start, shading = _start(*at, vertex)
+    start, shading = _start(at[0], at[1], at[2], vertex)
 
     def per_bit(left: Any, bits: Any) -> tuple:
         b = dr.tzcnt(left)

@@ -107,12 +107,12 @@ def _builtin(name: str) -> Material:
 def _lambertian(name: str, value: str) -> Material:
     """Parse `0.5` or `0.8/0.3/0.1`."""
     try:
-        albedo = tuple(float(part) for part in value.split("/"))
+        albedo = [float(part) for part in value.split("/")]
     except ValueError:
-        albedo = ()
+        albedo = []
     if len(albedo) not in (1, 3):
         raise InputError(f"material {name!r}: expected lambertian:0.5 or lambertian:0.8/0.3/0.1")
-    return lambertian(albedo[0] if len(albedo) == 1 else albedo)
+    return lambertian(albedo[0] if len(albedo) == 1 else (albedo[0], albedo[1], albedo[2]))
 
 
 def _user_material(path: str) -> Material:

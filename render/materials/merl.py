@@ -103,7 +103,7 @@ def build(values: np.ndarray, name: str, path: str = "") -> MerlTable:
         InputError: wrong shape, a value that is not finite, or no valid entry.
     """
     values = _checked(values, path or name, np.float32)
-    valid = (values >= 0).all(0)
+    valid = np.all(values >= 0, axis=0)
     if not valid.any():
         raise InputError(f"{path or name}: every entry is negative, which means not measured; fetch the file again")
     return MerlTable(name=name, values=_filled(values, valid), valid=valid, path=path)
@@ -186,7 +186,9 @@ def evaluate(table: MerlTable, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     """
     wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
     at_knots = knots(table.values)
-    value = sum(weight * at_knots[:, row, column, cell] for row, column, cell, weight in _corners(wi, wo))
+    value = sum(
+        (weight * at_knots[:, row, column, cell] for row, column, cell, weight in _corners(wi, wo)), np.zeros(())
+    )
     return np.where(((wi[:, 2] > 0) & (wo[:, 2] > 0))[:, None], value.T, 0.0)
 
 
@@ -194,7 +196,9 @@ def measured(table: MerlTable, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     """Tell for (N, 3) `wi` and `wo` whether `evaluate` there rests on measured entries alone; (N,) bool."""
     wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
     holes = knots((~table.valid).astype(np.float32)) > 0
-    touched = sum((weight > 0) & holes[row, column, cell] for row, column, cell, weight in _corners(wi, wo))
+    touched = sum(
+        ((weight > 0) & holes[row, column, cell] for row, column, cell, weight in _corners(wi, wo)), np.zeros(())
+    )
     return (wi[:, 2] > 0) & (wo[:, 2] > 0) & (touched == 0)
 
 
@@ -216,7 +220,7 @@ def bivariate(table: MerlTable, theta_h: np.ndarray, theta_d: np.ndarray) -> np.
     return (1 - b) * rows[:, :, column] + b * rows[:, :, column + 1]
 
 
-def _corners(wi: np.ndarray, wo: np.ndarray) -> Iterator[tuple]:
+def _corners(wi: np.ndarray, wo: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
     """Yield the knot (row, column, cell of phi_d) and the weight, (N,) each, of the eight about each pair.
 
     No difference vector is formed: with s = wi + wo, tan(theta_d) = |wi - wo| / |s|, and the components of the
@@ -271,7 +275,7 @@ def _checked(values: np.ndarray, where: str, dtype: type) -> np.ndarray:
     if values.shape != (3, *SHAPE):
         raise InputError(f"{where}: values must have the shape {(3, *SHAPE)}, got {values.shape}")
     with np.errstate(over="ignore"):
-        converted = np.array(values, dtype, order="C")
+        converted: np.ndarray = np.array(values, dtype, order="C")
     finite = np.isfinite(converted)
     if not finite.all():
         plane, *entry = (int(k) for k in np.argwhere(~finite)[0])

@@ -11,6 +11,7 @@ import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -130,7 +131,7 @@ def _parse(data: bytes) -> dict[str, np.ndarray]:
     """Read version, table of fields and arrays; struct.error, KeyError or ValueError where the bytes make no sense."""
     position = len(_MAGIC)
 
-    def take(form: str) -> tuple:
+    def take(form: str) -> tuple[Any, ...]:
         nonlocal position
         values = struct.unpack_from(form, data, position)
         position += struct.calcsize(form)
@@ -234,7 +235,9 @@ def write(
     return load(path)
 
 
-def _slice(brdf: Callable, theta: float, side: int) -> tuple[np.ndarray, np.ndarray]:
+def _slice(
+    brdf: Callable[[np.ndarray, np.ndarray], np.ndarray], theta: float, side: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Tabulate one incident angle.
 
     Returns:

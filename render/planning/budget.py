@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
@@ -98,13 +99,13 @@ class Pace:
         return scenes * self.seconds / self.workers
 
 
-def recent_pace(lines: Sequence[dict], workers: int) -> Pace | None:
+def recent_pace(lines: Sequence[dict[str, Any]], workers: int) -> Pace | None:
     """Return the pace of the last `RECENT` ledger lines, or None without any."""
     seconds = [line["seconds"] for line in lines[-RECENT:]]
     return Pace(statistics.median(seconds), workers) if seconds else None
 
 
-def sampled_pace(lines: Sequence[dict], loads: float, workers: int) -> Pace | None:
+def sampled_pace(lines: Sequence[dict[str, Any]], loads: float, workers: int) -> Pace | None:
     """Estimate the pace of a whole run from a sample whose views are spread over many shapes.
 
     Args:
@@ -142,7 +143,7 @@ def available_memory() -> int:
         return pages * os.sysconf("SC_PAGE_SIZE") // 2 if pages > 0 else 4 * WORKER_MEMORY
 
 
-def stage_seconds(lines: Collection[dict]) -> dict[str, float]:
+def stage_seconds(lines: Collection[dict[str, Any]]) -> dict[str, float]:
     """Sum the seconds per stage over ledger lines."""
     total: dict[str, float] = {}
     for line in lines:

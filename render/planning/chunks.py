@@ -1,6 +1,6 @@
 """Cutting a plan into units of work: views that share rays, shapes that share a mesh, shares of a manifest."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -43,7 +43,7 @@ def view_groups(scenes: Sequence[SceneSpec]) -> Iterator[list[SceneSpec]]:
             yield group[first : first + GROUP_SIZE]
 
 
-def _ray_key(scene: SceneSpec) -> tuple:
+def _ray_key(scene: SceneSpec) -> tuple[Hashable, ...]:
     return scene.shape, scene.view, scene.seed, scene.lights, scene.size, scene.spp, scene.bounces
 
 

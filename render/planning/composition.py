@@ -1,9 +1,10 @@
 """What a manifest is made of: counts of shapes, views, materials and categories, and the light directions."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,7 @@ def category(material: str) -> str:
 
 def compose(scenes: Sequence[SceneSpec]) -> Composition:
     """Count what a manifest holds."""
-    per_family: dict[str, list] = {}
+    per_family: dict[str, list[Any]] = {}
     for scene in scenes:
         entry = per_family.setdefault(family(scene.shape), [0, set(), set()])
         entry[0] += 1
@@ -104,9 +105,9 @@ def light_directions(scenes: Sequence[SceneSpec]) -> np.ndarray:  # (N, 3) float
     return np.concatenate([scene.light_directions() for scene in sets.values()])
 
 
-def _view_key(scene: SceneSpec) -> tuple:
+def _view_key(scene: SceneSpec) -> tuple[Hashable, ...]:
     return scene.shape, scene.view, scene.lights
 
 
-def _counted(items: Iterable) -> dict:
+def _counted(items: Iterable[Any]) -> dict[Any, int]:
     return dict(Counter(items).most_common())

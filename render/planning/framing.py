@@ -71,8 +71,8 @@ def rasterise(mesh: TriangleMesh, view: View, cells: int) -> np.ndarray:  # (cel
     return nearest.reshape(cells, cells)
 
 
-def _fill(nearest: np.ndarray, depth: np.ndarray, place: tuple, corners: np.ndarray, faces: np.ndarray, box: tuple,
-          cells: int) -> None:  # fmt: skip
+def _fill(nearest: np.ndarray, depth: np.ndarray, place: tuple[np.ndarray, ...], corners: np.ndarray, faces: np.ndarray,
+          box: tuple[np.ndarray, ...], cells: int) -> None:  # fmt: skip
     """Test the cells in the boxes of some triangles and keep the nearest hits."""
     left, top, width, height = box
     number = np.repeat(np.arange(len(faces)), width * height)
@@ -100,5 +100,5 @@ def _fill(nearest: np.ndarray, depth: np.ndarray, place: tuple, corners: np.ndar
 def tile_view(view: View, row: int, column: int, tiles: int) -> View:
     """Return the view whose frame is tile (row, column), row 0 at the top, of an image of tiles x tiles frames."""
     centre = ((2 * column + 1) / tiles - 1, 1 - (2 * row + 1) / tiles)
-    offset = tuple(round((view.offset[axis] - centre[axis]) * tiles, 6) for axis in range(2))
-    return View(rotation=view.rotation, scale=round(view.scale * tiles, 6), offset=offset)
+    x, y = (round((view.offset[axis] - centre[axis]) * tiles, 6) for axis in range(2))
+    return View(rotation=view.rotation, scale=round(view.scale * tiles, 6), offset=(x, y))

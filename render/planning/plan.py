@@ -184,7 +184,7 @@ def _views(config: DataConfig, family: str, number: int, shape: str) -> list[Vie
     return views
 
 
-def _framed_view(config: DataConfig, family: str, keys: tuple, mesh: Any) -> View | None:
+def _framed_view(config: DataConfig, family: str, keys: tuple[Any, ...], mesh: Any) -> View | None:
     """Draw poses until one, or one of its tiles, shows enough of the shape."""
     from render.planning.framing import measure, tile_view
 
@@ -201,7 +201,9 @@ def _framed_view(config: DataConfig, family: str, keys: tuple, mesh: Any) -> Vie
     return None
 
 
-def _plan_view(config: DataConfig, keys: tuple, shape: str, pose: View, materials: _Materials) -> list[SceneSpec]:
+def _plan_view(
+    config: DataConfig, keys: tuple[Any, ...], shape: str, pose: View, materials: _Materials
+) -> list[SceneSpec]:
     """Draw lights and materials of one view; each from a stream of its own."""
     family, number, view = keys
     directions = light_sets.draw(config.lights, config.light_count, generator(config.seed, *keys, "lights"))
@@ -211,7 +213,7 @@ def _plan_view(config: DataConfig, keys: tuple, shape: str, pose: View, material
     if held_out and materials.unseen:
         drawn = generator(config.seed, *keys, "unseen").permutation(len(materials.unseen))
         surface[1::2] = [materials.unseen[index] for index in np.resize(drawn, len(surface[1::2]))]
-    common = {
+    common: dict[str, Any] = {
         "seed": derived_seed(config.seed, *keys, "sampler"),
         "split": "val" if held_out else "train",
         "shape": shape,
@@ -225,7 +227,7 @@ def _plan_view(config: DataConfig, keys: tuple, shape: str, pose: View, material
     return [SceneSpec(id=f"{name}-m{slot}", material=material, **common) for slot, material in enumerate(surface)]
 
 
-def _surface(config: DataConfig, keys: tuple, materials: _Materials, first: int) -> str:
+def _surface(config: DataConfig, keys: tuple[Any, ...], materials: _Materials, first: int) -> str:
     """Name the surface of a scene: material `first` alone, or mixed with others by a seeded pattern."""
     rng, pool = generator(config.seed, *keys), materials.pool
     if rng.random() >= config.spatially_varying:

@@ -53,7 +53,7 @@ def describe(folder: Path, text: Description, splits: Sequence[str], files: Mapp
         splits: Splits the manifest has.
         files: {file name: description} of the single files to list, present in the folder; `manifest.jsonl` among them.
     """
-    optional = {"url": text.url, "citeAs": text.cite}
+    optional: dict[str, Any] = {"url": text.url, "citeAs": text.cite}
     if text.creator:
         optional["creator"] = {"@type": "sc:Person", "name": text.creator}
     common = read_yaml(str(resources.files("assets") / "croissant.yaml"))

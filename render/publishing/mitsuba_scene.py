@@ -103,7 +103,7 @@ def save(folder: str | Path, spec: SceneSpec, mesh: TriangleMesh | None = None) 
     surface = surfaces.load(spec.material)
     shares = np.zeros((len(mesh.vertices), 0), np.float32)
     if surface.pattern:
-        quarter_pixel = 0.5 / (spec.size * spec.view.scale)
+        quarter_pixel = 0.5 / (spec.resolution[0] * spec.view.scale)
         mesh, shares = pattern_mesh.cut(mesh, _weights(surface.pattern, mesh), quarter_pixel)
     folder = Path(folder)
     if folder.exists() and not (folder / SCENE).is_file() and (not folder.is_dir() or any(folder.iterdir())):
@@ -187,7 +187,9 @@ def _write_mesh(path: Path, mesh: TriangleMesh, shares: np.ndarray) -> None:
     ply = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False)
     for number, share in enumerate(shares.T, start=1):
         ply.vertex_attributes[f"share{number}_0"] = share  # Mitsuba takes the suffix for the channel
-    path.write_bytes(ply.export(file_type="ply", vertex_normal=True))
+    data = ply.export(file_type="ply", vertex_normal=True)
+    assert isinstance(data, bytes), type(data)
+    path.write_bytes(data)
 
 
 def _scene(spec: SceneSpec, bsdf: ET.Element) -> ET.Element:

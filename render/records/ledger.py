@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
+from typing import Any, TextIO
 
 from render.records.manifest import FAILED, SceneSpec, read_events, read_failed
 from render.records.shards import is_whole
@@ -42,7 +43,7 @@ class Ledger:
         host = socket.gethostname().split(".")[0] or "host"
         self.folder = folder
         self.path = folder / LOG / f"done-{host}-{os.getpid()}-{start}.jsonl"
-        self._handle = None
+        self._handle: TextIO | None = None
 
     def __enter__(self) -> "Ledger":
         return self
@@ -51,7 +52,7 @@ class Ledger:
         if self._handle is not None:
             self._handle.close()
 
-    def add(self, line: dict) -> None:
+    def add(self, line: dict[str, Any]) -> None:
         """Append the line of a finished shard: id, spec, bytes, seconds, stages, time, worker."""
         with _writing(self.path):
             if self._handle is None:
@@ -59,7 +60,7 @@ class Ledger:
             self._handle.write(json.dumps(line) + "\n")
             self._handle.flush()
 
-    def fail(self, line: dict) -> None:
+    def fail(self, line: dict[str, Any]) -> None:
         """Append the line of a failure: id, seed, shape, material, reason, traceback, seconds, attempt, time."""
         path = self.folder / FAILED
         # One write each: several machines append to this file.
@@ -77,13 +78,13 @@ def _writing(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); free space") from error
 
 
-def read_runs(folder: Path) -> list[list[dict]]:
+def read_runs(folder: Path) -> list[list[dict[str, Any]]]:
     """Return the ledger lines of every run that finished a shard."""
     runs = (list(read_events(path)) for path in sorted((folder / LOG).glob("done-*.jsonl")))
     return [lines for lines in runs if lines]
 
 
-def latest(runs: Sequence[list[dict]]) -> dict[str, dict]:
+def latest(runs: Sequence[list[dict[str, Any]]]) -> dict[str, dict[str, Any]]:
     """Return the last line of every finished shard by id, in order of time."""
     lines = sorted((line for lines in runs for line in lines), key=lambda line: line["time"])
     return {line["id"]: line for line in lines}
@@ -116,8 +117,8 @@ class Survey:
     """
 
     done: frozenset[str]
-    failed: dict[str, list[dict]]
-    lines: dict[str, dict]
+    failed: dict[str, list[dict[str, Any]]]
+    lines: dict[str, dict[str, Any]]
     size: int
 
 
@@ -142,7 +143,7 @@ def survey(folder: Path, scenes: Sequence[SceneSpec], *, verify: bool = False) -
     return Survey(frozenset(done), failed, listed, sum(sizes[id] for id in done))
 
 
-def sweep(folder: Path, pids: Collection[int] = (), older_than: float = 3600.0) -> None:
+def sweep(folder: Path, pids: Collection[int | None] = (), older_than: float = 3600.0) -> None:
     """Remove half-written shards: those of the given processes, and those that are older than any write takes."""
     limit = datetime.now().timestamp() - older_than
     for path in (folder / SHARDS).glob(".*.tmp.exr"):

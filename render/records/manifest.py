@@ -138,7 +138,7 @@ def no_manifest(folder: Path) -> InputError:
     )
 
 
-def read_events(path: Path) -> Iterator[dict]:
+def read_events(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the whole lines of a ledger, which may be missing, and may be appended to at this moment.
 
     Raises:
@@ -150,9 +150,9 @@ def read_events(path: Path) -> Iterator[dict]:
             yield row
 
 
-def read_failed(folder: Path) -> dict[str, list[dict]]:
+def read_failed(folder: Path) -> dict[str, list[dict[str, Any]]]:
     """Return all recorded failures by scene id, oldest first; some of these scenes may be done by now."""
-    failures: dict[str, list[dict]] = {}
+    failures: dict[str, list[dict[str, Any]]] = {}
     for line in read_events(folder / FAILED):
         failures.setdefault(line["id"], []).append(line)
     return failures
@@ -160,9 +160,10 @@ def read_failed(folder: Path) -> dict[str, list[dict]]:
 
 def _scenes(path: Path) -> Iterator[SceneSpec]:
     """Yield the scenes of a manifest; those of one view, which differ in id and material only, share its values."""
-    last, scene = None, None
+    last: Any = None
+    scene: SceneSpec | None = None
     for number, row in enumerate(read_jsonl(path), start=1):
-        own = {key: row.get(key) for key in ("id", "material")} if isinstance(row, dict) else {}
+        own: dict[str, Any] = {key: row.get(key) for key in ("id", "material")} if isinstance(row, dict) else {}
         if scene is not None and {type(value) for value in own.values()} == {str} and row == last | own:
             scene = replace(scene, **own)
         else:
@@ -173,7 +174,7 @@ def _scenes(path: Path) -> Iterator[SceneSpec]:
 
 def _scene(row: Any, where: str) -> SceneSpec:
     """Build a scene from a line; its lights, which are most of it, are not read number by number if all are sound."""
-    lights = row.get("lights") if isinstance(row, dict) else None
+    lights: Any = row.get("lights") if isinstance(row, dict) else None
     if not _is_vectors(lights):
         return build(SceneSpec, row, where)
     return replace(build(SceneSpec, row | {"lights": ()}, where), lights=tuple(map(tuple, lights)))

@@ -16,6 +16,7 @@ import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -83,7 +84,7 @@ class Shard:
                 )
 
 
-def write_exr(path: str | Path, parts: list[tuple[str, dict, dict[str, np.ndarray]]]) -> None:
+def write_exr(path: str | Path, parts: list[tuple[str, dict[str, Any], dict[str, np.ndarray]]]) -> None:
     """Write a multi-part OpenEXR file; the only place in the project that does.
 
     Args:
@@ -154,7 +155,7 @@ def _seal(path: Path) -> None:
             handle.write(_digest(data, match).encode())
 
 
-def _digest(data: bytes, match: re.Match) -> str:
+def _digest(data: bytes, match: re.Match[bytes]) -> str:
     """Return the SHA-256 of the whole file but for the digest itself, since OpenEXR alone overlooks altered bytes."""
     digest = hashlib.sha256(memoryview(data)[: match.start(1)])
     digest.update(memoryview(data)[match.end(1) :])
@@ -233,7 +234,7 @@ def _read_sealed(path: str | Path) -> bytes:
     return data
 
 
-def _read_parts(path: str | Path) -> list:
+def _read_parts(path: str | Path) -> list[OpenEXR.Part]:
     """Return the parts of a file whose digest is right."""
     _read_sealed(path)
     try:

@@ -46,8 +46,9 @@ class Worker:
 
     def abort(self) -> None:
         """Stop a process that hangs; its fault handler first writes where it hung."""
-        with suppress(OSError):
-            os.kill(self.process.pid, signal.SIGABRT)
+        if self.process.pid is not None:
+            with suppress(OSError):
+                os.kill(self.process.pid, signal.SIGABRT)
         self.process.join(2)
         if self.process.is_alive():
             self.process.kill()

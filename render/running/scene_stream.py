@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from itertools import groupby, islice
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -144,7 +144,7 @@ def _render(config: StreamWorkerConfig, outbox: queue.Queue) -> tuple:
     return ("end",)
 
 
-def _send(connection: Connection, outbox: queue.Queue) -> None:
+def _send(connection: Connection, outbox: queue.Queue[tuple[Any, ...] | None]) -> None:
     while (message := outbox.get()) is not None:
         try:
             connection.send(message)

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from pathlib import Path
+from typing import Any
 
 from render.backend import variant
 from render.planning import budget
@@ -81,8 +82,8 @@ class RunSummary:
 
     scenes: int
     done: int
-    lines: list[dict]
-    failed: list[dict]
+    lines: list[dict[str, Any]]
+    failed: list[dict[str, Any]]
     skipped: int
     seconds: float
     workers: int
@@ -99,8 +100,8 @@ def render_supervised(
     folder: str | Path,
     options: RunOptions | None = None,
     *,
-    on_shard: Callable[[dict], None] | None = None,
-    serve: Callable = serve,
+    on_shard: Callable[[dict[str, Any]], None] | None = None,
+    serve: Callable[..., None] = serve,
 ) -> RunSummary:
     """Render every scene that has no whole shard yet and did not fail before; go on after failures.
 
@@ -154,16 +155,16 @@ class _Run:
         options: RunOptions,
         ledger: Ledger,
         errors: Path,
-        serve: Callable,
-        on_shard: Callable[[dict], None] | None,
+        serve: Callable[..., None],
+        on_shard: Callable[[dict[str, Any]], None] | None,
     ) -> None:
         self.folder, self.options, self.ledger = folder, options, ledger
         self.errors, self.serve, self.on_shard = errors, serve, on_shard
         self.total, self.initial = len(scenes), len(scenes) - len(wanted)
         self.wanted = {scene.id: scene for scene in wanted}
         self.attempts = {id: len(rows) for id, rows in found.failed.items()}
-        self.lines: list[dict] = []
-        self.failed: list[dict] = []
+        self.lines: list[dict[str, Any]] = []
+        self.failed: list[dict[str, Any]] = []
         self.workers: list[Worker] = []
         self.started = 0
         choice = variant.choose() if wanted else None

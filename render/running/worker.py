@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 
@@ -51,7 +52,7 @@ class Stages:
         finally:
             self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - start
 
-    def each(self, stage: str, items: Iterator) -> Iterator:
+    def each(self, stage: str, items: Iterator[Any]) -> Iterator[Any]:
         """Iterate over `items`, counting the time they take to appear as `stage`."""
         while True:
             with self.time(stage):

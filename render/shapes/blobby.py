@@ -83,7 +83,7 @@ def merged_balls(rng: np.random.Generator) -> Field:
         centres.append(centres[host] + way / np.linalg.norm(way) * (radii[host] + rng.uniform(-0.2, 0.5) * radius))
         radii.append(radius)
     middle = np.mean(centres, axis=0)
-    extent = max(np.linalg.norm(centre - middle) + radius for centre, radius in zip(centres, radii, strict=True))
+    extent = max(float(np.linalg.norm(centre - middle)) + radius for centre, radius in zip(centres, radii, strict=True))
     balls = [sdf.ball((c - middle) / extent, r / extent) for c, r in zip(centres, radii, strict=True)]
     solid = sdf.warped(sdf.union(balls, rng.uniform(0.08, 0.35)), vector_waves(rng, 1.5, 4), rng.uniform(0.0, 0.12))
     frequency = np.exp(rng.uniform(np.log(4), np.log(11)))
@@ -102,7 +102,7 @@ def displaced_sphere(rng: np.random.Generator, parameters: BlobParameters) -> Tr
     base, faces, first, second = _sphere_frame()
     points, tangents = _displace(rng, parameters, base, [first, second])
     points, tangents = _carry(rng, parameters, points, tangents)
-    return TriangleMesh(vertices=points.T, faces=faces, normals=unit(np.cross(*tangents, axis=0).T))
+    return TriangleMesh(vertices=points.T, faces=faces, normals=unit(np.cross(tangents[0], tangents[1], axis=0).T))
 
 
 def _displace(
@@ -119,7 +119,7 @@ def _displace(
     log_radius = parameters.lumpiness * ((1 - share) * value + share * sign * 1.6 * fold)
     gain = parameters.lumpiness * ((1 - share) + share * sign * 1.6 * value / fold)
     radius = np.exp(log_radius)
-    stretch = np.float32(parameters.stretch)[:, None]
+    stretch = np.array(parameters.stretch, np.float32)[:, None]
     pairs = zip(tangents, slopes, strict=True)
     moved = [radius * (tangent + base * (gain * slope)) * stretch for tangent, slope in pairs]
     return radius * base * stretch, moved

@@ -8,17 +8,20 @@ import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 
 from render.shared.errors import InputError, unknown
 from render.shared.files import read_text
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 
 
-def read_yaml(path: str | Path) -> dict:
+def read_yaml(path: str | Path) -> dict[str, Any]:
     """Read a YAML file whose top level is a mapping.
 
     Raises:
@@ -93,7 +96,7 @@ def to_yaml(value: Any) -> str:
 def _convert(hint: Any, value: Any, name: str) -> Any:
     """Convert one value to the annotated type `hint`, or raise an InputError naming the field."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
-    if dataclasses.is_dataclass(hint):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return build(hint, value, name)
     if origin in (typing.Union, types.UnionType):
         return _convert_union(inner, value, name)
@@ -114,7 +117,7 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
     return _scalar(hint, value, name)
 
 
-def _convert_union(kinds: tuple, value: Any, name: str) -> Any:
+def _convert_union(kinds: tuple[Any, ...], value: Any, name: str) -> Any:
     """Take the first member type of a union that accepts `value`."""
     if value is None and type(None) in kinds:
         return None

@@ -133,12 +133,12 @@ def find_maxima(profiles: np.ndarray, mask: np.ndarray, *, smoothing: float = 2.
         found[index] = ndimage.binary_dilation(peaks, disc) & mask
         bright[index] = image >= 0.5 * (high - low)
     chosen = found & bright & (found.sum(0) == 1)
-    index, pixel = np.nonzero(chosen[:, mask])
+    brightest, pixel = np.nonzero(chosen[:, mask])
     if not len(pixel):
         raise InputError(
             "no pixel is brightest in one image only; the object needs curved, diffuse parts facing lights"
         )
-    return Maxima(pixels=pixel, images=index)
+    return Maxima(pixels=pixel, images=brightest)
 
 
 def intersect(

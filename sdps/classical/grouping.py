@@ -161,7 +161,8 @@ def _k_means(points: np.ndarray, groups: int, rng: np.random.Generator) -> np.nd
     distinct = np.unique(np.round(sample, 5), axis=0)
     if len(distinct) <= groups:
         return vq(points, distinct)[0]
-    centres, _ = kmeans2(sample, groups, iter=_STEPS, minit=start, missing="warn", rng=rng)
+    # The stubs know `minit` and `missing` as literals, and no `rng`.
+    centres, _ = kmeans2(sample, groups, iter=_STEPS, minit=start, missing="warn", rng=rng)  # type: ignore[call-overload]
     return vq(points, centres)[0]
 
 

@@ -129,7 +129,8 @@ def _uncalibrated(
     prepared = prepare(images, mask, front="diffuse", minimum=_FEWEST, seed=seed)
     start = equal_intensity(prepared.factors)
     glossy = np.flatnonzero(prepared.specular().sum(1) > 0.05 * prepared.profiles.sum(1))
-    gbr, info = start, {"highlights": len(glossy) >= 30}
+    gbr = start
+    info: dict[str, Any] = {"highlights": len(glossy) >= 30}
     if info["highlights"]:
         pixels = generator(seed, "half_vector lights").permutation(glossy)[:150]
         energy = _bas_relief_energy(prepared, pixels, prior)
@@ -212,7 +213,7 @@ def _carry(start: np.ndarray, chosen: np.ndarray, solved: np.ndarray, mask: np.n
     place = np.stack([columns, rows], axis=1) * (2.0 / np.sqrt(len(rows)))
     features = np.concatenate([place, 4.0 * start], axis=1)
     count = min(8, len(chosen))
-    distance, nearest = spatial.cKDTree(features[chosen]).query(features, k=count)
+    distance, nearest = map(np.asarray, spatial.cKDTree(features[chosen]).query(features, k=count))
     weight = 1.0 / (distance + 0.05)
     weight /= weight.sum(1, keepdims=True)
     change = (solved - start[chosen])[nearest]  # (P, 8, 3)

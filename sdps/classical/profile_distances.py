@@ -11,6 +11,7 @@ and the lights.
 """
 
 import logging
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -224,7 +225,7 @@ def _spread_samples(unit: np.ndarray, usable: np.ndarray, count: int, rng: np.ra
 
 def _embed_samples(
     shapes: np.ndarray, mask: np.ndarray, count: int, neighbours: int, slope: str, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, dict]:
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """Return the rows of samples (S,), their normals (S, 3) in the camera frame, and diagnostics."""
     unit = normalised(shapes)
     usable = np.flatnonzero(shapes.std(1) > 1e-3)
@@ -253,7 +254,7 @@ def _embed_samples(
 
 def _solve(
     ways: np.ndarray, places: np.ndarray, outward: np.ndarray, distribution: float, slope: str, mask: np.ndarray
-) -> tuple[np.ndarray, dict]:
+) -> tuple[np.ndarray, dict[str, Any]]:
     """Turn geodesics (S, S) into oriented normals (S, 3)."""
     along, correlation = _contour_slope(ways[np.ix_(places, places)], outward)
     if correlation < 0.5:

@@ -9,14 +9,14 @@ Every function takes numpy arrays or torch tensors and returns the same kind.
 
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
 
 from render.shared.errors import InputError
 
-Array = np.ndarray | torch.Tensor
+Array = TypeVar("Array", np.ndarray, torch.Tensor)
 ReadOut = Literal["centre", "expectation", "peak"]
 
 
@@ -94,7 +94,10 @@ class LightClasses:
             intensities: (...).
         """
         values = (*azimuth_elevation(directions), intensities)
-        return tuple(_shared_weights(part, *span) for part, span in zip(values, self._spans(), strict=True))
+        azimuth, elevation, intensity = (
+            _shared_weights(part, *span) for part, span in zip(values, self._spans(), strict=True)
+        )
+        return azimuth, elevation, intensity
 
     def _spans(self) -> tuple[tuple[float, float, int], ...]:
         """Return low, high and count of the bins of azimuth, elevation and intensity."""

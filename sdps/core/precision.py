@@ -85,7 +85,7 @@ def _resolved(precision: str, device: str) -> Arithmetic:
         return Arithmetic("bfloat16" if fast else "float32", device, said)
     if precision == "bfloat16" and not fast:
         _log.warning("precision bfloat16 was asked for, but %s; use auto or float32", said)
-    return Arithmetic(precision, device, f"asked for; {said}")
+    return Arithmetic("bfloat16" if precision == "bfloat16" else "float32", device, f"asked for; {said}")
 
 
 def _times(ratio: float) -> str:

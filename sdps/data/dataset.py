@@ -4,10 +4,10 @@ The position in an endless stream of samples determines everything about a sampl
 augmentation, crop. So a run is resumed exactly by one integer, and no two workers share a random stream.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -73,7 +73,7 @@ class SampleOptions:
     rescale: bool = False
 
 
-class SceneDataset(Dataset):
+class SceneDataset(Dataset[Any]):
     """Samples of the scenes of one split of a data folder, indexed by `SampleKey`.
 
     Args:
@@ -190,12 +190,14 @@ def choose_images(directions: np.ndarray, options: SampleOptions, rng: np.random
     return rng.permutation(nearest[:kept])[: options.images]
 
 
-def collate(samples: list[Batch | InputError]) -> Batch | InputError:
+def collate(samples: Sequence[Batch | InputError]) -> Batch | InputError:
     """Stack samples into a batch, or pass on the first error a worker met."""
+    whole = []
     for sample in samples:
         if isinstance(sample, InputError):
             return sample
-    return Batch(*(torch.stack(tensors) for tensors in zip(*samples, strict=True)))
+        whole.append(sample)
+    return Batch(*(torch.stack(tensors) for tensors in zip(*whole, strict=True)))
 
 
 class SampleStream:
@@ -252,8 +254,8 @@ def _resize(
         return images, normals, mask
     stack = np.concatenate([images, normals[None], np.repeat(mask[None, ..., None], 3, -1)]).astype(np.float32)
     tensor = torch.from_numpy(np.ascontiguousarray(stack.transpose(0, 3, 1, 2)))
-    resized = functional.interpolate(tensor, (size, size), mode="bilinear", antialias=True)
-    resized = resized.numpy().transpose(0, 2, 3, 1)
+    shrunk = functional.interpolate(tensor, (size, size), mode="bilinear", antialias=True)
+    resized = shrunk.numpy().transpose(0, 2, 3, 1)
     images, normals, mask = resized[:-2], resized[-2], resized[-1, ..., 0] > 0.5
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     return images, np.where(mask[..., None], normals / np.maximum(length, 1e-6), 0.0), mask

@@ -77,11 +77,12 @@ class SceneStore:
         images, truth = (self.folder / CACHE_FOLDER / f"{entry}.{kind}.npy" for kind in ("images", "truth"))
         if not images.is_file():
             stored = _decode(path, scene)
+            decoded = np.asarray(stored.images)
             # The images come last: where they are, the ground truth is.
-            kept = stored.images.any(axis=(0, 3))
+            kept = np.any(decoded, axis=(0, 3))
             layers = [stored.normals, stored.mask[..., None], kept[..., None]]
             _save(truth, np.concatenate(layers, axis=-1, dtype=np.float32))
-            _save(images, stored.images[:, kept])
+            _save(images, decoded[:, kept])
             return stored
         try:
             ground = np.load(truth)  # (H, W, 5)

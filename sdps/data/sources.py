@@ -5,7 +5,7 @@ that makes a stopped run resumable to the batch. Where several processes train t
 batch, so that together they see what one process would.
 """
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Any, Protocol
 
 from torch.utils.data import DataLoader
@@ -98,7 +98,7 @@ class StoredScenes:
         self.dataset, self.batch, self.workers, self.pin_memory = dataset, batch, workers, pin_memory
         self.scenes = len(dataset)
         self._part = share_of_batch(batch, rank, world)
-        self._running: Iterator[Batch | InputError] | None = None
+        self._running: Generator[Batch | InputError, None, None] | None = None
 
     def batches(self, taken: int) -> Iterator[Batch | InputError]:
         """Yield batches endlessly, from sample `taken` on."""
@@ -106,7 +106,7 @@ class StoredScenes:
         self._running = self._load(taken)
         return self._running
 
-    def _load(self, taken: int) -> Iterator[Batch | InputError]:
+    def _load(self, taken: int) -> Generator[Batch | InputError, None, None]:
         # The generator alone holds the loader, so closing it ends the workers.
         yield from DataLoader(
             self.dataset,

@@ -9,7 +9,7 @@ trainer for it, and the same seed gives the same batches.
 import hashlib
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from fractions import Fraction
@@ -89,7 +89,7 @@ class StreamedScenes:
         self._part = share_of_batch(batch, rank, world)
         self._identity: dict[str, Any] | None = None
         self._stream: SceneStream | None = None
-        self._running: Iterator[Batch | InputError] | None = None
+        self._running: Generator[Batch | InputError, None, None] | None = None
 
     def first(self, number: int) -> int:
         """Return the number of the first scene in the window of batch `number`."""
@@ -104,7 +104,7 @@ class StreamedScenes:
         self._running = self._run(number)
         return self._running
 
-    def _run(self, number: int) -> Iterator[Batch | InputError]:
+    def _run(self, number: int) -> Generator[Batch | InputError, None, None]:
         self._stream = self._open_stream(self.first(number))
         window = _Window(self._stream, self.first(number), self.window, show=self._rank == 0)
         # One thread, one batch ahead: the window is only ever touched in it, in the order of the batches.
@@ -127,8 +127,10 @@ class StreamedScenes:
         samples = []
         for place in range(self.batch)[self._part]:
             rng = generator(self.options.seed, "stream", "sample", number, place)
-            samples.append(make_sample(*scenes[drawn[place]], self.options, rng))
+            scene, stored = scenes[int(drawn[place])]
+            samples.append(make_sample(scene, stored, self.options, rng))
         batch = collate(samples)
+        assert isinstance(batch, Batch)  # no sample is an error
         return Batch(*(tensor.pin_memory() for tensor in batch)) if self._pin_memory else batch
 
     def identity(self) -> dict[str, Any]:

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sdps.inference.image_source import View
+from sdps.inference.symmetry import AnyView
 from sdps.models.base import LightingNetwork, Lights, NormalNetwork, divide
 from sdps.models.observation_maps import predict_normals
 
-Autocast = Callable[[], AbstractContextManager]
+Autocast = Callable[[], AbstractContextManager[Any]]
 _GREY_VALUES = 2**26
 """Grey values kept at once for pixel networks (256 MiB); of more, the images are read again for further pixels."""
 _PIXELS = {"cpu": 64, "cuda": 2048}
@@ -26,7 +26,7 @@ _PIXELS = {"cpu": 64, "cuda": 2048}
 
 
 def lighting_prediction(
-    network: LightingNetwork, view: View, autocast: Autocast, context: Callable[[slice], Tensor] | None = None
+    network: LightingNetwork, view: AnyView, autocast: Autocast, context: Callable[[slice], Tensor] | None = None
 ) -> Any:
     """Return a lighting network's prediction for all images, as its `forward` would.
 
@@ -36,19 +36,21 @@ def lighting_prediction(
         autocast: Makes the context in which the network runs.
         context: Further channels (1, n, C, 128, 128) for the images of a slice.
     """
-    mask, local, shared = view.mask, [], None
+    mask, local = view.mask, []
+    shared: Tensor | None = None
     for part, images in view:
         extra = None if context is None else context(part)
         with autocast():
             feature = network.encode(images, mask, extra)  # (1, n, F, 8, 8)
         local.append(feature)
         shared = _maximum(shared, feature.amax(dim=1, keepdim=True))
+    assert shared is not None  # a view has an image
     with autocast():
         predictions = [network.predict(feature, shared) for feature in local]
     return type(predictions[0])(*(torch.cat(parts, dim=1) for parts in zip(*predictions, strict=True)))
 
 
-def normal_map(network: NormalNetwork, view: View, lights: Lights | None, autocast: Autocast) -> Tensor:
+def normal_map(network: NormalNetwork, view: AnyView, lights: Lights | None, autocast: Autocast) -> Tensor:
     """Return a normal network's unit normals (1, 3, h, w), float32.
 
     Args:
@@ -58,26 +60,31 @@ def normal_map(network: NormalNetwork, view: View, lights: Lights | None, autoca
         autocast: Makes the context in which the network runs.
     """
     mean_square = _mean_square(network, view, lights) if network.per_pixel else None
-    mask, feature = view.mask, None
+    mask = view.mask
+    feature: Tensor | None = None
     for part, images in view:
         seen = network.observe(images, mask, some_lights(lights, part), mean_square)
         with autocast():
             feature = _maximum(feature, network.encode(seen))
+    assert feature is not None  # a view has an image
     with autocast():
         return network.regress(feature).float()
 
 
-def _mean_square(network: NormalNetwork, view: View, lights: Lights | None) -> Tensor:
+def _mean_square(network: NormalNetwork, view: AnyView, lights: Lights | None) -> Tensor:
     """Return the mean over all images and channels of the squares of what the network sees, (1, 1, 1, h, w)."""
-    total = 0.0
+    total = torch.zeros((), device=view.mask.device)
     for part, images in view:
         if network.needs_lights:
-            images = divide(images, some_lights(lights, part).intensities)
+            assert lights is not None
+            images = divide(images, lights.intensities[:, part])
         total = total + network.mean_square(images) * images.shape[1]
     return total / len(view)
 
 
-def pixel_normal_map(network: nn.Module, view: View, lights: Lights, autocast: Autocast, *, rotations: int) -> Tensor:
+def pixel_normal_map(
+    network: nn.Module, view: AnyView, lights: Lights, autocast: Autocast, *, rotations: int
+) -> Tensor:
     """Return CNN-PS's unit normals (1, 3, h, w), float32, zero outside the mask.
 
     Args:

@@ -101,7 +101,7 @@ def survey(source: ImageSource, mask: np.ndarray, margin: int | None, *, stray: 
         if not np.isfinite(inside).all():
             raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
         sample[start:stop] = inside[:, chosen]
-    rows, columns = (_box(mask.any(axis=axis), margin) for axis in (1, 0))
+    rows, columns = (_box(np.any(mask, axis=axis), margin) for axis in (1, 0))
     level = stray_light(sample) if stray else np.zeros((len(source), 3), np.float32)
     return ObjectImages(source, rows, columns, mask[rows, columns], shape, level, without(sample, level))
 

@@ -37,9 +37,9 @@ def stray_light(values: np.ndarray) -> np.ndarray:
     for image, inside, found in zip(values, shadow, level, strict=True):
         for channel in np.flatnonzero(inside.sum(0) >= _FEWEST):
             found[channel] = np.median(image[inside[:, channel], channel])
-    for channel in level.T:
-        told = channel[np.isfinite(channel)]
-        channel[np.isnan(channel)] = np.median(told) if len(told) else 0.0
+    for column in level.T:
+        told = column[np.isfinite(column)]
+        column[np.isnan(column)] = np.median(told) if len(told) else 0.0
     return np.minimum(level, _MOST * np.median(level, axis=0))
 
 

@@ -57,6 +57,9 @@ class KeptView:
             yield part, images.float()
 
 
+AnyView = View | KeptView | TurnedView
+
+
 def turned_context(symmetry: Symmetry, context: Callable[[slice], Tensor] | None) -> Callable[[slice], Tensor] | None:
     """Return what gives the turned channels of a second pass: normals and shading (1, n, 4, h, w)."""
     if context is None:
@@ -75,6 +78,6 @@ def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
         return found[0][1]
     directions = torch.stack([symmetry.back.vectors(lights.directions.float()) for symmetry, lights in found]).mean(0)
     intensities = torch.stack([lights.intensities.float() for _, lights in found]).mean(0)
-    sure = [lights.confidence for _, lights in found]
-    confidence = None if sure[0] is None else torch.stack([one.float() for one in sure]).mean(0)
+    sure = [lights.confidence.float() for _, lights in found if lights.confidence is not None]
+    confidence = torch.stack(sure).mean(0) if sure else None
     return Lights(functional.normalize(directions, dim=-1), intensities, confidence)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from sdps.core.lighting import ReadOut
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
 from sdps.methods.method import NONE, Method, combined, label
@@ -55,7 +56,8 @@ def lighting_methods(
     trained = [name for name in names if pretrained.trained_file(out, name).is_file()]
     methods = [Method(name=name, lights=name, paper=MODELS[name].paper if name in MODELS else "") for name in trained]
     if "lcnet" in trained:
-        others = (how for how in ("centre", "expectation", "peak") if how != config.read_out)
+        read_outs: tuple[ReadOut, ...] = ("centre", "expectation", "peak")
+        others = (how for how in read_outs if how != config.read_out)
         methods += [Method(name=f"lcnet, {how}", lights="lcnet", read_out=how) for how in others]
     available, told = pretrained.shipped(), {way.lights for way in ways}
     kept = [

@@ -1,7 +1,7 @@
 """A method with its networks loaded: images in, normals and lights out."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 _digest = cache(file_hash)
 _PLACES = ("lights", "second", "normals")
+Found = dict[tuple[Hashable, ...], Estimate]
+"""Estimated lights by what they depend on."""
 
 
 @cache
@@ -67,7 +69,7 @@ class Runner:
         """Return a digest of what results depend on besides images and code: weights, settings and arithmetic."""
         method = self.method
         names = {place: getattr(method, place) for place in _PLACES}
-        parts = [method.intensities]
+        parts: list[Any] = [method.intensities]
         parts += [(place, _digest(self.files[name]) if name in self.files else name) for place, name in names.items()]
         if self.estimator is not None:
             used = self.config.options() | {"precision": self.estimator.arithmetic.precision}
@@ -80,7 +82,7 @@ class Runner:
         mask: np.ndarray,
         lights: np.ndarray | None,
         intensities: np.ndarray | None,
-        found: dict[tuple, Estimate] | None = None,
+        found: Found | None = None,
     ) -> Estimate:
         """Run the method; of the lights it sees what it is to be given.
 
@@ -94,7 +96,8 @@ class Runner:
         Raises:
             InputError: images or lights the method cannot work with, in one line.
         """
-        method, given = self.method, {}
+        method = self.method
+        given: dict[str, Any] = {}
         if method.lights == TRUE_LIGHTS:
             given["lights"] = lights
         if TRUE_LIGHTS in (method.lights, method.intensities) and intensities is not None:
@@ -107,11 +110,10 @@ class Runner:
             return self._lights(images, mask, given, found)
         if found is not None and method.lights not in (NONE, TRUE_LIGHTS):
             given["found"] = self._lights(images, mask, given, found)
+        assert self.estimator is not None  # the method has a normal model
         return self.estimator.estimate(images, mask, **given)
 
-    def _lights(
-        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: dict[tuple, Estimate] | None
-    ) -> Estimate:
+    def _lights(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
         """Estimate the lights, or take what another method with the same lighting networks found."""
         found = {} if found is None else found
         places = _PLACES if self.method.second else ("lights",)  # a second pass sees normals
@@ -119,14 +121,14 @@ class Runner:
         options = self.config.options() | ({} if self.method.second else {"normal_views": None, "rotations": None})
         key = (*used, *options.items(), "intensities" in given)
         if key not in found:
+            assert self.estimator is not None  # the method has a lighting model
             found[key] = self.estimator.estimate_lights(images, mask, given.get("intensities"))
         return found[key]
 
-    def _classical(
-        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: dict[tuple, Estimate] | None
-    ) -> Estimate:
+    def _classical(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
         """Run a classical method, which holds the object's box of all images at once."""
-        name, told = self.method.normals, ()
+        name = self.method.normals
+        told: tuple[Any, ...] = ()
         if classical.METHODS[name].calibrated:
             if self.method.lights == TRUE_LIGHTS:
                 told = given["lights"], given.get("intensities")
@@ -163,5 +165,5 @@ class Runner:
 
 def _filled(config: InferenceConfig, method: Method) -> InferenceConfig:
     """Return the configuration with what the method says where it says nothing, one view where neither does."""
-    views = {name: getattr(config, name) or getattr(method, name) or 1 for name in VIEWS}
+    views: dict[str, Any] = {name: getattr(config, name) or getattr(method, name) or 1 for name in VIEWS}
     return replace(config, read_out=method.read_out or config.read_out, **views)

@@ -125,13 +125,15 @@ class NormalNetwork(nn.Module, ABC):
             lights: May be None for networks that are not told the lights.
             mean_square: `mean_square(...)` over all images of the scene where `images` are only some; see `per_pixel`.
         """
+        directions = None
         if self.needs_lights:
-            images = divide(images, lights.intensities)
+            assert lights is not None
+            images, directions = divide(images, lights.intensities), lights.directions
         if self.per_pixel:
             squares = mean_square if mean_square is not None else self.mean_square(images)
             # The published norm of 32 images of 3 channels, whatever the number of images here.
             images = images / ((32 * 3 * squares).sqrt() + _SCALE_FLOOR)
-        return Observations(images, lights.directions if self.needs_lights else None, mask if self.needs_mask else None)
+        return Observations(images, directions, mask if self.needs_mask else None)
 
     @staticmethod
     def mean_square(images: Tensor) -> Tensor:

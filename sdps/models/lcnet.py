@@ -3,7 +3,7 @@
 Legend: B scenes, Q images of a scene, K classes.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -70,7 +70,8 @@ class LightingTrunk(LightingNetwork):
             return self.classifier(local.flatten(0, 1))
         # The first convolution sees [local, shared]. What it makes of the shared half is the same for every image of a
         # scene, so it is computed once per scene and added.
-        (first, activation), rest = self.classifier[0], self.classifier[1:]
+        begin: Any = self.classifier[0]
+        (first, activation), rest = begin, self.classifier[1:]
         width = local.shape[2]
         own = functional.conv2d(local.flatten(0, 1), first.weight[:, :width], first.bias, padding=1)
         common = functional.conv2d(shared.flatten(0, 1), first.weight[:, width:], padding=1)  # (B, F', 8, 8)
@@ -108,7 +109,7 @@ class LCNet(LightingTrunk):
         widths: tuple[int, int, int] = (128, 256, 256),
     ) -> None:
         inputs = 3 + use_mask + context
-        super().__init__(inputs=inputs, use_mask=use_mask, use_global=use_global, widths=tuple(widths))
+        super().__init__(inputs=inputs, use_mask=use_mask, use_global=use_global, widths=widths)
         low, high = intensity_range
         self.classes = LightClasses(directions=direction_classes, intensities=intensity_classes, low=low, high=high)
         self.azimuth = head(widths[2], direction_classes)

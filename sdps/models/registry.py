@@ -5,7 +5,7 @@ on the lights of LCNet_reg differ in their training only. The recipes are the pa
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -41,7 +41,7 @@ class ModelEntry:
     """
 
     role: Role
-    build: Callable[..., nn.Module]
+    build: type[nn.Module]
     parameters: int
     summary: str
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -212,7 +212,7 @@ def network_options(name: str) -> set[str]:
     names: set[str] = set()
     for kind in entry(name).build.__mro__:
         if "__init__" in vars(kind):
-            parameters = inspect.signature(kind.__init__).parameters.values()
+            parameters = inspect.signature(vars(kind)["__init__"]).parameters.values()
             names |= {parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY}
             if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
                 break

@@ -31,8 +31,8 @@ class UPSFCN(MaxFusionNet):
     needs_lights = False
 
     def __init__(self, *, width: float = 1.0, deep: bool = False, use_mask: bool = False) -> None:
-        widths = tuple(round(width * channels) for channels in _WIDTHS)
-        super().__init__(3 + use_mask, widths=widths, deeper=(6, 2) if deep else (0, 0))
+        first, second, third = (round(width * channels) for channels in _WIDTHS)
+        super().__init__(3 + use_mask, widths=(first, second, third), deeper=(6, 2) if deep else (0, 0))
         self.needs_mask = use_mask
         initialise(self)
 

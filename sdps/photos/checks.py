@@ -194,8 +194,9 @@ def _colour(photos: Photographs, measures: Measures) -> Iterator[Finding]:
 
 def _camera(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     for name in ("exposure time", "aperture", "ISO", "focal length"):
-        values = [settings.get(name) for settings in measures.settings]
-        if None in values or len({round(value, 6) for value in values}) == 1:
+        told = [settings.get(name) for settings in measures.settings]
+        values = [value for value in told if value is not None]
+        if len(values) < len(told) or len({round(value, 6) for value in values}) == 1:
             continue
         level = "warning" if name == "focal length" else "note"
         effect = (

@@ -51,4 +51,4 @@ def _given_gamma(gamma: str | float) -> str | float:
 
 def _words(gamma: str | float) -> str:
     """Name a curve in a sentence."""
-    return {"linear": "linear", "srgb": "sRGB"}.get(gamma) or f"raised to the power {gamma:.3g}"
+    return {"linear": "linear", "srgb": "sRGB"}.get(str(gamma)) or f"raised to the power {gamma:.3g}"

@@ -55,6 +55,7 @@ def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up") -> 
     path = Path(path)
     signs = parse_frame(frame)
     if path.suffix.lower() == ".json":
+        names: list[str] | None
         names, table = _read_json(path)
         if signs != (1, 1, 1):
             raise InputError(f"{path}: lights.json states its own frame; leave the frame flag {frame!r} out")
@@ -81,7 +82,9 @@ def read_intensities(path: str | Path, files: Sequence[str]) -> np.ndarray:
     """
     path = Path(path)
     names, table = _read_table(path, (1, 3), "i or r g b")
-    return _intensities(path, _in_order(path, names, table, files), files)
+    found = _intensities(path, _in_order(path, names, table, files), files)
+    assert found is not None  # it is None for no columns alone
+    return found
 
 
 def write_lights(
@@ -143,7 +146,7 @@ def _read_json(path: Path) -> tuple[list[str], np.ndarray]:
 
 def _read_table(path: Path, widths: tuple[int, ...], want: str) -> tuple[list[str] | None, np.ndarray]:
     """Read rows of numbers, each with a name before it or none with; (N, width) float64."""
-    rows = []
+    rows: list[tuple[int, str, list[float]]] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         fields = _fields(line)
         if fields and not (not rows and {field.lower() for field in fields} <= _HEADINGS):
@@ -200,7 +203,7 @@ def _in_order(path: Path, names: list[str] | None, table: np.ndarray, files: Seq
     missing = [file for file, place in zip(files, found, strict=True) if place is None]
     if missing:
         raise InputError(f"{path}: no row for {missing[0]} ({len(missing)} pictures lack one); add it")
-    return table[found]
+    return table[[place for place in found if place is not None]]
 
 
 def _intensities(path: Path, values: np.ndarray, files: Sequence[str]) -> np.ndarray | None:

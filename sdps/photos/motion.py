@@ -199,7 +199,8 @@ class Tracker:
         shifted = _moved(outline, rows, columns)
         covered = shifted & ~ndimage.binary_dilation(outline)
         uncovered = outline & ~ndimage.binary_dilation(shifted)
-        return tuple(float(lit[part].mean()) if part.any() else 0.0 for part in (covered, uncovered))
+        share, other = (float(lit[part].mean()) if part.any() else 0.0 for part in (covered, uncovered))
+        return share, other
 
     def _steps(self, shift: Shift, sign: int) -> tuple[int, int]:
         """Return a shift in pixels of the window."""

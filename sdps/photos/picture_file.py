@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -116,9 +117,10 @@ def _png(path: Path, data: bytes) -> Picture:
     return _by_opencv(path, data, "PNG", profile, exif.get(_ORIENTATION, 1))
 
 
-def _tiff(path: Path, data: bytes) -> Picture:
+def _tiff(path: Path, data: bytes | bytearray) -> Picture:
     with tifffile.TiffFile(io.BytesIO(data)) as file:
-        tags, order = file.pages[0].tags, file.byteorder
+        page: Any = file.pages[0]  # a TiffPage; only later ones may be frames
+        tags, order = page.tags, file.byteorder
         profile = bytes(tags[_PROFILE].value) if _PROFILE in tags else None
         orientation = int(tags[_ORIENTATION].value) if _ORIENTATION in tags else 1
         if orientation != 1:  # OpenCV turns such pictures by itself, or fails; the tag must be gone before

@@ -154,7 +154,8 @@ def _survey(folder: Path, files: tuple[str, ...], gamma: str | float, mask_file:
             variation.add(brightness(to_linear(pixels, applied)))
     notes = [why, *_orientation_note(first.orientation, turns)]
     try:
-        mask, said = automatic_mask(variation) if given is None else (given, f"the mask is {mask_file.name}")
+        known = None if given is None or mask_file is None else (given, f"the mask is {mask_file.name}")
+        mask, said = known or automatic_mask(variation)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
     _refuse_broken(folder, files, broken, mask)
@@ -213,7 +214,7 @@ def _lights(
     if second is None and path is not None and path.name == "light_directions.txt" and str(lights) == "folder":
         second = path.with_name("light_intensities.txt") if path.with_name("light_intensities.txt").is_file() else None
     if second is not None:
-        if strengths is not None:
+        if strengths is not None and path is not None:
             raise InputError(f"{second}: {path.name} holds intensities as well; keep those of one file")
         strengths = read_intensities(second, files)
         notes = (*notes, f"intensities are those of {second.name}")

@@ -59,10 +59,11 @@ def profile_exponent(profile: bytes | None) -> float | None:
 
     Reference: ICC.1:2022, 10.6 curveType and 10.18 parametricCurveType.
     """
+    profile = profile or b""
     try:
-        (count,) = struct.unpack_from(">I", profile or b"", 128)
+        (count,) = struct.unpack_from(">I", profile, 128)
         tags = {bytes(tag): offset for tag, offset, _ in struct.iter_unpack(">4sII", profile[132 : 132 + 12 * count])}
-        offset = tags.get(b"rTRC", tags.get(b"kTRC"))
+        offset = tags[b"rTRC"] if b"rTRC" in tags else tags[b"kTRC"]
         kind, _, number = struct.unpack_from(">4sII", profile, offset)
         if kind == b"curv" and number == 0:
             return 1.0

@@ -65,5 +65,5 @@ def predicted_range(steps: np.ndarray, values: np.ndarray, at: float, *, fits: i
     for _ in range(fits):
         chosen = np.sort(rng.integers(len(steps), size=len(steps)))
         if len(np.unique(chosen)) >= _FEWEST:
-            found.append(fit_power_law(steps[chosen], values[chosen]).at(at))
+            found.append(np.asarray(fit_power_law(steps[chosen], values[chosen]).at(at)))
     return np.percentile(found, (10, 50, 90))

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
@@ -17,7 +17,7 @@ from render.shared.files import atomic_path, read_text
 
 Rows = list[dict[str, float]]
 
-_STYLE = {
+_STYLE: Any = {
     "font.size": 10, "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False,
     "legend.fontsize": 8.5, "axes.titlesize": 10,
 }  # fmt: skip
@@ -182,7 +182,7 @@ def _draw(axes: Axes, rows: Rows, panel: _Panel) -> None:
             axes.plot(steps, values, lw=0.6, alpha=0.35, color=f"C{place}")
             axes.plot(steps, _smooth(values), lw=1.5, color=f"C{place}", label=label)
         else:
-            marks = {"marker": "o", "ms": 3} if name.startswith("val_") or len(steps) < 2 else {}
+            marks: dict[str, Any] = {"marker": "o", "ms": 3} if name.startswith("val_") or len(steps) < 2 else {}
             axes.plot(steps, values, lw=1.3, color=f"C{place}", label=label, **marks)
     axes.set(title=panel.title, xlabel="optimiser step", ylabel=panel.unit)
     if panel.title == "learning rate":
@@ -206,7 +206,11 @@ def _hours_above(axes: Axes, rows: Rows, *, label: bool) -> None:
         axes.spines["top"].set_visible(False)
         return
     above = axes.secondary_xaxis(
-        "top", functions=(lambda steps: _hours(rows, steps), lambda hours: _hours(rows, hours, inverse=True))
+        "top",
+        functions=(
+            lambda steps: _hours(rows, np.asarray(steps)),
+            lambda hours: _hours(rows, np.asarray(hours), inverse=True),
+        ),
     )
     if label:
         above.set_xlabel("hours of training", fontsize=8.5)

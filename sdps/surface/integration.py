@@ -119,7 +119,11 @@ def integrate(
     if discontinuities and len(weights):
         z, weights, iterations = _bilateral(graph, z, sharpness, most)
     torn = (weights < 0.01 * (graph.facing**2).mean(axis=0)).mean() if discontinuities and len(weights) else 0.0
-    diagnostics = {"below": float((unit[:, 2] < STEEPEST).mean()), "torn": float(torn), "iterations": iterations}
+    diagnostics: dict[str, Any] = {
+        "below": float((unit[:, 2] < STEEPEST).mean()),
+        "torn": float(torn),
+        "iterations": iterations,
+    }
     return Depth(mask=mask, **_laid_out(graph, mask, z), **diagnostics, seconds=time.perf_counter() - started)
 
 

@@ -4,6 +4,7 @@ Legend: (H, W) image sides, v vertices (one per used pixel), f triangles.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -79,8 +80,11 @@ def write_mesh(surface: trimesh.Trimesh, path: str | Path) -> None:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise unknown("mesh format", suffix, FORMATS)
-    options = {".ply": {"vertex_normal": True}, ".obj": {"include_normals": True, "include_color": True}}
-    data = surface.export(file_type=suffix[1:], **options.get(suffix, {"include_normals": True}))
+    options: dict[str, dict[str, Any]] = {
+        ".ply": {"vertex_normal": True},
+        ".obj": {"include_normals": True, "include_color": True},
+    }
+    data: Any = surface.export(file_type=suffix[1:], **options.get(suffix, {"include_normals": True}))
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 

@@ -17,7 +17,8 @@ _BLOCK = 3  # pixels along the side of the blocks that aggregates may not leave
 _COARSEST = 1000  # unknowns that are solved directly
 _STRONG = 0.1  # of an unknown's strongest edge: weaker ones do not join an aggregate
 _SMOOTHINGS = 2  # damped Jacobi sweeps before and after every coarse correction
-_SHIFT = 1e-10  # of the diagonal; a component's mean is free, so the matrix is singular
+_ROUNDING = 1e-10  # of the largest diagonal entry: less is none
+_SHIFT = 1e-8  # of the diagonal; a component's mean is free, so the matrix is singular, and rounding must stay small
 
 
 def laplacian(edges: np.ndarray, weights: np.ndarray, count: int) -> sparse.csr_matrix:
@@ -52,7 +53,7 @@ class Multigrid:
             self._levels.append(level)
             matrix = (level.prolong.T @ matrix @ level.prolong).tocsr()
         diagonal = matrix.diagonal()
-        shift = _SHIFT * diagonal + (diagonal <= 1e-14 * diagonal.max(initial=1e-300))
+        shift = _SHIFT * diagonal + (diagonal <= _ROUNDING * diagonal.max(initial=1e-300))
         self._coarsest = splu((matrix + sparse.diags_array(shift)).tocsc(), permc_spec="MMD_AT_PLUS_A",
                               diag_pivot_thresh=0.0, options={"SymmetricMode": True})  # fmt: skip
 
@@ -75,7 +76,9 @@ def _coarsen(matrix: sparse.csr_matrix, positions: np.ndarray) -> tuple[_Level, 
     """Join the unknowns of a block that strong edges connect; return the level and the blocks of the new unknowns."""
     count = matrix.shape[0]
     diagonal = matrix.diagonal()
-    inverse = np.where(diagonal > 0, 1.0 / np.where(diagonal > 0, diagonal, 1.0), 0.0)
+    # A component that has become one unknown has rounding errors for a diagonal, and nothing left to correct.
+    tied = diagonal > _ROUNDING * diagonal.max(initial=1e-300)
+    inverse = np.where(tied, 1.0 / np.where(tied, diagonal, 1.0), 0.0)
     blocks = positions // _BLOCK
     pairs = matrix.tocoo()
     rows, columns, values = pairs.row, pairs.col, -pairs.data

@@ -73,7 +73,7 @@ def fit_albedo(
             for light, intensity, values in zip(lights[part], intensities[part], observed, strict=True):
                 model = _shading(unit, light)[:, None] * intensity  # (n, C)
                 weighted = model
-                if albedo is not None:
+                if albedo is not None and smallest is not None:
                     off = np.abs((values - model * albedo).mean(axis=1))
                     weighted = model / np.maximum(off, smallest)[:, None]
                 above += weighted * values

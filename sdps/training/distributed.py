@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import distributed
@@ -55,7 +56,7 @@ class Team:
         """
         own = arithmetic(precision, self.device)
         (half,) = self.agree([float(own.precision == "bfloat16")])
-        agreed = "bfloat16" if half else "float32"
+        agreed: Literal["float32", "bfloat16"] = "bfloat16" if half else "float32"
         return own if own.precision == agreed else replace(own, precision=agreed, reason="as the leading process")
 
     def wait(self) -> None:

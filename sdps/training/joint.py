@@ -1,7 +1,7 @@
 """Stages of models that depend on two others: the second lighting pass, and fine-tuning a pair together."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -59,9 +59,9 @@ class SecondStage(LightingStage):
     def context(self, batch: Batch) -> Tensor:
         """Return normals and shading (B, Q, 4, S, S) of the first pass."""
         images, mask = resize_input(batch.images, batch.mask)
-        network: LightingNetwork = self.lighting.network
+        network = cast(LightingNetwork, self.lighting.network)
         lights = network.lights(network(images, mask), "expectation")
-        estimator: NormalNetwork = self.normals.network
+        estimator = cast(NormalNetwork, self.normals.network)
         return LCNetSecond.context(estimator(estimator.observe(images, mask, lights)), mask, lights.directions)
 
 
@@ -75,6 +75,7 @@ class JointStage(Stage):
     """
 
     config: JointTraining
+    network: Any  # a ModuleDict of both, whose entries have no types
     goal = "normal_mae"
 
     def __init__(
@@ -87,7 +88,7 @@ class JointStage(Stage):
         pair = {"lighting": self.lighting.network, "normals": self.normals.network}
         return nn.ModuleDict(pair).requires_grad_(True)
 
-    def parts(self, network: nn.Module) -> list[Part]:
+    def parts(self, network: Any) -> list[Part]:
         """Return both networks, saved as `lcnet-joint` and `nenet-joint` by the names of the runs they start from."""
         pairs = zip((self.config.lights, self.config.normals), (self.lighting, self.normals), strict=True)
         return [

@@ -59,6 +59,7 @@ class PixelStage(NormalStage):
         """
         config = self.config
         lights = self.training_lights(batch)
+        assert lights is not None  # a pixel network is always told them
         pixels = draw_pixels(
             batch, lights, batch.seed.tolist(), count=config.pixels_per_scene, min_lights=config.min_lights
         )
@@ -69,6 +70,7 @@ class PixelStage(NormalStage):
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return loss and normal MAE over an even sample of the object's pixels, each given all lights."""
         lights = self.lights(batch)
+        assert lights is not None  # a pixel network is always told them
         pixels = sample_pixels(batch, lights, VALIDATION_PIXELS)
         rotations = min(self.config.rotations, VALIDATION_ROTATIONS)
         normals = predict_normals(self.network, *pixels[:3], rotations=rotations)

@@ -61,7 +61,7 @@ def run(name: str, sections: Mapping[str, Mapping[str, Any]], runs: Mapping[str,
     for layer, settings in [("", recipe), *((part, sections.get(part, {})) for part in _SECTIONS[role]), (where, own)]:
         build(_CLASSES[role], {**values, **settings}, layer)  # names the section a mistake is in
         values |= {key: _joined(values.get(key), value) for key, value in settings.items()}
-    config = build(_CLASSES[role], values, where)
+    config: TrainingConfig = build(_CLASSES[role], values, where)
     requires = _requires(name, model, config)
     return Run(name, model, config, requires | ({"start": config.start} if config.start else {}))
 
@@ -73,16 +73,17 @@ def _joined(before: Any, value: Any) -> Any:
 
 def _requires(name: str, model: str, config: TrainingConfig) -> dict[str, str]:
     """Return the runs whose weights a run needs."""
-    needed = {"lighting": getattr(config, "lights", ""), "normals": getattr(config, "normals", "")}
+    lights = getattr(config, "lights", "")
+    needed = {"lighting": lights, "normals": getattr(config, "normals", "")}
     if model != JOINT:
         if entry(model).role == "lighting":
             return {}
         if entry(model).role in ("normals", "pixels") and not entry(model).lights:
-            if config.lights:
+            if lights:
                 raise InputError(f"runs.{name}.lights: model {model!r} is told no lights; leave it out")
             return {}
         needed = {
-            "lighting": config.lights or entry(model).lights,
+            "lighting": lights or entry(model).lights,
             "normals": getattr(config, "normals", "") or entry(model).normals,
         }
     return {use: run for use, run in needed.items() if run and run != TRUE_LIGHTS}

@@ -1,6 +1,7 @@
 """The stage that trains a run, by the role of its model."""
 
 from collections.abc import Mapping
+from typing import cast
 
 from render.shared.errors import InputError
 from sdps.models import registry
@@ -9,7 +10,7 @@ from sdps.training.joint import JointStage, SecondStage
 from sdps.training.pixel_stage import PixelStage
 from sdps.training.recipes import JOINT
 from sdps.training.stages import LightingStage, NormalStage, Stage
-from sdps.training.training_config import TrainingConfig
+from sdps.training.training_config import JointTraining, LightingTraining, TrainingConfig
 
 
 def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
@@ -38,10 +39,10 @@ def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping
 def _stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
     """Return the stage with random weights."""
     if model == JOINT:
-        return JointStage(config, trained["lighting"], trained["normals"], name=name)
+        return JointStage(cast(JointTraining, config), trained["lighting"], trained["normals"], name=name)
     role = registry.entry(model).role
     if role == "lighting":
-        return LightingStage(config, model=model, name=name)
+        return LightingStage(cast(LightingTraining, config), model=model, name=name)
     if role == "second":
         return SecondStage(config, trained["lighting"], trained["normals"], model=model, name=name)
     kind = PixelStage if role == "pixels" else NormalStage

@@ -5,7 +5,7 @@ The trainer (`sdps.training.trainer`) knows nothing else about them.
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -13,11 +13,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from render.shared.seeds import derived_seed, generator
+from sdps.core.lighting import ReadOut
 from sdps.core.losses import faithful_normal_loss, masked_normal_loss
 from sdps.core.metrics import angle_degrees, direction_mae, intensity_error
 from sdps.data.dataset import Batch, SampleOptions
 from sdps.models import registry
-from sdps.models.base import Lights
+from sdps.models.base import LightingNetwork, Lights, NormalNetwork
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.lcnet import resize_input
 from sdps.models.registry import TRUE_LIGHTS
@@ -65,7 +66,7 @@ class Stage(ABC):
         """Move all networks to `device`, in the memory layout the configuration asks for."""
         layout = torch.channels_last if self.config.channels_last else torch.contiguous_format
         for network in (self.network, *self.frozen()):
-            network.to(device, memory_format=layout)
+            network.to(device, memory_format=layout)  # type: ignore[call-overload]  # torch's stubs lack it
 
     def origin(self) -> dict[str, Any]:
         """Return what else these weights depend on, for their metadata."""
@@ -106,6 +107,7 @@ class LightingStage(Stage):
     """Models that tell lights from images and mask."""
 
     config: LightingTraining
+    network: LightingNetwork
 
     def __init__(self, config: LightingTraining, *, model: str = "lcnet", name: str | None = None) -> None:
         super().__init__(name or model, model, config, lighting_options(model, config))
@@ -123,7 +125,9 @@ class LightingStage(Stage):
         """Return the loss, and direction and intensity errors of every read-out."""
         prediction = self.predict(batch)
         values = {"loss": float(self.network.loss(prediction, batch.directions, batch.intensities)["total"])}
-        for how, suffix in (("centre", ""), ("expectation", "_expectation"), ("peak", "_peak")):
+        read_outs: tuple[ReadOut, ...] = ("centre", "expectation", "peak")
+        for how in read_outs:
+            suffix = "" if how == "centre" else f"_{how}"
             values |= light_errors(self.network.lights(prediction, how), batch, suffix)
         return values
 
@@ -139,6 +143,7 @@ class NormalStage(Stage):
     """
 
     config: NormalTraining
+    network: NormalNetwork
     goal = "normal_mae"
     usual = "nenet"
     """Name in the registry where no other is given."""
@@ -155,7 +160,7 @@ class NormalStage(Stage):
         super().__init__(name or model, model, config, normal_options(model, config))
         self.source = config.lights or registry.entry(model).lights
         assert lighting is not None or self.source in (TRUE_LIGHTS, ""), f"{model} needs a trained lighting model"
-        self.lighting = freeze(lighting) if self.source not in (TRUE_LIGHTS, "") else None
+        self.lighting = freeze(lighting) if lighting and self.source not in (TRUE_LIGHTS, "") else None
 
     def frozen(self) -> list[nn.Module]:
         return [] if self.lighting is None else [self.lighting.network]
@@ -176,13 +181,13 @@ class NormalStage(Stage):
             return None
         if self.lighting is None:
             return Lights(batch.directions, batch.intensities)
-        network = self.lighting.network
+        network = cast(LightingNetwork, self.lighting.network)
         return network.lights(network(*resize_input(batch.images, batch.mask)), self.config.read_out)
 
     def training_lights(self, batch: Batch) -> Lights | None:
         """Return the lights the network is given in training, some of the way towards the true ones (`light_blend`)."""
         lights, limit = self.lights(batch), self.config.light_blend
-        if self.lighting is None or not limit:
+        if self.lighting is None or lights is None or not limit:
             return lights
         drawn = [generator(seed, "light_blend").uniform(0.0, limit) for seed in batch.seed.tolist()]
         share = torch.tensor(drawn, device=batch.images.device)[:, None]  # (B, 1)
@@ -204,7 +209,8 @@ class NormalStage(Stage):
         loss = masked if self.config.loss == "masked" else faithful_normal_loss(normals, truth)
         terms = {"masked_loss": masked}
         if logits is not None:
-            terms["lighting_loss"] = self.network.lighting_loss(logits, batch.directions, batch.intensities)
+            learner = cast(UPSFCNLight, self.network)
+            terms["lighting_loss"] = learner.lighting_loss(logits, batch.directions, batch.intensities)
             loss = loss + self.config.lighting_weight * terms["lighting_loss"]
         return loss, terms
 

@@ -279,6 +279,7 @@ class Trainer:
         try:
             for index in np.linspace(0, len(self.validation) - 1, count).round().astype(int):
                 batch = collate([self.validation.sample(SampleKey(int(index), 0, int(index)))])
+                assert isinstance(batch, Batch)  # `sample` raises
                 with self.arithmetic.autocast():
                     rows.append(self.stage.metrics(batch.to(self.team.device)))
         finally:
@@ -384,7 +385,7 @@ class Trainer:
 
 def _optimiser(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer | Muon:
     """Return the optimiser that a configuration names."""
-    options = {"lr": config.learning_rate, "weight_decay": config.weight_decay}
+    options: dict[str, Any] = {"lr": config.learning_rate, "weight_decay": config.weight_decay}
     if config.optimiser == "muon":
         return Muon(network, **options)
     kind = torch.optim.Adam if config.optimiser == "adam" else torch.optim.AdamW

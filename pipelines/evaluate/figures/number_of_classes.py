@@ -117,7 +117,7 @@ def _variants(item: TestObject, count: int) -> list[TestObject]:
     found = []
     for corner in CORNERS:
         name = f"{item.name}, K_d {count} {corner[0]:+d}{corner[1]:+d}"
-        lights = deviated(item.light_directions, count, corner)
+        lights = deviated(item.true_directions, count, corner)
         digest = hashlib.sha256(item.digest.encode() + lights.tobytes()).hexdigest()[:24]
         found.append(replace(item, name=name, digest=digest, light_directions=lights))
     return found

@@ -38,7 +38,7 @@ def subsets(total: int, draws: int, seed: int) -> list[tuple[int, int, np.ndarra
 
 def part_of(item: TestObject, count: int, draw: int, places: np.ndarray) -> TestObject:
     """Return an object, whose images are an array, seen in some of them only."""
-    if count == len(item.light_directions):
+    if count == len(item.true_directions):
         return item
     digest = hashlib.sha256(item.digest.encode() + places.astype(np.int64).tobytes()).hexdigest()[:24]
     return replace(
@@ -99,7 +99,9 @@ def _average(draws: Sequence[Mean]) -> tuple[float, float, float, int]:
     """Return mean, lowest and highest over the draws, and how many objects failed in all of them."""
     values = [item.value for item in draws if np.isfinite(item.value)]
     failed = sum(item.failed for item in draws)
-    return (float(np.mean(values)), min(values), max(values), failed) if values else (*[float("nan")] * 3, failed)
+    if not values:
+        return np.nan, np.nan, np.nan, failed
+    return float(np.mean(values)), min(values), max(values), failed
 
 
 def _published(method: Method, shape: str, metric: str) -> float | None:

@@ -132,7 +132,7 @@ def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Tab
 def _hardest(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
     """List the materials the first method finds hardest."""
     first = curves[0].errors
-    names = sorted(first, key=first.get, reverse=True)[:HARDEST]
+    names = sorted(first, key=lambda name: first[name], reverse=True)[:HARDEST]
     rows = tuple(
         (name, *(number(c.errors[name]) if name in c.errors else "-" for c in curves),
          *(number(column[name]) if name in column else "-" for column in published.values()))

@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -102,14 +103,15 @@ def fit_principled(target: np.ndarray, weight: np.ndarray, at: Angles) -> Callab
     return lambda where: principled(p, where)
 
 
-def _best(form: Callable, starts: list, target: np.ndarray, weight: np.ndarray, at: Angles) -> np.ndarray:
+def _best(
+    form: Callable[..., np.ndarray], starts: list[list[float]], target: np.ndarray, weight: np.ndarray, at: Angles
+) -> np.ndarray:
     """Return the parameters of the best local optimum over `starts`."""
-    runs = [
-        least_squares(
-            lambda p: np.clip(weight * (form(p, at) - target), -1e6, 1e6).ravel(), start, bounds=(-20, 20), max_nfev=60
-        )
-        for start in starts
-    ]
+
+    def misfit(p: np.ndarray) -> np.ndarray:
+        return np.clip(weight * (form(p, at) - target), -1e6, 1e6).ravel()
+
+    runs = [least_squares(misfit, start, bounds=(-20, 20), max_nfev=60) for start in starts]
     return min(runs, key=lambda run: run.cost).x
 
 
@@ -151,7 +153,7 @@ def sgd(constants: Sequence[Sequence[float]]) -> Brdf:
     return evaluate
 
 
-def read_published(path: Path, names: Sequence[str]) -> dict[str, dict]:
+def read_published(path: Path, names: Sequence[str]) -> dict[str, Any]:
     """Read JSON with the constants of ABC and SGD, sections `abc` and `sgd`, by material.
 
     Raises:
@@ -174,7 +176,7 @@ def compare(
     networks: NetworkFile,
     names: Sequence[str],
     errors: Sequence[float],
-    published: dict[str, dict],
+    published: dict[str, Any],
 ) -> str:
     """Fit and measure every candidate.
 

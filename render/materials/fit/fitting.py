@@ -104,7 +104,7 @@ class Fitter:
             InputError: the BRDF is known nowhere, or zero everywhere.
         """
         target = brdf(self.samples.wi, self.samples.wo)
-        known = np.isfinite(target).all(1)
+        known = np.all(np.isfinite(target), axis=1)
         if not target[known].any():
             raise InputError(f"material {name!r} is black or unknown in every direction: nothing to fit")
         samples, basis, target = _subset(self.samples, known), self._basis, target[known]
@@ -132,7 +132,7 @@ class Fitter:
     def error(self, material: Material, brdf: Brdf) -> float:
         """Return the relative RMS error of the sphere, `spheres.sphere_error`, where the BRDF is known."""
         reference = brdf(self.test.wi, self.test.wo)
-        known = np.isfinite(reference).all(1)
+        known = np.all(np.isfinite(reference), axis=1)
         test = _subset(self.test, known)
         return spheres.sphere_error(model.evaluate(material, test.wi, test.wo), reference[known], test)
 

@@ -5,6 +5,7 @@ and second differences mean relative smoothness; the penalties also carry values
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -71,7 +72,7 @@ def penalty() -> np.ndarray:
     ]
     shadow = [(1e-5, _difference(_S, 2)), (1e-5, _difference(_S, 1))]
     azimuth = [(1e-5, sp.eye_array(int(np.prod(model.AZIMUTH_KNOTS - np.array(1)))))]
-    blocks = [sum(weight * (rows.T @ rows) for weight, rows in part) for part in (table, shadow, azimuth)]
+    blocks: list[Any] = [sum(weight * (rows.T @ rows) for weight, rows in part) for part in (table, shadow, azimuth)]
     return sp.block_diag(blocks).toarray()
 
 

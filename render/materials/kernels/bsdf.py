@@ -177,7 +177,10 @@ class MERLFitBSDF(FamilyBSDF):
     """One-sided Mitsuba BSDF of one `Material`, e.g. `{'type': 'ps_material', 'material': 'chrome'}`."""
 
     def __init__(self, props: "mi.Properties") -> None:
-        self.material = load(props["material"])
+        material = load(props["material"])
+        if not isinstance(material, Material):
+            raise InputError(f"{props['material']}: the plugin `ps_material` reads fitted materials (.yaml)")
+        self.material = material
         super().__init__(props, [PackedMaterials([self.material])])
 
     def to_string(self) -> str:

@@ -4,6 +4,9 @@ Every material mixes a cosine lobe with a lobe of half vectors, whose distributi
 material at the knots of the project's model (`model.half_knots`).
 """
 
+from abc import ABC, abstractmethod
+from typing import Any
+
 import drjit as dr
 import numpy as np
 
@@ -18,7 +21,7 @@ _KNOTS = model.HALF_KNOTS
 _ENTRIES = _KNOTS + 1  # lobe probability, then the cumulative distribution at the knots of theta_h
 
 
-class HalfVectorLobes:
+class HalfVectorLobes(ABC):
     """The part of a packed family that is the same for all with half-vector lobes.
 
     A family adds `prepare` and `eval_at`. All methods work inside symbolic loops and calls, in the local shading frame
@@ -41,6 +44,15 @@ class HalfVectorLobes:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @staticmethod
+    @abstractmethod
+    def prepare(wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True) -> Any:
+        """Return what `eval_at` needs of unit vectors to the camera and to the light."""
+
+    @abstractmethod
+    def eval_at(self, index: "mi.UInt32", at: Any) -> "mi.Color3f":
+        """Evaluate f cos(theta_o) of the materials `index` at what `prepare` returned."""
 
     def eval(
         self, index: "mi.UInt32", wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True

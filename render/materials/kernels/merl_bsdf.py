@@ -122,9 +122,10 @@ class MerlBSDF(FamilyBSDF):
     """One-sided Mitsuba BSDF of one MERL table, e.g. `{'type': 'merl', 'filename': 'chrome.binary'}`."""
 
     def __init__(self, props: "mi.Properties") -> None:
-        self.table = load(props["filename"])
-        if not isinstance(self.table, MerlTable):
+        table = load(props["filename"])
+        if not isinstance(table, MerlTable):
             raise InputError(f"{props['filename']}: the plugin `merl` reads MERL tables, files ending in .binary")
+        self.table = table
         super().__init__(props, [PackedMerl([self.table])])
 
     def to_string(self) -> str:

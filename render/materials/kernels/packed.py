@@ -30,7 +30,7 @@ class Part(NamedTuple):
     """One material of a surface: its family's number and its own in the family."""
 
     family: int
-    index: int
+    member: int
 
 
 class PackedSurfaces:
@@ -59,7 +59,7 @@ class PackedSurfaces:
         self.parts = tuple(tuple(next(numbers) for _ in surface.components) for surface in surfaces)
         self._patterns = [surface.pattern and Evaluator(surface.pattern, mesh) for surface in surfaces]
         narrow = [family.highlight for family in self.families]
-        self.glossy = tuple(any(narrow[part.family][part.index] > GLOSSY for part in parts) for parts in self.parts)
+        self.glossy = tuple(any(narrow[part.family][part.member] > GLOSSY for part in parts) for parts in self.parts)
 
     def __len__(self) -> int:
         return len(self.parts)
@@ -83,7 +83,7 @@ class PackedSurfaces:
             family = self.families[part.family]
             if part.family not in prepared:
                 prepared[part.family] = family.prepare(wi, wo, active)
-            value = family.eval_at(opaque(mi.UInt32(part.index)), prepared[part.family])
+            value = family.eval_at(opaque(mi.UInt32(part.member)), prepared[part.family])
             total += value if weights is None else value * weights[k]
         return total
 
@@ -119,7 +119,7 @@ class PackedSurfaces:
         density = mi.Float(0)
         for family, share in zip(self.families, shares, strict=True):
 
-            def add(k: Any, weight: Any, total: Any, family=family) -> tuple:
+            def add(k: Any, weight: Any, total: Any, family: Any = family) -> tuple:
                 return (dr.fma(weight, family.pdf(k, wi, wo), total),)
 
             (density,) = _over_materials(len(family), share, lanes, (density,), add)
@@ -128,15 +128,16 @@ class PackedSurfaces:
     def _shares(self, family: int, weights: tuple, lanes: int) -> tuple:
         """Return the share of each material of a family in the mixture, (K) or, where patterns vary, (K * lanes)."""
         count, fraction = len(self.families[family]), 1 / len(self.parts)
-        fixed, varying = np.zeros(count), {}
+        fixed = np.zeros(count)
+        varying: dict[int, Any] = {}
         for parts, weight in zip(self.parts, weights, strict=True):
             for k, part in enumerate(parts):
                 if part.family != family:
                     continue
                 if weight is None:
-                    fixed[part.index] += fraction
+                    fixed[part.member] += fraction
                 else:
-                    varying[part.index] = varying.get(part.index, mi.Float(0)) + fraction * weight[k]
+                    varying[part.member] = varying.get(part.member, mi.Float(0)) + fraction * weight[k]
         if not varying:
             return opaque(mi.Float(fixed.astype(np.float32))), False
         flat = dr.zeros(mi.Float, count * lanes)
@@ -157,8 +158,8 @@ def _over_materials(count: int, share: tuple, lanes: int, state: tuple, step: An
     def body(k: Any, *values: Any) -> tuple:
         return k + 1, *step(k, dr.gather(mi.Float, weights, dr.fma(k, width, lane) if varies else k), *values)
 
-    _, *state = dr.while_loop((mi.UInt32(0), *state), lambda k, *_: k < total, body)
-    return tuple(state)
+    _, *last = dr.while_loop((mi.UInt32(0), *state), lambda k, *_: k < total, body)
+    return tuple(last)
 
 
 def pack(names: Sequence[str], mesh: TriangleMesh | None = None) -> PackedSurfaces:

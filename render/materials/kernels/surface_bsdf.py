@@ -38,7 +38,7 @@ class SurfaceBSDF(FamilyBSDF):
         """Return (family, index, weight) of each material where the pattern is evaluated."""
         weights = self.pattern.at(self.to_object @ si.p, si.prim_index) if self.pattern else [mi.Float(1)]
         places = self.packed.parts[0]
-        return [(self.families[p.family], mi.UInt32(p.index), w) for p, w in zip(places, weights, strict=True)]
+        return [(self.families[p.family], mi.UInt32(p.member), w) for p, w in zip(places, weights, strict=True)]
 
     def to_string(self) -> str:
         """Name the surface."""

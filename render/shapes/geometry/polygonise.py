@@ -77,7 +77,7 @@ def _survey(field: Field, half_size: float) -> tuple[np.ndarray, np.ndarray, flo
 def _evaluate_near_surface(field: Field, low: np.ndarray, spacing: np.float32, blocks: np.ndarray) -> np.ndarray:
     """Sample the grid of `blocks` * BLOCK points, exactly in blocks near the surface, elsewhere by sign only."""
     origin = low.astype(np.float32)[:, None]
-    index = np.indices(blocks).reshape(3, -1)
+    index = np.indices(tuple(blocks)).reshape(3, -1)
     middle = np.float32((BLOCK - 1) / 2)
     centres = evaluate(field, origin + (index * BLOCK + middle).astype(np.float32) * spacing)
     # Grid points of a block are at most this far from its centre, and surface cells reach one spacing further.

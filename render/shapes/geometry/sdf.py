@@ -172,9 +172,9 @@ def bounded(field: Field, centre: Vector, radius: float, margin: float = 0.15) -
 
 def placed(field: Field, position: Vector, frame: np.ndarray | None = None, scale: float = 1.0) -> Field:
     """Scale `field`, turn it by `frame`, and move its origin to `position`."""
-    position, scale = column(position), np.float32(scale)
+    origin, size = column(position), np.float32(scale)
     turn = np.eye(3, dtype=np.float32) if frame is None else np.asarray(frame, dtype=np.float32)
-    return lambda p: field((turn.T / scale) @ (p - position)) * scale
+    return lambda p: field((turn.T / size) @ (p - origin)) * size
 
 
 def squeezed(field: Field, factors: Vector) -> Field:
@@ -224,11 +224,11 @@ def displaced(field: Field, relief: Field, amount: float) -> Field:
 
 def furrows(waves: Waves, width: float = 0.2) -> Field:
     """Rounded lobes between narrow furrows, |n| of a noise n, of about zero mean; `width` rounds the furrows."""
-    width = np.float32(width)
+    rounding = np.float32(width)
 
     def relief(p: np.ndarray) -> np.ndarray:
         value = waves(p)
-        return np.sqrt(value * value + width * width) - np.float32(0.8)
+        return np.sqrt(value * value + rounding * rounding) - np.float32(0.8)
 
     return relief
 

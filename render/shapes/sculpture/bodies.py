@@ -53,8 +53,11 @@ def draw_pose(rng: np.random.Generator) -> Pose:
         chest=chest,
         neck=neck,
         head=head,
-        arms=tuple(_arm(rng, chest, chest_turn, side) for side in (1, -1)),
-        legs=tuple(_leg(rng, pelvis, pelvis_turn, side, stance, leading=side == 1) for side in (1, -1)),
+        arms=(_arm(rng, chest, chest_turn, 1), _arm(rng, chest, chest_turn, -1)),
+        legs=(
+            _leg(rng, pelvis, pelvis_turn, 1, stance, leading=True),
+            _leg(rng, pelvis, pelvis_turn, -1, stance, leading=False),
+        ),
         pelvis_turn=pelvis_turn,
         chest_turn=chest_turn,
         head_turn=head_turn,

@@ -33,7 +33,7 @@ def folds(rng: np.random.Generator, spacing: float, *, tilt: float = 0.25) -> Fi
 def gathered(relief: Field, centre: sdf.Vector, radius: float) -> Field:
     """Let the folds run together where the cloth is narrower than `radius` about the vertical through `centre`."""
     centre = sdf.column(centre)
-    keep = np.float32([[0], [1], [0]])
+    keep = np.array([[0], [1], [0]], np.float32)
 
     def pattern(p: np.ndarray) -> np.ndarray:
         q = p - centre

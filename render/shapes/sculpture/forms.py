@@ -29,7 +29,8 @@ def vessel(rng: np.random.Generator) -> Field:
 
     body = sdf.intersection([outside, sdf.box([0, 0, 0], [2, 1, 2])], 0.03)
     relief = scalar_waves(rng, 8, 28, count=24)
-    carved = [relief, sdf.furrows(relief, 0.3), sdf.cracks(relief, 0.5)][rng.integers(3)]
+    reliefs: list[Field] = [relief, sdf.furrows(relief, 0.3), sdf.cracks(relief, 0.5)]
+    carved = reliefs[rng.integers(3)]
     height = rng.choice([0.0, rng.uniform(0.005, 0.03)])
     body = sdf.displaced(body, carved, height)
     # The wall must outlast the deepest hollow of the relief, about three standard deviations.
@@ -105,9 +106,9 @@ def knot(rng: np.random.Generator) -> Field:
             harmonics[2, order] += -1j * weight * sense
         harmonics[1, loops] = -0.25j
     else:
-        order = np.arange(1, 5)
+        orders = np.arange(1, 5)
         harmonics = np.zeros((3, 5), dtype=complex)
-        harmonics[:, 1:] = (rng.normal(size=(3, 4)) + 1j * rng.normal(size=(3, 4))) * 0.4 / order**1.2
+        harmonics[:, 1:] = (rng.normal(size=(3, 4)) + 1j * rng.normal(size=(3, 4))) * 0.4 / orders**1.2
     thick, swell, beats = rng.uniform(0.09, 0.2), rng.uniform(0, 0.4), int(rng.integers(1, 9))
     return tube(harmonics, lambda t: np.float32(thick) * (1 + np.float32(swell) * np.sin(np.float32(beats) * t)))
 

@@ -1,6 +1,7 @@
 """Search of the three numbers of a bas-relief transformation for the minimum of an energy of any shape."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -49,12 +50,14 @@ def minimise_over_bas_reliefs(energy: Callable[[Gbr], float], starts: Sequence[G
     first = np.argsort(coarse, kind="stable")[:_REFINED]
     best, lowest = candidates[first[0]], coarse[first[0]]
     simplex = np.vstack([np.zeros(3), np.diag(_SPAN / 8.0)])
-    options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-7, "maxfev": 250}
+    options: Any = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-7, "maxfev": 250}
     for index in progress_bar(first, desc="bas-relief polish", unit="start"):
         centre = candidates[index]
-        found = optimize.minimize(
-            lambda offset, at=centre: value(_moved(at, offset)), np.zeros(3), method="Nelder-Mead", options=options
-        )
+
+        def near(offset: np.ndarray, at: Gbr = centre) -> float:
+            return value(_moved(at, offset))
+
+        found = optimize.minimize(near, np.zeros(3), method="Nelder-Mead", options=options)
         if found.fun < lowest:
             best, lowest = _moved(centre, found.x), float(found.fun)
     return best, lowest, counted

@@ -93,7 +93,7 @@ def test_directions_are_drawn_with_the_density_they_come_with(names, table):
     for number, parts in enumerate(surfaces.parts):
         for k, part in enumerate(parts):
             share = 1 if weights[number] is None else weights[number][k]
-            expected += share * surfaces.families[part.family].pdf(mi.UInt32(part.index), wi, wo) / len(surfaces)
+            expected += share * surfaces.families[part.family].pdf(mi.UInt32(part.member), wi, wo) / len(surfaces)
     np.testing.assert_allclose(np.array(density), np.array(expected), rtol=1e-4, atol=1e-7)
     above = np.array(wo.z) > 0
     assert (np.array(density)[above] > 0).all()
