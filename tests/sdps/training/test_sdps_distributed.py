@@ -12,9 +12,9 @@ from sdps_scenes import write_data
 
 SCRIPT = """
 import sys
-from sdps.config import NormalTraining
-from sdps.stages import NormalStage
-from sdps.training import train
+from sdps.training.training_config import NormalTraining
+from sdps.training.stages import NormalStage
+from sdps.training.trainer import train
 
 config = NormalTraining(
     steps=4, batch_scenes=4, images=2, size=32, crop=16, lights="true", log_every=1, workers=0, validation_scenes=2,
