@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from render.shared.errors import InputError
-from sdps.surface.multigrid import Multigrid, laplacian, solve
+from sdps.surface.laplacian import laplacian, multigrid, solve
 
 STEEPEST = 0.03
 """Least n_z that is believed, so that slopes stop at 33. Half a pixel inside the rim of a sphere of radius R pixels,
@@ -65,7 +65,6 @@ class _Graph:
     Attributes:
         edges: (2, m) pixels a and b.
         count: n.
-        positions: (n, 2) rows and columns.
         along: (2, m) float64, n_x or n_y at a and b.
         facing: (2, m) float64, n_z at a and b, at least `STEEPEST`.
         before, after: (m,) the edge of the same direction that ends at a, and that which starts at b; -1 for none.
@@ -73,7 +72,6 @@ class _Graph:
 
     edges: np.ndarray
     count: int
-    positions: np.ndarray
     along: np.ndarray
     facing: np.ndarray
     before: np.ndarray
@@ -160,7 +158,7 @@ def _graph(unit: np.ndarray, mask: np.ndarray) -> _Graph:
         parts.append((edges, unit[edges, axis], ending[edges[0]], starting[edges[1]]))
         offset += edges.shape[1]
     edges, along, before, after = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
-    return _Graph(edges, count, np.argwhere(mask), along, facing[edges], before, after)
+    return _Graph(edges, count, along, facing[edges], before, after)
 
 
 def _smooth(graph: _Graph) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +167,7 @@ def _smooth(graph: _Graph) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(graph.count), np.zeros(0)
     facing = graph.facing.mean(axis=0)
     matrix, right = _system(graph, facing**2, -graph.along.mean(axis=0) / facing)
-    cycle = Multigrid(matrix, graph.positions)
+    cycle = multigrid(matrix)
     return solve(matrix, right, np.zeros(graph.count), cycle, tolerance=_TOLERANCE)[0], facing**2
 
 
@@ -183,7 +181,7 @@ def _bilateral(graph: _Graph, z: np.ndarray, sharpness: float, most: int) -> tup
         # The last term holds a step that no equation ties any more where it was.
         target = (_WEAKEST * _steps(graph, z) - (shares * graph.facing * graph.along).sum(axis=0)) / weights
         matrix, right = _system(graph, weights, target)
-        cycle = cycle or Multigrid(matrix, graph.positions)
+        cycle = cycle or multigrid(matrix)
         z, steps = solve(matrix, right, z, cycle, tolerance=_ROUGH)
         if steps > _OUTWORN:
             cycle = None

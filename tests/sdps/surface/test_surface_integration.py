@@ -8,7 +8,7 @@ from surface_scenes import balls, from_slopes, grid, sphere, waves
 
 from render.shared.errors import InputError
 from sdps.surface.integration import Depth, integrate
-from sdps.surface.multigrid import Multigrid, laplacian, solve
+from sdps.surface.laplacian import laplacian, multigrid, solve
 
 
 def errors(depth: Depth, truth: np.ndarray) -> np.ndarray:
@@ -180,7 +180,7 @@ def test_multigrid_against_a_direct_solve():
     matrix = laplacian(edges, 10 ** rng.uniform(-4, 0, edges.shape[1]), int(mask.sum()))
     shifted = (matrix + sparse.diags_array(np.full(len(index[mask]), 1e-3))).tocsr()
     right = rng.normal(size=matrix.shape[0])
-    cycle = Multigrid(shifted, np.argwhere(mask))
+    cycle = multigrid(shifted)
     found, steps = solve(shifted, right, np.zeros_like(right), cycle, tolerance=1e-10)
     assert steps < 150
     expected = spsolve(shifted.tocsc(), right)
@@ -189,7 +189,7 @@ def test_multigrid_against_a_direct_solve():
     assert one @ cycle(two) == pytest.approx(two @ cycle(one))  # symmetric, as conjugate gradients need
 
 
-@pytest.mark.parametrize("size", [128, 512])
+@pytest.mark.parametrize("size", [128, 512, pytest.param(1024, marks=pytest.mark.slow)])
 def test_a_porous_mask_of_many_components_is_solved(size):
     # Parts that have become single unknowns have rounding errors for a matrix, and every part's mean is free.
     truth, normals, mask = sphere(size, 0.48 * size, 0.95)
