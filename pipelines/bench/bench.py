@@ -190,7 +190,7 @@ def _interleaved(ways: dict[str, Callable[[], None]], repeats: int, bar: "tqdm[A
     return times
 
 
-def table(result: dict) -> str:
+def table(result: dict[str, Any]) -> str:
     """Format the result of `run` as Markdown tables with a line about the scene and the machine."""
     config, machine, seconds, spread = (result[key] for key in ("config", "machine", "seconds", "spread"))
     about = (

@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,7 +67,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def judge(folder: Path, scene: SceneSpec) -> list[dict]:
+def judge(folder: Path, scene: SceneSpec) -> list[dict[str, Any]]:
     """Check a scene in every case: whether the words came, and which pictures were named, rightly and wrongly."""
     shard = read_shard(folder / scene.file, scene)
     rng = generator(0, scene.id, "checks")
@@ -119,7 +119,7 @@ def _named(alarms: Sequence[Finding], words: Sequence[str]) -> set[int] | None:
     return {int(name[:3]) for finding in found for name in finding.images} if found else None
 
 
-def table(rows: Sequence[dict], scenes: int) -> str:
+def table(rows: Sequence[dict[str, Any]], scenes: int) -> str:
     """Lay out how many scenes were warned of, and the share of spoilt pictures named."""
     body = []
     for case, spoilt in CASES.items():

@@ -7,6 +7,7 @@ least squares in the same run.
 
 import argparse
 import sys
+from typing import Any
 
 from pipelines.bench.bench_scenes import BenchClassicalConfig, large_object
 from pipelines.shared.flags import add_fields, add_out, from_flags, picked
@@ -39,7 +40,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _work(name: str, config: BenchClassicalConfig) -> dict:
+def _work(name: str, config: BenchClassicalConfig) -> dict[str, Any]:
     """Make the images, run the method, and tell what it took; sizes are None where the system does not tell them."""
     images, mask, normals, lights, gains = large_object(config)
     before = peak_gib()
@@ -53,7 +54,7 @@ def _work(name: str, config: BenchClassicalConfig) -> dict:
     }
 
 
-def table(found: dict[str, dict], config: BenchClassicalConfig) -> str:
+def table(found: dict[str, dict[str, Any]], config: BenchClassicalConfig) -> str:
     """Lay the figures out as text, with the limits."""
     base = found.get("least-squares", {}).get("seconds")
     rows = []

@@ -23,7 +23,7 @@ _WARM_UP = 12  # views, after which every kernel a run needs has been met
 _VIEWS = 40
 
 
-def steady_state(_: int, __: Path | None) -> tuple[dict, str]:
+def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
     """Count the kernels compiled while shapes, views, materials and lights change."""
     from render.backend import variant
 
@@ -80,7 +80,7 @@ def memory(scenes: int, out: Path | None) -> tuple[dict[str, Any], str]:
         pairs = zip(range(0, half, 8), range(half, len(planned), 8), strict=False)
         planned = [scene for pair in pairs for first in pair for scene in planned[first : first + 8]][:scenes]
 
-        def record(scene: object) -> None:
+        def record(scene: SceneSpec) -> None:
             sizes.append(resident_bytes())
             (Path(folder) / scene.file).unlink()
 
@@ -144,7 +144,7 @@ def _run(planned: Sequence[SceneSpec], processes: int, cores: int) -> RunSummary
 
 
 # What runs one part, given the scenes of the memory test and a folder for pictures: plain values, Markdown about them.
-PARTS: dict[str, Callable[[int, Path | None], tuple[dict, str]]] = {
+PARTS: dict[str, Callable[[int, Path | None], tuple[dict[str, Any], str]]] = {
     "steady": steady_state,
     "memory": memory,
     "workers": workers,

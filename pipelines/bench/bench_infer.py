@@ -86,7 +86,7 @@ def repeated(folder: Path, source: Path, count: int) -> Path:
     return folder
 
 
-def _work(folder: Path, method: str, models: Path | None, config: InferenceConfig) -> dict:
+def _work(folder: Path, method: str, models: Path | None, config: InferenceConfig) -> dict[str, Any]:
     """Do what `sdps infer` does, and tell what it took: seconds per step and in all, peak_gib, pixels, precision."""
     marks = [time.perf_counter()]
 

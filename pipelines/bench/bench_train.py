@@ -34,7 +34,7 @@ from sdps.core.losses import masked_normal_loss
 from sdps.core.precision import arithmetic
 from sdps.data.dataset import Batch
 from sdps.models import registry
-from sdps.models.base import Lights
+from sdps.models.base import LightingNetwork, Lights, NormalNetwork
 from sdps.training.distributed import Team
 from sdps.training.loggers import Meter
 from sdps.training.stage_factory import create_stage
@@ -133,7 +133,8 @@ def machine() -> dict[str, Any]:
     for name in ("float32", "bfloat16"):
         left, right = (torch.ones(2048, 2048, dtype=getattr(torch, name)) for _ in range(2))
         left @ right
-        rates[name] = float(np.median([2 * 2048**3 / 1e9 / timed(lambda a=left, b=right: a @ b) for _ in range(5)]))
+        times = [timed(partial(torch.matmul, left, right)) for _ in range(5)]
+        rates[name] = float(np.median([2 * 2048**3 / 1e9 / seconds for seconds in times]))
     return {
         "processor": processor(), "precision": chosen.precision, "reason": chosen.reason,
         "instructions": torch.backends.cpu.get_cpu_capability(), "threads": torch.get_num_threads(),
@@ -183,8 +184,8 @@ def _ways(
             continue
         trainer = make_trainer(replace(training(config, model), **changes), model, folder, scratch / name)
         if name == MUON:
-            update = trainer.optimiser.step
-            trainer.optimiser.step = lambda update=update: updates.append(timed(update))
+            step = partial(_note_time, updates, trainer.optimiser.step)
+            trainer.optimiser.step = step  # type: ignore[method-assign]
         ways[name] = partial(trainer.take_step, batch, 0.5)
 
     def one_thread() -> None:
@@ -199,6 +200,10 @@ def _ways(
     else:
         skipped[ONE_THREAD] = "there is no other"
     return ways, skipped
+
+
+def _note_time(seconds: list[float], action: Callable[[], object]) -> None:
+    seconds.append(timed(action))
 
 
 def _warm_up(ways: dict[str, Callable[[], object]]) -> dict[str, str]:
@@ -218,12 +223,13 @@ def _warm_up(ways: dict[str, Callable[[], object]]) -> dict[str, str]:
 
 def training(config: BenchTrainConfig, model: str) -> TrainingConfig:
     """Return the settings the trainer is measured with: those of the presets for processors without a GPU."""
-    common = {"seed": config.seed, "batch_scenes": config.scenes, "images": config.images, "size": config.size,
-              "optimiser": "adamw", "validation_scenes": 0}  # fmt: skip
     entry = registry.entry(model)
-    if entry.role == "lighting":
-        return LightingTraining(**common)
-    return NormalTraining(**common, **({"lights": "true"} if entry.lights else {}))
+    kind = LightingTraining if entry.role == "lighting" else NormalTraining
+    settings = kind(
+        seed=config.seed, batch_scenes=config.scenes, images=config.images, size=config.size, optimiser="adamw",
+        validation_scenes=0,
+    )  # fmt: skip
+    return replace(settings, lights="true") if isinstance(settings, NormalTraining) and entry.lights else settings
 
 
 def make_trainer(settings: TrainingConfig, model: str, folder: Path, scratch: Path) -> Trainer:
@@ -241,6 +247,11 @@ def first_batch(config: BenchTrainConfig, model: str, folder: Path) -> Batch:
         source = make_trainer(training(config, model), model, folder, Path(scratch)).source
         batch = next(source.batches(0))
         source.close()
+    return _sound(batch)
+
+
+def _sound(batch: Batch | InputError) -> Batch:
+    """Return a batch, or raise the mistake that stands in its place."""
     if isinstance(batch, InputError):
         raise batch
     return batch
@@ -252,10 +263,11 @@ def plain_loop(model: str, batch: Batch) -> Callable[[], object]:
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-4)
 
     def step() -> float:
-        if registry.entry(model).role == "lighting":
+        if isinstance(network, LightingNetwork):
             prediction = network(batch.images, batch.mask)
             loss = network.loss(prediction, batch.directions, batch.intensities)["total"]
         else:
+            assert isinstance(network, NormalNetwork), model
             lights = Lights(batch.directions, batch.intensities)
             normals = network(network.observe(batch.images, batch.mask, lights))
             loss = masked_normal_loss(normals, batch.normals, batch.mask)
@@ -271,7 +283,8 @@ def _in_turn(
     ways: dict[str, Callable[[], object]], config: BenchTrainConfig, images: int
 ) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
     """Return each way's images per second in every round, of wall time and of processor time."""
-    wall, processor = ({name: [] for name in ways} for _ in range(2))
+    wall: dict[str, list[float]] = {name: [] for name in ways}
+    processor: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(config.rounds):
         for name, way in ways.items():
             steps, began, spent = 0, time.perf_counter(), time.process_time()
@@ -289,11 +302,11 @@ def _waiting(config: BenchTrainConfig, model: str, folder: Path, scratch: Path, 
     batches = trainer.source.batches(0)
     try:
         for _ in range(2 + _SCENES // config.scenes):  # starts the loader, decodes every scene once, warms up
-            trainer.take_step(next(batches), 0.5)
+            trainer.take_step(_sound(next(batches)), 0.5)
         meter, began = Meter(), time.perf_counter()
         while time.perf_counter() - began < config.seconds / 2:
             with meter.waiting():
-                batch = next(batches)
+                batch = _sound(next(batches))
             meter.add(trainer.take_step(batch, 0.5), batch.images.shape[0] * batch.images.shape[1])
         values = meter.summary()
         return {"share": values["waiting_share"], "images_per_second": values["images_per_second"]}

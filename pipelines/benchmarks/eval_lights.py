@@ -6,6 +6,7 @@ Gourd&Apple (Alldrin et al. 2008) and the Light Stage Data Gallery (Einarsson et
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from pipelines.benchmarks import suite
 from pipelines.benchmarks.lit_photographs import GOURD_APPLE, LIGHT_STAGE, gourd_apple_objects, light_stage_objects
@@ -82,7 +83,7 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError(f"--longest-side {args.longest_side}: must be 0 or at least 16 pixels")
 
 
-def default_methods(models: object) -> list[Method]:
+def default_methods(models: Path | None) -> list[Method]:
     """Return every method that finds lights, and the paper's pair for its normals."""
     pairs = [method for method in select.every_method(models) if method.paper == "B1" or method.second]
     return [*select.lighting_rows(models), *pairs, *select.classical_rows(calibrated=False)]
@@ -90,7 +91,7 @@ def default_methods(models: object) -> list[Method]:
 
 def definition(bench: suite.Benchmark, items: Sequence[TestObject], about: str, longest: int) -> str:
     """Say what the numbers are of."""
-    images = ", ".join(f"{item.name} {len(item.light_directions)}" for item in items)
+    images = ", ".join(f"{item.name} {len(item.true_directions)}" for item in items)
     size = f", crops averaged down to {longest} pixels" if longest else ""
     return (
         f"{bench.title}: images of {images}; {about}; cropped to the mask's box with 15 pixels of margin, "

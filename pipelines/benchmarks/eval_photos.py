@@ -91,7 +91,7 @@ def with_reference(item: TestObject, method: str) -> TestObject:
     Raises:
         InputError: an image that cannot be read, or the method fails.
     """
-    images = item.load().opened()
+    images = item.load()
     estimate = registry.run(method, images[0 : len(images)], item.mask, item.light_directions)
     return replace(item, digest=f"{item.digest}-{method}", normals=estimate.normals)
 
@@ -102,7 +102,7 @@ def table(items: Sequence[TestObject], found: Found, reference: str) -> Table:
     for name, results in found.items():
         errors = [results[item.name].scores.get("normal_mae", np.nan) for item in items]
         known = [PUBLISHED.get(name, {}).get(item.name, np.nan) for item in items]
-        pairs = zip([*errors, np.mean(errors)], [*known, np.mean(known)], strict=True)
+        pairs = zip([*errors, float(np.mean(errors))], [*known, float(np.mean(known))], strict=True)
         rows.append((name, *(_cell(error, figure) for error, figure in pairs)))
     header = ("method", *(item.name for item in items), "mean")
     return Table(title=f"Normals against {reference} (degrees)", header=header, rows=tuple(rows))

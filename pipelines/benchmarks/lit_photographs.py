@@ -82,17 +82,21 @@ def light_stage_objects(root: Path, *, least_z: float = 0.0, gamma: float = 1.0,
     intensities = read_intensities(base / "light_intensities.txt", len(directions))
     objects = []
     for folder in folders:
-        images, chosen = find_images(folder, (".exr", ".png"), len(directions), gamma), slice(None)
+        images = find_images(folder, (".exr", ".png"), len(directions), gamma)
+        chosen = np.arange(len(directions))
         if len(images.files) == len(directions):  # an array holds the images in front only, and the lights' files too
             chosen = front(directions, least_z)
-            images = Images(
-                lambda number, read=images.read, chosen=chosen: read(int(chosen[number])),
-                [images.files[number] for number in chosen], [images.names[number] for number in chosen],
-            )  # fmt: skip
+            images = _some(images, chosen)
         matte = next((path for path in sorted(folder.glob("*matte.png"))), folder / "matte.png")
         objects.append(photographed(folder.name, images, read_mask(matte), directions[chosen], intensities[chosen],
                                     longest=longest, files=[matte], settings=(gamma,)))  # fmt: skip
     return objects
+
+
+def _some(images: Images, numbers: np.ndarray) -> Images:
+    """Return the images of these numbers, of a file each."""
+    files, names = ([whole[number] for number in numbers] for whole in (images.files, images.names))
+    return Images(lambda number: images.read(int(numbers[number])), files, names)
 
 
 def front(directions: np.ndarray, least_z: float) -> np.ndarray:

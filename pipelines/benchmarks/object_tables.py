@@ -73,7 +73,7 @@ def object_table(
     """
     official = any(name in known for name in present)
     columns = [*(known if official else ()), *(name for name in present if name not in known)]
-    entries = [
+    entries: list[tuple[str, str, dict[str, float], float | None, Sequence[str]]] = [
         (name, OURS, _scores(found, metric), None, [key for key, one in found.items() if one.reason])
         for name, found in results.items()
         if any(metric in result.scores or result.reason for result in found.values())

@@ -123,7 +123,7 @@ def photographed(
     margin: int = MARGIN,
     longest: int = 0,
     files: Sequence[Path] = (),
-    settings: tuple = (),
+    settings: tuple[object, ...] = (),
 ) -> TestObject:
     """Return an object of which the lights are known; its images stay on disk.
 

@@ -105,7 +105,7 @@ def evaluate(
     )  # fmt: skip
     writer = SectionWriter(section)
     for item in items:
-        writer.strip(f"{item.name}, {len(item.light_directions)} images", tiles(item, found, shown))
+        writer.strip(f"{item.name}, {len(item.true_directions)} images", tiles(item, found, shown))
     values = {
         "protocol": protocol | to_plain(config),
         "weights": weights_of(runners),

@@ -73,7 +73,7 @@ def _validation(folder: Path) -> dict[str, Any]:
         return {}
 
 
-def _failures(folder: Path) -> list[dict] | str:
+def _failures(folder: Path) -> list[dict[str, Any]] | str:
     """Return the rows of `failed.jsonl`, or why they cannot be read."""
     if not (folder / "failed.jsonl").is_file():
         return []

@@ -21,7 +21,7 @@ from render.shared.files import atomic_path, read_whole_lines, source_digest
 
 if TYPE_CHECKING:
     from sdps.inference.image_source import ImageSource
-    from sdps.methods.runner import Runner
+    from sdps.methods.runner import Found, Runner
 
 _log = logging.getLogger(__name__)
 _FORMAT = "evaluation-3"
@@ -150,7 +150,8 @@ class Evaluation:
             runners: The methods.
             keep: Names of methods whose normal maps are kept (float16).
         """
-        images, lights, found = None, {}, []
+        images, found = None, []
+        lights: Found = {}
         for runner in runners:
             key, kept = (runner.method.name, runner.identity(), item.name, item.digest), runner.method.name in keep
             maps = self.folder / "maps" / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.npz"
@@ -163,7 +164,7 @@ class Evaluation:
         return found
 
     def _run(
-        self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: dict[Any, Any]
+        self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: "Found"
     ) -> dict[str, Any]:
         """Run a method and return what is kept of it, JSON ready."""
         try:

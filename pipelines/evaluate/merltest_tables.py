@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -72,7 +73,7 @@ def normal_table(results: Sequence[SceneScores], methods: Sequence[Method], *, a
 def _rows(
     results: Sequence[SceneScores],
     methods: Sequence[Method],
-    paper: dict[str, tuple],
+    paper: dict[str, tuple[Any, ...]],
     metrics: tuple[str, ...],
     all_rows: bool,
 ) -> tuple[tuple[str, ...], ...]:

@@ -105,14 +105,17 @@ def _shape_sheet() -> pictures.Image.Image:
     return pictures.contact_sheet(tiles, columns=8)
 
 
-def _rendered(shape: str, materials: list[str], view: View, **settings: int) -> Iterator[np.ndarray]:
+def _rendered(
+    shape: str, materials: list[str], view: View, *, size: int, spp: int, bounces: int
+) -> Iterator[np.ndarray]:
     """Yield an image (H, W, 3) of a shape in each material under one light."""
     from render.kernel import many_lights, scene
     from render.materials.kernels.packed import pack
     from render.shapes import load
 
     built = scene.build(load(shape))
-    _, images = many_lights.render(built, view, pack(materials, built.mesh), _LIGHTS, seed=0, **settings)
+    surfaces = pack(materials, built.mesh)
+    _, images = many_lights.render(built, view, surfaces, _LIGHTS, size=size, spp=spp, bounces=bounces, seed=0)
     return (stack[0] for _, stack in images)
 
 

@@ -37,6 +37,9 @@ def short(name: str) -> str:
     return before + (shipped if bracket and name.endswith(shipped) else "")
 
 
+Values = Sequence[float] | np.ndarray
+
+
 class LineChart:
     """Lines of methods with their names beside the ends, published figures in grey.
 
@@ -48,7 +51,7 @@ class LineChart:
         self.axes = axes
         self._ends: list[tuple[str, float, str]] = []
 
-    def line(self, number: int, name: str, x: Sequence[float], y: Sequence[float], **style: Any) -> None:
+    def line(self, number: int, name: str, x: Values, y: Values, **style: Any) -> None:
         """Draw the line of the method of this number."""
         self.axes.plot(x, y, color=colour(number), **{"marker": marker(number), "ms": 4, **style})
         self.end(name, y, colour(number))
@@ -59,7 +62,7 @@ class LineChart:
             self.axes.plot([x], [y], color=PUBLISHED, marker="D", ms=6, ls="", mfc="none", zorder=5)
             self.end(name, [y], PUBLISHED)
 
-    def end(self, name: str, y: Sequence[float], shade: str) -> None:
+    def end(self, name: str, y: Values, shade: str) -> None:
         """Write a name beside the last figure of a line."""
         self._ends.append((name, next((value for value in reversed(y) if np.isfinite(value)), np.nan), shade))
 

@@ -6,11 +6,14 @@ import re
 from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
-from typing import TypeVar, get_origin
+from typing import TYPE_CHECKING, TypeVar, get_origin
 
 from render.shared.errors import unknown
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 
 
 def add_fields(parser: argparse.ArgumentParser, config: type, names: Iterable[str] = ()) -> None:

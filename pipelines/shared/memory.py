@@ -52,7 +52,7 @@ def apart(work: Callable[..., Any], *arguments: Any) -> Any:
             raise InputError("the process died before it was done; there may be too little memory") from error
 
 
-def measured(work: Callable[..., dict], *arguments: Any) -> dict:
+def measured(work: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
     """Return what `work` returns in a fresh process and an empty `error`, or its complaint as `error` alone."""
     try:
         return {**apart(work, *arguments), "error": ""}

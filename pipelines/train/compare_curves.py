@@ -38,7 +38,7 @@ def main(args: argparse.Namespace) -> int:
             inside = (steps >= span[0]) & (steps <= span[1])
             law = fit_power_law(steps[inside], values[inside])
             far = np.geomspace(steps[0], max([*asked, steps[-1]]), 100)
-            fits[name] = far, law.at(far)
+            fits[name] = far, np.asarray(law.at(far))
             cells.append(f"{law.floor:.3g} + {law.scale:.3g} step^-{law.exponent:.2f}")
             for at in asked:
                 low, middle, high = predicted_range(steps[inside], values[inside], at)

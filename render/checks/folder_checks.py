@@ -2,7 +2,7 @@
 
 import os
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Hashable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ def check_folder(
     return findings
 
 
-def _kind(scene: SceneSpec) -> tuple:
+def _kind(scene: SceneSpec) -> tuple[Hashable, ...]:
     """Return what makes a scene a sample of its own; nothing says that imported scenes of one name show one view."""
     imported = scene.id if family(scene.shape) == IMPORTED else ""
     return scene.shape, scene.material, scene.view, scene.lights, scene.size, imported

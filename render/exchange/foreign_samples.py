@@ -80,7 +80,7 @@ class Source:
 
 def read_stack(paths: Sequence[Path], size: tuple[int, int], intensities: np.ndarray) -> tuple[np.ndarray, int]:
     """Read pictures of a size (H, W) under lights of intensities (L, 3); see `Source.stack`."""
-    result, bits = np.empty((len(paths), *size, 3), np.float32), None
+    result, bits = np.empty((len(paths), *size, 3), np.float32), 0
     for image, path, intensity in zip(result, paths, intensities, strict=True):
         pixels = read_image(path)
         if pixels.shape[:2] != size:

@@ -86,9 +86,12 @@ def render(
     return _ground_truth(truths, size, spp), images
 
 
-def _summed(passes: Iterable[Paths], surfaces: PackedSurfaces, wanted: Sequence[int]) -> tuple[list[Paths], dict]:
+def _summed(
+    passes: Iterable[Paths], surfaces: PackedSurfaces, wanted: Sequence[int]
+) -> tuple[list[Paths], dict[int, np.ndarray]]:
     """Return the passes without their vertices, whose memory is freed one by one, and the sums of their images."""
-    truths, stacks = [], {}
+    truths: list[Paths] = []
+    stacks: dict[int, np.ndarray] = {}
     for paths in passes:
         truths.append(replace(paths, depths=(), glints=None))
         for index, stack in shade(paths, surfaces, wanted):

@@ -220,7 +220,7 @@ def write(
         raise InputError(f"{path}: rgb: the BRDF has values that are negative or not finite; repair its table")
     # Nowhere zero, or light just above the horizon between two dark entries would never be sampled.
     luminance += 1e-4 * luminance.mean((1, 2), keepdims=True) + 1e-12
-    fields = {
+    fields: dict[str, np.ndarray] = {
         "description": np.frombuffer(description.encode() or b"written by sdps", np.uint8),
         "jacobian": np.zeros(1, np.uint8),
         "phi_i": np.zeros(1, np.float32),

@@ -202,7 +202,9 @@ def _scene(spec: SceneSpec, bsdf: ET.Element) -> ET.Element:
             distance=f"{distance:.9g}", far=f"{2 * distance:.9g}", mesh=MESH,
         )
     )  # fmt: skip
-    scene.find("shape").append(bsdf)
+    shape = scene.find("shape")
+    assert shape is not None  # the template has one
+    shape.append(bsdf)
     return scene
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 from render.planning.chunks import Chunk
 from render.records.ledger import now
+from render.records.manifest import SceneSpec
 from render.running.messages import Begun, Done, Ended, Failed, Fatal, Message, Ready, WorkerConfig
 from render.shared.errors import InputError
 
@@ -93,7 +94,7 @@ class Work:
                 break
         return self.sound
 
-    def _view(self, built: Any, group: Collection) -> None:
+    def _view(self, built: Any, group: Collection[SceneSpec]) -> None:
         """Render one view; a material that fails is left out, anything else fails the view."""
         left = [scene.id for scene in group if scene.id in self.chunk.wanted]
         while left and self.sound:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Begun:
 class Done:
     """A shard is written; its ledger line."""
 
-    line: dict
+    line: dict[str, Any]
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from multiprocessing.connection import Connection
 
 from render.planning.chunks import Chunk
 from render.running.isolation import TAIL
@@ -15,7 +16,7 @@ from render.running.messages import WorkerConfig
 class Worker:
     """A rendering process and what it is working on."""
 
-    def __init__(self, serve: Callable, config: WorkerConfig) -> None:
+    def __init__(self, serve: Callable[[Connection, WorkerConfig], None], config: WorkerConfig) -> None:
         context = multiprocessing.get_context("spawn")  # forking would copy the state of a started backend
         self.connection, theirs = context.Pipe()
         self.errors = config.errors

@@ -79,13 +79,16 @@ def rendered_views(
         only: Numbers of the scenes to shade, rising; the bytes do not depend on it.
 
     Raises:
-        InputError: the object is outside the frame.
+        InputError: images that are not square, or the object is outside the frame.
     """
     from render.kernel import many_lights
 
     first = scenes[0]
+    height, width = first.resolution
+    if height != width:
+        raise InputError(f"scene {first.id}: size is {height}x{width}; only square images can be rendered")
     truth, images = many_lights.render(
-        built, first.view, surfaces, first.light_directions(), size=first.size, spp=first.spp, bounces=first.bounces,
+        built, first.view, surfaces, first.light_directions(), size=height, spp=first.spp, bounces=first.bounces,
         seed=first.seed, only=only,
     )  # fmt: skip
     if not truth.mask.any():

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from itertools import groupby, islice
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,6 +34,9 @@ class RenderedScene(NamedTuple):
     images: np.ndarray  # (L, H, W, 3) float16, linear radiance under irradiance pi
     normals: np.ndarray  # (H, W, 3) float32, unit, camera frame, zero outside the mask
     mask: np.ndarray  # (H, W) bool
+
+
+_Message = tuple[str] | tuple[str, str] | tuple[str, str, RenderedScene]
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,7 @@ def serve(connection: Connection, config: StreamWorkerConfig) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    outbox: queue.Queue[tuple | None] = queue.Queue(config.depth)
+    outbox: queue.Queue[_Message | None] = queue.Queue(config.depth)
     sender = threading.Thread(target=_send, args=(connection, outbox), daemon=True)
     sender.start()
     outbox.put(_render(config, outbox))
@@ -124,7 +127,7 @@ def serve(connection: Connection, config: StreamWorkerConfig) -> None:
     sender.join()
 
 
-def _render(config: StreamWorkerConfig, outbox: queue.Queue) -> tuple:
+def _render(config: StreamWorkerConfig, outbox: queue.Queue[_Message | None]) -> _Message:
     """Put the scenes into the outbox; return the last message."""
     try:
         import drjit as dr
@@ -144,7 +147,7 @@ def _render(config: StreamWorkerConfig, outbox: queue.Queue) -> tuple:
     return ("end",)
 
 
-def _send(connection: Connection, outbox: queue.Queue[tuple[Any, ...] | None]) -> None:
+def _send(connection: Connection, outbox: queue.Queue[_Message | None]) -> None:
     while (message := outbox.get()) is not None:
         try:
             connection.send(message)

@@ -257,7 +257,7 @@ class _Run:
             case Fatal(reason):
                 raise InputError(f"{reason} ({self._kept()})" if self.lines else reason)
 
-    def _done(self, worker: Worker, line: dict) -> None:
+    def _done(self, worker: Worker, line: dict[str, Any]) -> None:
         worker.finished(line["id"])
         worker.rendered += 1
         self.lines.append(line)

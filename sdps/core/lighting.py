@@ -47,7 +47,7 @@ def bin_index(values: Array, low: float, high: float, count: int) -> Array:
     """
     xp = library(values)
     index = xp.clip(xp.floor((values - low) / (high - low) * count), 0, count - 1)
-    return index.long() if isinstance(index, torch.Tensor) else index.astype(np.int64)
+    return index.long() if xp is torch else index.astype(np.int64)
 
 
 def bin_centre(index: Array, low: float, high: float, count: int) -> Array:
@@ -79,8 +79,9 @@ class LightClasses:
 
     def encode(self, directions: Array, intensities: Array) -> tuple[Array, Array, Array]:
         """Return azimuth, elevation and intensity classes, each (...) int64, of (..., 3) and (...)."""
-        values = (*azimuth_elevation(directions), intensities)
-        return tuple(bin_index(part, *span) for part, span in zip(values, self._spans(), strict=True))
+        azimuth, elevation = azimuth_elevation(directions)
+        angles, _, strengths = self._spans()
+        return bin_index(azimuth, *angles), bin_index(elevation, *angles), bin_index(intensities, *strengths)
 
     def encode_soft(
         self, directions: torch.Tensor, intensities: torch.Tensor

@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixe
 from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
 from sdps.inference.inference_config import InferenceConfig
 from sdps.inference.turned_views import KeptView, TurnedView, mean_lights, turned_context, turned_lights
-from sdps.models.base import Lights
+from sdps.models.base import Lights, NormalNetwork
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
 from sdps.models.lighting_variants import LCNetSecond
@@ -84,7 +84,14 @@ class Estimator(InferenceConfig):
     @property
     def needs_lights(self) -> bool:
         """Whether the normal model is told the lights; otherwise it works without a lighting model."""
-        return self.normals.role == "pixels" or self.normals.network.needs_lights
+        model = self._normal_model()
+        return model.role == "pixels" or cast(NormalNetwork, model.network).needs_lights
+
+    def _normal_model(self) -> TrainedModel:
+        """Return the normal model, or refuse to work without one."""
+        if self.normals is None:
+            raise InputError("no normal model was loaded, so only lights can be estimated; load one")
+        return self.normals
 
     @torch.inference_mode()
     def estimate(
@@ -120,8 +127,6 @@ class Estimator(InferenceConfig):
             InputError: sizes that do not fit, non-finite values, an empty mask, lights wanted without a lighting
                 model, or lights found though they are given.
         """
-        if self.normals is None:
-            raise InputError("no normal model was loaded, so only lights can be estimated; load one")
         if self.needs_lights and self.lighting is None and lights is None:
             raise InputError("no lighting model was loaded, so light directions must be given")
         began = time.perf_counter() - (found.diagnostics["seconds"] if found is not None else 0.0)
@@ -157,7 +162,8 @@ class Estimator(InferenceConfig):
         """Check the arguments of `estimate`; return the object's images, what is known, and the first diagnostics."""
         _check_lights(len(images), lights, intensities)
         scene = survey(images, mask, self.margin_of(mask.shape), stray=self.stray_light)
-        diagnostics = {"precision": self.arithmetic.precision, "stray_light": scene.stray, "exposure": {}}
+        precision = self.arithmetic.precision
+        diagnostics: dict[str, Any] = {"precision": precision, "stray_light": scene.stray, "exposure": {}}
         return scene, self._known(lights, intensities), diagnostics
 
     def _lit(
@@ -170,6 +176,7 @@ class Estimator(InferenceConfig):
             return self._estimate_lights(scene, known, diagnostics)
         if not self.needs_lights:
             return None
+        assert known.directions is not None  # without a lighting model `estimate` refuses that
         equal = np.full(len(scene), self._mean_intensity(), np.float32)
         return self._lights(known.directions, equal if known.intensities is None else known.intensities)
 
@@ -177,7 +184,8 @@ class Estimator(InferenceConfig):
         self, scene: ObjectImages, known: _Known, lit: Lights | None, diagnostics: dict[str, Any]
     ) -> np.ndarray:
         """Return the normals of the object's box, (h, w, 3) float32, zero outside the mask."""
-        multiple = 1 if self.normals.role == "pixels" else self.normals.network.size_multiple
+        model = self._normal_model()
+        multiple = 1 if model.role == "pixels" else cast(NormalNetwork, model.network).size_multiple
         view = self._view(scene, "normals", known.balance, pad_to(multiple), scene.mask.size, diagnostics)
         box = self._normals(view, lit)[0].permute(1, 2, 0).cpu().numpy()  # padded
         box = box[: scene.mask.shape[0], : scene.mask.shape[1]]
@@ -213,10 +221,9 @@ class Estimator(InferenceConfig):
     ) -> Lights:
         """Return the lights (1, L, ...) that the lighting network in `place` finds, with test-time augmentation."""
         network = getattr(self, place).network
-        view = self._view(scene, place, None, resize_input, INPUT_SIZE**2, diagnostics)
+        read = self._view(scene, place, None, resize_input, INPUT_SIZE**2, diagnostics)
         views = self.light_views or 1
-        if views > 1:
-            view = KeptView(view)
+        view: View | KeptView = KeptView(read) if views > 1 else read
         found = []
         for symmetry in SYMMETRIES[:views]:
             turned, extra = TurnedView(view, symmetry), turned_context(symmetry, context)
@@ -226,10 +233,11 @@ class Estimator(InferenceConfig):
 
     def _normals(self, view: View, lights: Lights | None) -> Tensor:
         """Return normals (1, 3, h, w) of a view, with test-time augmentation."""
-        network = self.normals.network
-        if self.normals.role == "pixels":
-            return pixel_normal_map(network, view, lights, self.arithmetic.autocast, rotations=self.rotations)
-        found = []
+        model = self._normal_model()
+        if model.role == "pixels":
+            assert lights is not None  # these models need lights
+            return pixel_normal_map(model.network, view, lights, self.arithmetic.autocast, rotations=self.rotations)
+        network, found = cast(NormalNetwork, model.network), []
         for symmetry in SYMMETRIES[: self.normal_views or 1]:
             lit = turned_lights(symmetry, lights)
             turned = normal_map(network, TurnedView(view, symmetry), lit, self.arithmetic.autocast)
@@ -253,6 +261,7 @@ class Estimator(InferenceConfig):
 
     def _mean_intensity(self) -> float:
         model = self.lighting if self.normals is None else self.normals
+        assert model is not None  # what is estimated needs one of them
         return float(np.mean(model.augmentation().intensity_range))
 
     def _known(self, lights: np.ndarray | None, intensities: np.ndarray | None) -> _Known:
@@ -301,7 +310,9 @@ def load_estimator(
     device = default_device(device)
     files = {"lighting": lighting, "normals": normals, "second": second}
     models = {place: None if file is None else load_model(file, device, _ROLES[place]) for place, file in files.items()}
-    return Estimator(**models, device=device, **options)
+    return Estimator(
+        lighting=models["lighting"], normals=models["normals"], second=models["second"], device=device, **options
+    )
 
 
 def default_device(device: str | torch.device | None = None) -> torch.device:
@@ -316,17 +327,23 @@ def load_model(file: str | Path, device: torch.device, role: str | tuple[str, ..
         InputError: the file is missing, damaged, or of a model of another role.
     """
     model = load_weights(file, role)
-    model.network.to(device, memory_format=torch.channels_last)  # a third faster on CPUs
+    # A third faster on CPUs. The stubs of torch lack `memory_format`.
+    model.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model
 
 
 def _concluded(normals: np.ndarray, lights: Lights | _Known, began: float, diagnostics: dict[str, Any]) -> Estimate:
     """Return an estimate; directions or intensities that nobody knows are empty."""
-    parts = lights[:2] if isinstance(lights, _Known) else (part[0].float().cpu().numpy() for part in lights[:2])
-    shapes = ((0, 3), (0,))
-    known = (np.zeros(shape, np.float32) if part is None else part for part, shape in zip(parts, shapes, strict=True))
+    directions, strengths = (
+        lights[:2] if isinstance(lights, _Known) else (part[0].float().cpu().numpy() for part in lights[:2])
+    )
     diagnostics["seconds"] = time.perf_counter() - began
-    return Estimate(normals, *known, diagnostics)
+    return Estimate(
+        normals,
+        np.zeros((0, 3), np.float32) if directions is None else directions,
+        np.zeros(0, np.float32) if strengths is None else strengths,
+        diagnostics,
+    )
 
 
 def _check_lights(count: int, lights: np.ndarray | None, intensities: np.ndarray | None) -> None:

@@ -90,7 +90,7 @@ def _casts(photos: Photographs, observations: np.ndarray) -> np.ndarray:  # (L,)
     saturation = photos.saturation
     if photos.intensities is not None and photos.intensities.ndim == 2:
         balance = photos.intensities / photos.intensities.mean(1, keepdims=True)
-        full = (some >= saturation).any(-1, keepdims=True)
+        full = np.any(some >= saturation, axis=-1, keepdims=True)
         some = np.where(full, np.inf, some / balance[:, None]).astype(np.float32)
         some[full[..., 0]] = saturation
     return colour_casts(some, saturation)

@@ -147,10 +147,10 @@ def _draw_runs(axes: Axes, runs: Mapping[str, Rows], value: str, against: str) -
             if not _timed(rows):
                 continue
             places = _hours(rows, places) * (60 if against == "minutes" else 1)
-        marks = {"marker": "o", "ms": 3} if value.startswith("val_") else {}
+        marker = "o" if value.startswith("val_") else None
         # Beyond the ten colours of the cycle, another line.
         axes.plot(places, values, lw=1.3, color=f"C{place % 10}", label=name, ls=("-", "--", ":")[place // 10 % 3],
-                  **marks)  # fmt: skip
+                  marker=marker, ms=3)  # fmt: skip
     axes.set(xlabel="optimiser step" if against == "step" else f"{against} of training", ylim=_from_zero(axes),
              xlim=(0, None))  # fmt: skip
     unit = _unit(value)

@@ -10,7 +10,7 @@ from sdps.training.joint import JointStage, SecondStage
 from sdps.training.pixel_stage import PixelStage
 from sdps.training.recipes import JOINT
 from sdps.training.stages import LightingStage, NormalStage, Stage
-from sdps.training.training_config import JointTraining, LightingTraining, TrainingConfig
+from sdps.training.training_config import JointTraining, LightingTraining, NormalTraining, TrainingConfig
 
 
 def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
@@ -44,6 +44,7 @@ def _stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, 
     if role == "lighting":
         return LightingStage(cast(LightingTraining, config), model=model, name=name)
     if role == "second":
-        return SecondStage(config, trained["lighting"], trained["normals"], model=model, name=name)
+        second = cast(LightingTraining, config)
+        return SecondStage(second, trained["lighting"], trained["normals"], model=model, name=name)
     kind = PixelStage if role == "pixels" else NormalStage
-    return kind(config, trained.get("lighting"), model=model, name=name)
+    return kind(cast(NormalTraining, config), trained.get("lighting"), model=model, name=name)

@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.figures.drawn import Drawn, LeftOut, finds
 from pipelines.evaluate.workbench import Workbench
 from pipelines.report.sections import Table
@@ -12,6 +13,8 @@ from pipelines.shared.text_tables import number
 
 SCENES = 3  # per shape
 COLUMNS = 3  # methods shown; all are in the table
+Panels = dict[str, tuple[TestObject, list[tuple[str, Result]]]]
+"""By scene: its object, and the results of the methods by their names."""
 
 
 def make(bench: Workbench) -> Drawn:
@@ -29,11 +32,11 @@ def make(bench: Workbench) -> Drawn:
     shapes = tuple(dict.fromkeys(scene.shape for scene in wanted))
     for shape in shapes:
         chosen = spread([scene for scene in wanted if scene.shape == shape], min(SCENES, bench.config.pictures))
-        panels: dict[str, list] = {}  # scene: its object, and the results of the methods
+        panels: Panels = {}
         objects = (((scene, item), item) for scene, item in bench.objects(chosen, folder, bench.config))
         for (scene, item), runner, result in bench.evaluated(objects, runners, len(chosen), f"lights, {shape}"):
             name = runner.method.name
-            panels.setdefault(scene.material, [item]).append((name, result))
+            panels.setdefault(scene.material, (item, []))[1].append((name, result))
             angle, gain = (result.scores.get(metric) for metric in ("direction_mae", "intensity_error"))
             rows.append((shape, scene.material, name, *("-" if v is None else number(v) for v in (angle, gain))))
             values[f"{scene.id} | {name}"] = {"direction_mae": angle, "intensity_error": gain}
@@ -56,13 +59,14 @@ def make(bench: Workbench) -> Drawn:
     )
 
 
-def _chart(panels: dict[str, list]) -> Figure:
+def _chart(panels: Panels) -> Figure:
     """Draw a row per material: the true lights, then those of each method."""
-    columns = min(1 + COLUMNS, *map(len, panels.values()))
+    columns = 1 + min(COLUMNS, *(len(found) for _, found in panels.values()))
     figure = charts.new_figure(2.5 * columns + 0.6, 2.75 * len(panels))
     grid = figure.subplots(len(panels), columns, squeeze=False)
-    for line, (material, (item, *found)) in zip(grid, panels.items(), strict=True):
-        points = charts.light_disc(line[0], item.light_directions, item.intensities)
+    for line, (material, (item, found)) in zip(grid, panels.items(), strict=True):
+        assert item.intensities is not None, item.name
+        points = charts.light_disc(line[0], item.true_directions, item.intensities)
         line[0].set_title(f"{material}\ntrue lights", fontsize=8)
         for axes, (name, result) in zip(line[1:], found, strict=False):
             if len(result.light_directions) == 0:

@@ -76,7 +76,7 @@ def make(bench: Workbench) -> Drawn:
     if not runners:
         raise LeftOut("bins needs a method that is told the lights; add psfcn or least-squares to --methods")
     wanted, folder = bench.merltest()
-    found: dict[tuple[str, str, int], list[list]] = {}  # (method, shape, bins): scores per corner
+    found: dict[tuple[str, str, int], list[list[dict[str, float]]]] = {}  # (method, shape, bins): scores per corner
     objects = (
         ((scene.shape, count, place), variant)
         for scene, item in bench.objects(wanted, folder, bench.config)

@@ -42,8 +42,9 @@ def part_of(item: TestObject, count: int, draw: int, places: np.ndarray) -> Test
         return item
     digest = hashlib.sha256(item.digest.encode() + places.astype(np.int64).tobytes()).hexdigest()[:24]
     return replace(
-        item, name=f"{item.name}, {count} images, draw {draw}", digest=digest, load=lambda: item.load()[places],
-        light_directions=item.light_directions[places], intensities=item.intensities[places],
+        item, name=f"{item.name}, {count} images, draw {draw}", digest=digest,
+        load=lambda: np.asarray(item.load())[places], light_directions=item.true_directions[places],
+        intensities=None if item.intensities is None else item.intensities[places],
     )  # fmt: skip
 
 
@@ -60,7 +61,7 @@ def make(bench: Workbench) -> Drawn:
         for scene, item in bench.objects(wanted, folder, bench.config)
         for count, draw, places in chosen
     )
-    found: dict[tuple[str, str, int, int], list] = {}
+    found: dict[tuple[str, str, int, int], list[dict[str, float]]] = {}
     for key, runner, result in bench.evaluated(objects, bench.runners, len(wanted) * len(chosen), "images"):
         found.setdefault((runner.method.name, *key), []).append(result.scores)
     points: Points = {}

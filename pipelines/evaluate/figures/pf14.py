@@ -116,7 +116,7 @@ def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[s
     config = replace(bench.config, shapes=(shape,), materials=materials, lights=lights)
     wanted, folder = bench.rendered(config, bench.out / "figures" / scenes.slug(lights))
     group_of = {name: group for group, names in kinds.items() for name in names}
-    found: dict[tuple[str, str], list] = {}
+    found: dict[tuple[str, str], list[dict[str, float]]] = {}
     objects = (
         (scene.material, replace(item, name=f"{item.name}, {lights}"))
         for scene, item in bench.objects(wanted, folder, config)

@@ -171,7 +171,9 @@ def load_mesh(path: str | Path) -> TriangleMesh:
     if not sum(len(part.faces) for part in geometry):
         raise InputError(f"{path}: contains no triangles; export it as a surface mesh")
     bare = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in geometry]
-    return from_trimesh(trimesh.util.concatenate(bare), str(path))
+    whole = trimesh.util.concatenate(bare)
+    assert isinstance(whole, trimesh.Trimesh), type(whole)
+    return from_trimesh(whole, str(path))
 
 
 def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh") -> TriangleMesh:
