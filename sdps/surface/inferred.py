@@ -37,7 +37,7 @@ class Inference:
         estimate: Normals, lights, and what else the method says.
         findings: What the checks said beforehand.
         files: The weights used, by name.
-        discontinuities: Depth may jump (`sdps.surface.integrate`).
+        discontinuities: Depth may jump (`sdps.surface.integration.integrate`).
         seconds: Time the method took.
     """
 
