@@ -119,6 +119,11 @@ def test_object_outside_the_frame_is_told(scenes, tmp_path):
     assert not (tmp_path / "shards").exists() or not any((tmp_path / "shards").iterdir())
 
 
+def test_scenes_that_are_not_square_are_refused(scenes, tmp_path):
+    with pytest.raises(InputError, match="size is 16x24; only square images"):
+        worker.render_scenes([replace(scenes[0], size=(16, 24))], tmp_path)
+
+
 # ---- Spatially-varying scenes -----------------------------------------------------------------------
 
 COMPONENTS = ("lambertian:0.9/0.5/0.1", "pink-felt")
