@@ -38,6 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--images", action="append", default=None, metavar="PATTERN",
                         help="files to use, in this order; one that begins with ! leaves files out")  # fmt: skip
     parser.add_argument("--discontinuities", action="store_true", help="let the depth jump where slopes disagree")
+    parser.add_argument("--refine", action="store_true",
+                        help="refine normals and lights until a simple model explains the photographs")  # fmt: skip
     using.add_arguments(parser)
     parser.add_argument("--self-test", action="store_true",
                         help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
@@ -79,8 +81,8 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is taken for orthographic\n")
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
     return infer(
-        photos, args.method, models=args.models, config=config, discontinuities=args.discontinuities,
-        findings=findings,
+        photos, args.method, models=args.models, config=config, refine=args.refine,
+        discontinuities=args.discontinuities, findings=findings,
     )  # fmt: skip
 
 

@@ -28,8 +28,8 @@ from sdps.core.estimate import Estimate
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
-from sdps.methods.method import Method
-from sdps.methods.parse import parse
+from sdps.methods.method import REFINE, Method
+from sdps.methods.parse import parse, refined
 from sdps.methods.runner import Runner
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load
@@ -53,6 +53,7 @@ def infer(
     *,
     models: str | Path | None = None,
     config: InferenceConfig | None = None,
+    refine: bool = False,
     discontinuities: bool = False,
     findings: tuple[Finding, ...] | None = None,
 ) -> Inference:
@@ -64,6 +65,8 @@ def infer(
             `auto` for the best there is: a pretrained network, or a classical method where there is none.
         models: Folder of trained runs (`out` of `train`) to take weights from before the pretrained ones.
         config: How networks are used; the defaults are those of every command.
+        refine: Refine normals and lights by inverse rendering (`sdps.refinement`); the same as `+refine` at the end of
+            `method`.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
 
@@ -78,7 +81,7 @@ def infer(
     grave = next((finding for finding in findings if finding.level == "error"), None)
     if grave is not None:
         raise InputError(f"{photos.folder}: {grave.text}")
-    runner = _runner(method, photos.light_directions is not None, models, config)
+    runner = _runner(method, photos.light_directions is not None, models, config, refine)
     began = time.perf_counter()
     found = runner.estimate(photos, photos.mask, photos.light_directions, photos.intensities)
     seconds = time.perf_counter() - began
@@ -200,11 +203,14 @@ def _finder(models: str | Path | None) -> Callable[[str], Path]:
     return partial(pretrained.require, out=None if models is None else Path(models))
 
 
-def _runner(method: str, lit: bool, models: str | Path | None, config: InferenceConfig | None) -> Runner:
+def _runner(
+    method: str, lit: bool, models: str | Path | None, config: InferenceConfig | None, refine: bool = False
+) -> Runner:
     """Return the method of an expression with its networks; `lit`: the light directions are known."""
     find = _finder(models)
-    chosen = _automatic(lit, find) if method == AUTO else method
-    return Runner(_told(chosen, lit, find), find, config)
+    plain = method.removesuffix(f"+{REFINE}")
+    chosen = _told(_automatic(lit, find) if plain == AUTO else plain, lit, find)
+    return Runner(refined(chosen) if refine or plain != method else chosen, find, config)
 
 
 def _told(text: str, lit: bool, find: Callable[[str], Path]) -> Method:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from sdps.classical import registry as classical
 from sdps.core.lighting import ReadOut
@@ -12,6 +13,8 @@ NONE = ""
 CONSTANT = "constant"
 """A predictor that sees nothing: what knowing nothing scores."""
 CLASSICAL = (*classical.METHODS, CONSTANT)
+REFINE = "refine"
+"""Last part of an expression: refine what the parts before it find."""
 VIEWS = ("light_views", "normal_views")
 
 
@@ -29,6 +32,7 @@ class Method:
         light_views: Test-time augmentation of lights: turned views averaged over where the configuration does not say;
             None for one.
         normal_views: The same for normals.
+        refined: Refine what it finds by inverse rendering (`sdps.refinement`).
         paper: Row of the paper's table.
     """
 
@@ -40,6 +44,7 @@ class Method:
     read_out: ReadOut | None = None
     light_views: int | None = None
     normal_views: int | None = None
+    refined: bool = False
     paper: str = ""
 
     def models(self) -> set[str]:
@@ -69,7 +74,7 @@ def combined(
 ) -> Method:
     """Return the method of parts that go together, with its label; asked for as a combination, with its views."""
     pair = COMBINATIONS[combination] if combination else None
-    views = {field: getattr(pair, field, None) for field in VIEWS}
+    views: dict[str, Any] = {field: getattr(pair, field, None) for field in VIEWS}
     named = combination if any(views.values()) else NONE  # others are their parts, and called so
     name = label(*map(stem, (lights, normals, second)), combination=named)
     return Method(

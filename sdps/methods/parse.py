@@ -1,12 +1,13 @@
 """Methods from words: expressions such as `lcnet+psfcn`, and flags."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.methods import pretrained
-from sdps.methods.method import CLASSICAL, CONSTANT, NONE, Method, combined, label, stem
+from sdps.methods.method import CLASSICAL, CONSTANT, NONE, REFINE, Method, combined, label, stem
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
 
@@ -54,14 +55,20 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
         text: A combination (`sdps`), a normal model (`nenet`), a classical method (`pf14`), a lighting model alone
             (`lcnet`), lights and normals (`lcnet+psfcn`, `true+least-squares`), or these with a second lighting pass in
             the middle. Calibrated methods alone are given the true lights, networks alone what they were trained on;
-            `shipped:` before a name means the shipped weights.
+            `shipped:` before a name means the pretrained weights. `+refine` at the end refines what was found.
         find: Gives the weights file of a name, or raises InputError.
 
     Raises:
         InputError: an unknown name, weights that are not there, or parts that do not go together.
     """
     parts = [part.strip() for part in text.split("+")]
-    if not all(parts) or len(parts) > 3:
+    if not all(parts):
+        raise InputError(f"method {text!r}: want METHOD, LIGHTS+NORMALS or LIGHTS+SECOND+NORMALS, and +refine or not")
+    if parts[-1] == REFINE:
+        if len(parts) == 1:
+            raise InputError(f"method {text}: say what is refined, as in sdps-plus+{REFINE}")
+        return refined(parse("+".join(parts[:-1]), find))
+    if len(parts) > 3:
         raise InputError(f"method {text!r}: want METHOD, LIGHTS+NORMALS or LIGHTS+SECOND+NORMALS")
     if len(parts) > 1:
         return combine(parts[0], parts[-1], parts[1] if len(parts) == 3 else None, None, find)
@@ -81,6 +88,17 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
         find(name)
         return Method(name=label(stem(name), NONE), lights=name)
     return combine(None, name, None, None, find)
+
+
+def refined(method: Method) -> Method:
+    """Return a method whose normals and lights are refined by inverse rendering (`sdps.refinement`).
+
+    Raises:
+        InputError: it gives no normals.
+    """
+    if method.normals in (NONE, CONSTANT):
+        raise InputError(f"method {method.name}+{REFINE}: refinement needs a method that gives normals")
+    return replace(method, name=f"{method.name}, refined", refined=True, paper="")
 
 
 def model_of(name: str, find: Callable[[str], Path]) -> str:

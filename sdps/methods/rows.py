@@ -131,4 +131,4 @@ def _with_row(method: Method) -> Method:
 def paper_row(method: Method) -> str:
     """Return the row of the paper's table of normals that a combination is, or an empty string."""
     parts = tuple(part.removeprefix(pretrained.SHIPPED) for part in (method.lights, method.normals, method.second))
-    return "" if method.intensities else next((row[3] for row in NORMAL_ROWS if row[:3] == parts), "")
+    return "" if method.intensities or method.refined else next((row[3] for row in NORMAL_ROWS if row[:3] == parts), "")

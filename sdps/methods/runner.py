@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from render.records.shards import file_hash
+from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.core.baselines import constant_estimate
 from sdps.core.estimate import Estimate
@@ -69,7 +70,7 @@ class Runner:
         """Return a digest of what results depend on besides images and code: weights, settings and arithmetic."""
         method = self.method
         names = {place: getattr(method, place) for place in _PLACES}
-        parts: list[Any] = [method.intensities]
+        parts: list[Any] = [method.intensities, method.refined]
         parts += [(place, _digest(self.files[name]) if name in self.files else name) for place, name in names.items()]
         if self.estimator is not None:
             used = self.config.options() | {"precision": self.estimator.arithmetic.precision}
@@ -102,6 +103,12 @@ class Runner:
             given["lights"] = lights
         if TRUE_LIGHTS in (method.lights, method.intensities) and intensities is not None:
             given["intensities"] = intensities
+        estimate = self._estimate(images, mask, given, found)
+        return self._refine(images, mask, estimate, given) if method.refined else estimate
+
+    def _estimate(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
+        """Run the method proper on what it is given."""
+        method = self.method
         if method.normals == CONSTANT:
             return constant_estimate(len(images), mask)
         if method.normals in classical.METHODS:
@@ -142,6 +149,30 @@ class Runner:
         normals = np.zeros((*mask.shape, 3), np.float32)
         normals[scene.rows, scene.columns] = estimate.normals
         return replace(estimate, normals=normals)
+
+    def _refine(self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any]) -> Estimate:
+        """Refine an estimate; lights it was given stay."""
+        from sdps.refinement.refine import refine
+
+        if not len(estimate.light_directions):
+            raise InputError(
+                f"{self.method.name}: refinement needs lights; put a lighting model before it, as in lcnet+"
+            )
+        names = {"lights": "directions", "intensities": "intensities"}
+        begun = given.get("intensities")
+        if begun is None:
+            begun = estimate.intensities if len(estimate.intensities) else np.ones(len(images), np.float32)
+        refined = refine(
+            images, mask, estimate.normals, estimate.light_directions, begun,
+            known=frozenset(name for key, name in names.items() if given.get(key) is not None),
+            stray=self.config.stray_light,
+        )  # fmt: skip
+        return Estimate(
+            refined.normals,
+            refined.light_directions,
+            refined.intensities.mean(axis=1),
+            estimate.diagnostics | {"refined": refined, "start": estimate},
+        )
 
     def score(
         self,

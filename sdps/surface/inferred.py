@@ -16,9 +16,11 @@ from render.shared.errors import InputError
 from render.shared.files import atomic_path, write_json
 from render.shared.images import quantise, write_png
 from sdps.core.estimate import Estimate
+from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
+from sdps.refinement.refined import Refined
 from sdps.surface.integration import Depth, integrate
 from sdps.surface.meshing import mesh, write_mesh
 from sdps.surface.relight import Residuals, fit_albedo, relit, residuals
@@ -130,6 +132,9 @@ class Inference:
             facts["light_confidence"] = dict(
                 zip(photos.files, np.round(np.asarray(confidence, float), 4).tolist(), strict=True)
             )
+        refined = self.estimate.diagnostics.get("refined")
+        if refined is not None:
+            facts["refined"] = _about_refined(refined, self.estimate.diagnostics["start"], photos)
         if self.residuals is not None:
             facts["lambertian_residual"] = round(self.residuals.overall, 4)
         return facts
@@ -167,6 +172,11 @@ class Inference:
         write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
         if len(self.light_directions):
             write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains)
+        refined = self.estimate.diagnostics.get("refined")
+        if refined is not None:
+            _save_array(folder / "albedo.npy", refined.albedo)
+            _save_array(folder / "highlights.npy", refined.strength)
+            _save_array(folder / "residual.npy", refined.pixel_residual)
         _save_array(folder / "depth.npy", self.depth.z)
         colour = None if self.albedo is None else _display(self.albedo, mask)
         surface = mesh(self.depth, colour=colour, normals=normals)
@@ -186,6 +196,22 @@ def check_out(out: Path, photographs: Path) -> None:
     """
     if out.resolve() == photographs.resolve():
         raise InputError(f"--out {out}: holds the photographs; choose another folder")
+
+
+def _about_refined(refined: Refined, start: Estimate, photos: Photographs) -> dict[str, Any]:
+    """Say how far refinement went, and which photographs its model explains worst; JSON ready."""
+    mask = photos.mask
+    moved = angle_degrees(refined.normals[mask], start.normals[mask])
+    turned = angle_degrees(refined.light_directions, start.light_directions)
+    residual = refined.image_residual
+    limit = 2.0 * float(np.median(residual))
+    return {
+        "normals_moved_degrees": round(float(moved.mean()), 2),
+        "lights_moved_degrees": round(float(turned.mean()), 2),
+        "residual": round(float(refined.pixel_residual[mask].mean()), 4),
+        "unexplained": [name for name, value in zip(photos.files, residual, strict=True) if value > limit],
+        "lobes": {"amplitudes": refined.amplitudes.round(4).tolist(), "sharpness": refined.sharpness.round(1).tolist()},
+    }
 
 
 def _save_array(path: Path, array: np.ndarray) -> None:

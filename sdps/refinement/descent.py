@@ -1,0 +1,140 @@
+"""Moving a state until the model explains the images: a coarse grid first, then every pixel."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from render.shared.errors import InputError
+from sdps.refinement.fused import data_term
+from sdps.refinement.image_model import Factors, State, factors, unit
+from sdps.refinement.priors import Neighbours, anchor, curl, neighbours, roughness
+
+_LEAST_RATE = 0.02
+
+
+class Weights(NamedTuple):
+    """Weights of the priors.
+
+    Attributes:
+        smooth: Of the roughness of normals.
+        albedo: Of the roughness of the albedos' logarithms. Few and even colours tell how a relief is stretched.
+        gloss: Of the roughness of the strengths' logarithms.
+        gloss_size: Of their squares, within `gloss`.
+        curl: Of the curl, at the start and at the end; in between it falls exponentially.
+        shift: Of where the lights point on average, likewise. Networks tell that well, and highlights, once found,
+            better.
+    """
+
+    smooth: float = 0.005
+    albedo: float = 0.05
+    gloss: float = 0.003
+    gloss_size: float = 0.1
+    curl: tuple[float, float] = (0.6, 0.1)
+    shift: tuple[float, float] = (10.0, 0.03)
+
+
+class Rates(NamedTuple):
+    """Learning rates of Adam, by part of the state, before `boost`."""
+
+    normals: float = 0.01
+    log_albedo: float = 0.02
+    log_strength: float = 0.05
+    lobes: float = 0.05
+    log_sharpness: float = 0.01
+    directions: float = 0.003
+    log_intensities: float = 0.003
+
+
+class Problem(NamedTuple):
+    """One grid of pixels.
+
+    Attributes:
+        mask: (H, W) bool, P true pixels.
+        images: (P, 3, L) float32, divided by their mean.
+        kept: (P, L) float32, 0 for observations that count for nothing.
+    """
+
+    mask: np.ndarray
+    images: Tensor
+    kept: Tensor
+
+
+def solve(
+    problem: Problem,
+    state: State,
+    *,
+    free: frozenset[str],
+    iterations: int,
+    boost: float,
+    weights: Weights,
+    rates: Rates | None = None,
+    after: Callable[[], object] = lambda: None,
+) -> State:
+    """Return the state after some iterations of Adam on the data term and the priors.
+
+    Args:
+        problem: The pixels.
+        state: Where to start.
+        free: Names of the parts of the state that move.
+        iterations: How many.
+        boost: What the rates are multiplied by; they fall along a cosine.
+        weights: Of the priors.
+        rates: Of Adam.
+        after: Called after each iteration.
+
+    Raises:
+        InputError: the loss is no longer a number.
+    """
+    rates, beside = rates or Rates(), neighbours(problem.mask)
+    state = State(*(part.clone().requires_grad_(name in free) for name, part in zip(State._fields, state, strict=True)))
+    groups = [{"params": [getattr(state, name)], "lr": getattr(rates, name), "base": getattr(rates, name)}
+              for name in State._fields if name in free]  # fmt: skip
+    adam, start = torch.optim.Adam(groups), unit(state.directions.detach())
+    for number in range(iterations):
+        part = number / max(iterations - 1, 1)
+        for group in adam.param_groups:
+            group["lr"] = group["base"] * boost * max((1.0 + math.cos(math.pi * part)) / 2.0, _LEAST_RATE)
+        adam.zero_grad(set_to_none=True)
+        made = factors(state)
+        loss = data_term(made, problem.images, problem.kept)
+        loss = loss + _priors(state, made, beside, weights, part)
+        if "directions" in free:
+            stretch, shift = anchor(state.directions, start)
+            loss = loss + stretch + _falling(weights.shift, part) * shift
+        loss.backward()
+        adam.step()
+        _unit_length(state, free)
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise InputError("refinement failed: the images hold values that are no numbers")
+        after()
+    return State(*(part.detach() for part in state))
+
+
+def _priors(
+    state: State, made: Factors, beside: Neighbours, weights: Weights, part: float
+) -> Tensor:  # fmt: skip
+    loss = weights.smooth * roughness(made.normals, beside)
+    loss = loss + _falling(weights.curl, part) * curl(made.normals, beside)
+    loss = loss + weights.albedo * roughness(state.log_albedo, beside)
+    gloss = state.log_strength
+    return loss + weights.gloss * (roughness(gloss, beside) + weights.gloss_size * (gloss**2).mean())
+
+
+def _falling(weight: tuple[float, float], part: float) -> float:
+    first, last = weight
+    return first * (last / first) ** part
+
+
+@torch.no_grad()
+def _unit_length(state: State, free: frozenset[str]) -> None:
+    """Keep vectors at length 1, and surfaces and lights on the camera's side."""
+    for name in ("normals", "directions"):
+        if name in free:
+            vectors = getattr(state, name)
+            vectors[:, 2].clamp_min_(1e-3)
+            vectors /= vectors.norm(dim=1, keepdim=True)

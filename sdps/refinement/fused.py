@@ -1,0 +1,175 @@
+"""The data term and its gradient, fused: one pass over pixels and images, compiled by numba.
+
+`sdps.refinement.image_model.difference` is the same term written down plainly in torch; the tests hold both together.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numba import types
+from numba.extending import intrinsic
+from torch import Tensor
+
+from sdps.refinement.image_model import DATA_FLOOR, LOBES, ROBUST, SHADE_FLOOR, SHADOW_EXCESS, SHADOW_WEIGHT, Factors
+
+BLOCKS = 64
+"""Parts the pixels are cut into. Sums are taken part by part, so results do not depend on the number of threads."""
+_FLOOR, _ROBUST, _SHADE = np.float32(DATA_FLOOR), np.float32(ROBUST), np.float32(SHADE_FLOOR)
+_EXCESS, _WEIGHT = np.float32(SHADOW_EXCESS), np.float32(SHADOW_WEIGHT)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+
+
+def _read_bits(context: Any, value: Any) -> Any:
+    """Read the bits of an int32 as a float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], context.get_value_type(types.float32))
+
+    return types.float32(types.int32), generate
+
+
+_bits: Any = intrinsic(_read_bits)
+
+
+@numba.njit(inline="always", fastmath=True)
+def _exp(x: Any) -> Any:
+    """Return e^x for x <= 0 to 1e-6 of it, in operations that run on several values at once; `math.exp` does not."""
+    y = max(x, np.float32(-80.0)) * np.float32(1.44269504)
+    whole = np.int32(y - np.float32(0.5))  # rounds to the nearest, since y <= 0
+    part = (y - np.float32(whole)) * np.float32(0.69314718)
+    series = np.float32(1.0 / 720.0) * part + np.float32(1.0 / 120.0)
+    series = series * part + np.float32(1.0 / 24.0)
+    series = series * part + np.float32(1.0 / 6.0)
+    series = series * part + np.float32(0.5)
+    series = (series * part + _ONE) * part + _ONE
+    return series * _bits((whole + np.int32(127)) << np.int32(23))
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True, error_model="numpy")
+def _pass(
+    normals: np.ndarray, albedo: np.ndarray, strength: np.ndarray, amplitudes: np.ndarray, sharpness: np.ndarray,
+    lights: np.ndarray, half: np.ndarray, shares: np.ndarray, images: np.ndarray, kept: np.ndarray,
+    total: np.ndarray, pixel: np.ndarray, light: np.ndarray, lobe: np.ndarray,
+) -> None:  # fmt: skip
+    """Add up the term and its gradients.
+
+    Args: normals (P, 3), albedo (P, 3), strength (P,), amplitudes (K,), sharpness (K,), lights (3, L), half (3, L),
+    shares (3, L) reciprocal intensities, images (P, 3, L), kept (P, L) 0 or 1. Written: total (B,), pixel (P, 7) for
+    normals, albedo and strength, light (B, 9, L) for directions, half vectors and log intensities, lobe (B, 2, K).
+    """
+    count, lamps = images.shape[0], images.shape[2]
+    for block in numba.prange(BLOCKS):
+        lobes = np.empty((LOBES, lamps), np.float32)
+        lag, bright, slope = np.empty(lamps, np.float32), np.empty(lamps, np.float32), np.empty(lamps, np.float32)
+        pull = np.empty(lamps, np.float32)
+        own = light[block]
+        summed = 0.0
+        for p in range(block * count // BLOCKS, (block + 1) * count // BLOCKS):
+            nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
+            scale = strength[p]
+            for i in range(lamps):
+                lag[i] = min(nx * half[0, i] + ny * half[1, i] + nz * half[2, i] - _ONE, _ZERO)
+                bright[i] = _ZERO
+                slope[i] = _ZERO
+            for k in range(LOBES):
+                height, sharp = amplitudes[k], sharpness[k]
+                for i in range(lamps):
+                    value = _exp(sharp * lag[i])
+                    lobes[k, i] = value
+                    bright[i] += height * value
+                    slope[i] += height * sharp * value
+            r0, r1, r2 = albedo[p, 0], albedo[p, 1], albedo[p, 2]
+            term = gx = gy = gz = g0 = g1 = g2 = gs = _ZERO
+            for i in range(lamps):
+                cosine = nx * lights[0, i] + ny * lights[1, i] + nz * lights[2, i]
+                lit = _ONE if cosine > _ZERO else _ZERO
+                shade, floor = max(cosine, _ZERO), max(cosine, _SHADE)
+                gloss = scale * bright[i]
+                # One channel at a time, written out: a loop of three is not merged with the loop over images.
+                y0 = images[p, 0, i] * shares[0, i]
+                y1 = images[p, 1, i] * shares[1, i]
+                y2 = images[p, 2, i] * shares[2, i]
+                s0, s1, s2 = r0 * floor, r1 * floor, r2 * floor
+                d0, d1, d2 = (r0 + gloss) * shade - y0, (r1 + gloss) * shade - y1, (r2 + gloss) * shade - y2
+                a0, a1, a2 = _ONE / (s0 * s0 + _FLOOR), _ONE / (s1 * s1 + _FLOOR), _ONE / (s2 * s2 + _FLOOR)
+                e0, e1, e2 = (np.sqrt(d0 * d0 * a0 + _ROBUST), np.sqrt(d1 * d1 * a1 + _ROBUST),
+                              np.sqrt(d2 * d2 * a2 + _ROBUST))  # fmt: skip
+                w0 = kept[p, i] * (_WEIGHT if d0 > _EXCESS * s0 else _ONE)
+                w1 = kept[p, i] * (_WEIGHT if d1 > _EXCESS * s1 else _ONE)
+                w2 = kept[p, i] * (_WEIGHT if d2 > _EXCESS * s2 else _ONE)
+                term += w0 * e0 + w1 * e1 + w2 * e2
+                q0, q1, q2 = w0 * d0 * a0 / e0, w1 * d1 * a1 / e1, w2 * d2 * a2 / e2
+                g0 += q0 * shade
+                g1 += q1 * shade
+                g2 += q2 * shade
+                glossy = (q0 + q1 + q2) * shade
+                gs += glossy * bright[i]
+                pull[i] = glossy * scale
+                by_cosine = lit * (q0 * (r0 + gloss) + q1 * (r1 + gloss) + q2 * (r2 + gloss))
+                by_lag = pull[i] * slope[i]
+                gx += by_cosine * lights[0, i] + by_lag * half[0, i]
+                gy += by_cosine * lights[1, i] + by_lag * half[1, i]
+                gz += by_cosine * lights[2, i] + by_lag * half[2, i]
+                own[0, i] += by_cosine * nx
+                own[1, i] += by_cosine * ny
+                own[2, i] += by_cosine * nz
+                own[3, i] += by_lag * nx
+                own[4, i] += by_lag * ny
+                own[5, i] += by_lag * nz
+                own[6, i] += q0 * y0
+                own[7, i] += q1 * y1
+                own[8, i] += q2 * y2
+            summed += float(term)
+            pixel[p, 0], pixel[p, 1], pixel[p, 2] = gx, gy, gz
+            pixel[p, 3], pixel[p, 4], pixel[p, 5] = g0, g1, g2
+            pixel[p, 6] = gs
+            for k in range(LOBES):
+                by_height = by_sharp = _ZERO
+                for i in range(lamps):
+                    by_height += pull[i] * lobes[k, i]
+                    by_sharp += pull[i] * lobes[k, i] * lag[i]
+                lobe[block, 0, k] += by_height
+                lobe[block, 1, k] += by_sharp * amplitudes[k]
+        total[block] = summed
+
+
+class _DataTerm(torch.autograd.Function):
+    """The mean of the robust differences, and its gradient found on the way."""
+
+    @staticmethod
+    def forward(context: Any, images: Tensor, kept: Tensor, *parts: Tensor) -> Tensor:
+        arrays = (part.detach().numpy() for part in parts)
+        normals, albedo, strength, amplitudes, sharpness, directions, half, logs = arrays
+        count, lamps = images.shape[0], images.shape[2]
+        total, pixel = np.zeros(BLOCKS), np.empty((count, 7), np.float32)
+        light, lobe = np.zeros((BLOCKS, 9, lamps), np.float32), np.zeros((BLOCKS, 2, LOBES), np.float32)
+        _pass(
+            normals, albedo, strength, amplitudes, sharpness, np.ascontiguousarray(directions.T),
+            np.ascontiguousarray(half.T), np.ascontiguousarray(np.exp(-logs.T)), images.numpy(), kept.numpy(), total,
+            pixel, light, lobe,
+        )  # fmt: skip
+        scale = 1.0 / images.numel()
+        lights = light.sum(axis=0, dtype=np.float64) * scale  # (9, L)
+        heights, sharps = lobe.sum(axis=0, dtype=np.float64) * scale
+        pixel *= scale
+        of_pixels = pixel[:, :3], pixel[:, 3:6], pixel[:, 6]
+        found = (*of_pixels, heights, sharps, lights[:3].T, lights[3:6].T, lights[6:].T)
+        context.save_for_backward(*(torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in found))
+        return torch.tensor(total.sum() * scale)
+
+    @staticmethod
+    def backward(context: Any, incoming: Tensor) -> tuple[Tensor | None, ...]:
+        return (None, None, *(part * incoming.float() for part in context.saved_tensors))
+
+
+def data_term(made: Factors, images: Tensor, kept: Tensor) -> Tensor:
+    """Return the mean of r (`sdps.refinement.image_model`) over pixels, channels and images; differentiable.
+
+    Args:
+        made: The model; float32 on the CPU.
+        images: (P, 3, L) float32, I, contiguous.
+        kept: (P, L) float32, 0 where an observation counts for nothing, else 1.
+    """
+    return _DataTerm.apply(images, kept, *(part.contiguous() for part in made))

@@ -1,0 +1,132 @@
+"""The image-formation model: a Lambertian surface with white highlights, directional lights, robust differences.
+
+Pixel p, image i, channel c; n unit normal, l unit direction to the light, v = (0, 0, 1), h = (l + v) / |l + v|:
+
+    q_pic = (rho_pc + S_pi) max(n_p . l_i, 0)                                           predicted radiance
+    S_pi  = s_p sum_k a_k exp(kappa_k (n_p . h_i - 1))                                  spherical Gaussians
+    y_pic = I_pic / e_ic                                                                radiance under equal lights
+    r_pic = w_pic sqrt((q_pic - y_pic)^2 / (sigma_pic^2 + 0.05) + 1e-4)                 robust difference
+    sigma_pic = rho_pc max(n_p . l_i, 0.05)                                             constant in the gradient
+
+with I divided by its mean over the object, and e by its own mean. w is 0 where a pixel is black although it is lit
+elsewhere (`shadowed`), 0.15 where it is darker than the model explains by half of sigma (a cast shadow), else 1.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+LOBES = 8
+DATA_FLOOR = 0.05
+"""Added to the squared scale of a difference, so that dark pixels do not outweigh bright ones."""
+ROBUST = 1e-4
+SHADE_FLOOR = 0.05
+SHADOW_EXCESS, SHADOW_WEIGHT = 0.5, 0.15
+_BLACK, _DARKER_SHARE = 0.1, 0.9
+
+
+class State(NamedTuple):
+    """What is refined; tensors float32, lengths and signs in the project's frame.
+
+    Attributes:
+        normals: (P, 3) towards unit length.
+        log_albedo: (P, 3) logarithm of rho.
+        log_strength: (P,) logarithm of s.
+        lobes: (K,) a_k before softplus.
+        log_sharpness: (K,) logarithm of kappa.
+        directions: (L, 3) from the surface to the light, towards unit length.
+        log_intensities: (L, 3).
+    """
+
+    normals: Tensor
+    log_albedo: Tensor
+    log_strength: Tensor
+    lobes: Tensor
+    log_sharpness: Tensor
+    directions: Tensor
+    log_intensities: Tensor
+
+
+class Factors(NamedTuple):
+    """The state as the model multiplies it.
+
+    Attributes:
+        normals: (P, 3) unit.
+        albedo: (P, 3).
+        strength: (P,).
+        amplitudes: (K,).
+        sharpness: (K,).
+        directions: (L, 3) unit.
+        half: (L, 3) unit half vectors.
+        log_intensities: (L, 3), the mean of their exponentials 1.
+    """
+
+    normals: Tensor
+    albedo: Tensor
+    strength: Tensor
+    amplitudes: Tensor
+    sharpness: Tensor
+    directions: Tensor
+    half: Tensor
+    log_intensities: Tensor
+
+
+def factors(state: State) -> Factors:
+    """Return what the model multiplies; differentiable."""
+    normals, directions = unit(state.normals), unit(state.directions)
+    logs = state.log_intensities
+    return Factors(
+        normals=normals,
+        albedo=state.log_albedo.exp(),
+        strength=state.log_strength.exp(),
+        amplitudes=torch.nn.functional.softplus(state.lobes),
+        sharpness=state.log_sharpness.exp(),
+        directions=directions,
+        half=unit(directions + directions.new_tensor([0.0, 0.0, 1.0])),
+        log_intensities=logs - logs.logsumexp((0, 1)) + np.log(logs.numel()),
+    )
+
+
+def unit(vectors: Tensor) -> Tensor:
+    """Return vectors (..., 3) at length 1."""
+    return vectors / vectors.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+
+
+def shadowed(radiance: Tensor) -> Tensor:  # (P, L) bool
+    """Return where a pixel is black: below a tenth of the mean of its darkest 90 % of images.
+
+    Args:
+        radiance: (P, 3, L), y with the first intensities.
+    """
+    grey = radiance.mean(dim=1)  # (P, L)
+    count = max(1, round(_DARKER_SHARE * grey.shape[1]))
+    darker = grey.sort(dim=1).values[:, :count].mean(dim=1, keepdim=True)
+    return grey < _BLACK * darker
+
+
+def difference(made: Factors, images: Tensor, dark: Tensor) -> Tensor:  # (P, 3, L)
+    """Return r of the module's text, plainly: the reference of `fused.data_term`, by autograd.
+
+    Args:
+        made: The model.
+        images: (P, 3, L), I.
+        dark: (P, L) bool, observations that count for nothing.
+    """
+    cosine = made.normals @ made.directions.T  # (P, L)
+    predicted = predict(made)
+    observed = images / made.log_intensities.exp().T  # (P, 3, L)
+    sigma = (made.albedo[..., None] * cosine.clamp_min(SHADE_FLOOR)[:, None]).detach()
+    gap = predicted - observed
+    weight = torch.where(gap > SHADOW_EXCESS * sigma, SHADOW_WEIGHT, 1.0) * ~dark[:, None]
+    return weight * (gap**2 / (sigma**2 + DATA_FLOOR) + ROBUST).sqrt()
+
+
+def predict(made: Factors) -> Tensor:  # (P, 3, L)
+    """Return q of the module's text."""
+    shade = (made.normals @ made.directions.T).clamp_min(0.0)  # (P, L)
+    lag = (made.normals @ made.half.T - 1.0).clamp_max(0.0)
+    lobes = (made.amplitudes[:, None, None] * (made.sharpness[:, None, None] * lag).exp()).sum(dim=0)
+    specular = made.strength[:, None] * lobes  # (P, L)
+    return (made.albedo[..., None] + specular[:, None]) * shade[:, None]

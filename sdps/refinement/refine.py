@@ -1,0 +1,236 @@
+"""Refine what a method found of an object: its normals and lights, until a simple model explains the photographs.
+
+The equations stand in `sdps.refinement.image_model`, the priors in `priors`.
+What was measured: docs/studies/refinement.md.
+"""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from render.shared.errors import InputError
+from render.shared.progress import progress_bar
+from sdps.inference.image_source import ImageSource, ObjectImages, survey
+from sdps.refinement.descent import Problem, Weights, solve
+from sdps.refinement.image_model import LOBES, State, difference, factors, shadowed
+from sdps.refinement.refined import Refined
+
+_FEWEST = 4
+_SHARPEST, _BROADEST = 300.0, 10.0
+_START_HEIGHT = -4.0
+_LIT_SHARE = 0.1
+_LEAST_ALBEDO = 1e-3
+_PART = 4096  # pixels worked on at once where arrays of all images are made
+CACHE_BYTES = 2**30
+"""Pixels gathered from the images are kept in memory up to so much, beyond it in a file of the temporary folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineConfig:
+    """How an object is refined. The defaults were chosen on DiLiGenT's ball, buddha, cow and pot2.
+
+    Attributes:
+        coarse_pixels: Pixels of the coarse grid, about.
+        iterations: On the coarse grid, with everything free.
+        boost: What the coarse grid's learning rates are multiplied by.
+        fine_iterations: On every pixel, with the lights as the coarse grid found them.
+        fine_boost: The same on every pixel.
+        fine_curl: Weight of the curl on every pixel.
+    """
+
+    coarse_pixels: int = 2800
+    iterations: int = 1000
+    boost: float = 4.0
+    fine_iterations: int = 120
+    fine_boost: float = 8.0
+    fine_curl: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("coarse_pixels", "iterations", "boost", "fine_boost", "fine_curl"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.fine_iterations < 0:
+            raise InputError(f"fine_iterations must not be negative, got {self.fine_iterations}")
+
+
+def refine(
+    images: ImageSource,
+    mask: np.ndarray,
+    normals: np.ndarray,
+    lights: np.ndarray,
+    intensities: np.ndarray,
+    *,
+    known: frozenset[str] = frozenset(),
+    config: RefineConfig | None = None,
+    stray: bool = True,
+) -> Refined:
+    """Refine normals and lights.
+
+    Args:
+        images: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time; read twice.
+        mask: (H, W) bool.
+        normals: (H, W, 3) unit, where a method put them.
+        lights: (L, 3) unit directions from the surface to the light.
+        intensities: (L,) or (L, 3).
+        known: `directions`, `intensities` or both, where these are given and must stay.
+        config: Iterations and rates.
+        stray: Take stray light off the images.
+
+    Raises:
+        InputError: fewer than four images, shapes that do not fit, or an object that is black.
+    """
+    config = config or RefineConfig()
+    _check(len(images), mask, normals, lights, intensities)
+    scene = survey(images, mask, 0, stray=stray)
+    stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
+    gains = np.broadcast_to(np.reshape(intensities, (len(images), -1)), (len(images), 3))
+    problem = _problem(scene, stride, gains)
+    begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
+    free = set(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
+    fine = config.fine_iterations if stride > 1 else 0
+    with progress_bar(None, total=config.iterations + fine, desc="refine", unit="iteration") as bar:
+        state = solve(
+            problem, _start(problem, begun, lights, gains), free=frozenset(free), iterations=config.iterations,
+            boost=config.boost, weights=Weights(), after=bar.update,
+        )  # fmt: skip
+        if stride > 1:
+            problem, state = _finer(scene, problem.mask, stride, state)
+        if fine:
+            state = solve(
+                problem, state, free=frozenset({"normals", "log_albedo", "log_strength"}), iterations=fine,
+                boost=config.fine_boost, weights=Weights(curl=(config.fine_curl, config.fine_curl)), after=bar.update,
+            )  # fmt: skip
+    return _result(scene, problem, state)
+
+
+def _check(count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> None:
+    if count < _FEWEST:
+        raise InputError(f"refinement needs at least {_FEWEST} images, got {count}")
+    if normals.shape != (*mask.shape, 3):
+        raise InputError(
+            f"refinement: mask {mask.shape} and normals {normals.shape} do not fit; give normals per pixel"
+        )
+    if lights.shape != (count, 3) or len(intensities) != count:
+        raise InputError(f"refinement: {count} images, but {len(lights)} lights and {len(intensities)} intensities")
+
+
+def _problem(scene: ObjectImages, stride: int, intensities: np.ndarray) -> Problem:
+    """Gather the pixels of a grid, image by image.
+
+    Raises:
+        InputError: they are black.
+    """
+    grid = scene.mask[::stride, ::stride]
+    values = _room((int(grid.sum()), 3, len(scene)))
+    for number in range(len(scene)):
+        values[:, :, number] = scene.read(number, number + 1)[0, ::stride, ::stride][grid]
+    mean = float(np.mean([part.mean(dtype=np.float64) for part in values.transpose(2, 0, 1)]))
+    if not mean > 0.0:
+        raise InputError("refinement: the object is black in every image")
+    gathered = torch.from_numpy(values)
+    gathered /= mean
+    shares = torch.from_numpy((intensities.mean() / intensities).astype(np.float32)).T  # (3, L)
+    kept = torch.from_numpy(_room((len(values), len(scene))))
+    for part in _parts(len(values)):
+        kept[part] = (~shadowed(gathered[part] * shares)).float()
+    return Problem(grid, gathered, kept)
+
+
+def _room(shape: tuple[int, ...]) -> np.ndarray:
+    """Return room for float32 values: in memory, or in a file if they are many."""
+    if 4 * np.prod(shape, dtype=np.int64) <= CACHE_BYTES:
+        return np.empty(shape, np.float32)
+    with tempfile.TemporaryFile() as file:  # its place on the disk goes with the array
+        return np.memmap(file, np.float32, "w+", shape=shape)
+
+
+def _parts(count: int) -> list[slice]:
+    return [slice(start, min(start + _PART, count)) for start in range(0, count, _PART)]
+
+
+def _start(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> State:
+    """Return the state that a method's normals and lights begin with."""
+    count = len(problem.images)
+    state = State(
+        normals=torch.from_numpy(np.array(normals, np.float32)),
+        log_albedo=torch.zeros(count, 3),
+        log_strength=torch.zeros(count),
+        lobes=torch.full((LOBES,), _START_HEIGHT),
+        log_sharpness=torch.linspace(np.log(_SHARPEST), np.log(_BROADEST), LOBES),
+        directions=torch.from_numpy(np.array(lights, np.float32)),
+        log_intensities=torch.from_numpy(np.log(np.maximum(intensities, 1e-6)).astype(np.float32)),
+    )
+    state.normals[:, 2].clamp_min_(1e-3)
+    return state._replace(log_albedo=_log_albedo(problem, state))
+
+
+def _log_albedo(problem: Problem, state: State) -> Tensor:  # (P, 3)
+    """Return the median over images of radiance by shading, where there is shading."""
+    made = factors(state)
+    found = torch.empty(len(problem.images), 3)
+    shares = torch.exp(-made.log_intensities).T  # (3, L)
+    for part in _parts(len(found)):
+        shade = (made.normals[part] @ made.directions.T).clamp_min(0.0)  # (p, L)
+        lit = shade > _LIT_SHARE * shade.mean(dim=1, keepdim=True)
+        ratio = problem.images[part] * shares / shade.clamp_min(1e-6)[:, None]
+        found[part] = ratio.masked_fill(~lit[:, None], torch.nan).nanmedian(dim=2).values
+    return found.nan_to_num(_LEAST_ALBEDO).clamp_min(_LEAST_ALBEDO).log()
+
+
+def _finer(scene: ObjectImages, coarse: np.ndarray, stride: int, state: State) -> tuple[Problem, State]:
+    """Return every pixel, and the state there: interpolated between the coarse pixels, with an albedo of its own."""
+    problem = _problem(scene, 1, factors(state).log_intensities.exp().numpy())
+    up = _interpolation(coarse, scene.mask, stride)
+    normals = up(state.normals.numpy())
+    state = state._replace(
+        normals=normals / normals.norm(dim=1, keepdim=True), log_strength=up(state.log_strength.numpy()[:, None])[:, 0]
+    )
+    return problem, state._replace(log_albedo=_log_albedo(problem, state))
+
+
+def _interpolation(coarse: np.ndarray, mask: np.ndarray, stride: int) -> Callable[[np.ndarray], Tensor]:
+    """Return what brings values (P, C) of the coarse pixels to all, bilinear; the nearest ones go on outside."""
+    nearest = tuple(ndimage.distance_transform_edt(~coarse, return_distances=False, return_indices=True))
+    places = np.argwhere(mask).T / stride
+
+    def up(values: np.ndarray) -> Tensor:
+        grid = np.zeros((*coarse.shape, values.shape[1]), np.float32)
+        grid[coarse] = values
+        filled = grid[nearest]
+        found = [ndimage.map_coordinates(filled[..., k], places, order=1, mode="nearest") for k in range(grid.shape[2])]
+        return torch.from_numpy(np.stack(found, axis=-1).astype(np.float32))
+
+    return up
+
+
+def _result(scene: ObjectImages, problem: Problem, state: State) -> Refined:
+    """Lay out what was found, and how far the model is from the images."""
+    made = factors(state)
+
+    def picture(values: Tensor) -> np.ndarray:
+        image = np.zeros((*scene.shape, *values.shape[1:]), np.float32)
+        image[scene.rows, scene.columns][problem.mask] = values.numpy()
+        return image
+
+    by_pixel, by_image = torch.empty(len(problem.images)), torch.zeros(len(scene))
+    for part in _parts(len(by_pixel)):
+        some = made._replace(normals=made.normals[part], albedo=made.albedo[part], strength=made.strength[part])
+        gaps = difference(some, problem.images[part], problem.kept[part] == 0.0)
+        by_pixel[part] = gaps.mean(dim=(1, 2))
+        by_image += gaps.mean(dim=1).sum(dim=0)
+    return Refined(
+        normals=picture(made.normals),
+        light_directions=made.directions.numpy(),
+        intensities=made.log_intensities.exp().numpy(),
+        albedo=picture(made.albedo),
+        strength=picture(made.strength),
+        amplitudes=made.amplitudes.numpy(),
+        sharpness=made.sharpness.numpy(),
+        pixel_residual=picture(by_pixel),
+        image_residual=(by_image / len(by_pixel)).numpy(),
+    )

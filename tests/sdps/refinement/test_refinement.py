@@ -1,0 +1,210 @@
+"""Refinement: the fused term against the plain one, recovery of lights and normals, ambiguity, damage."""
+
+import numpy as np
+import pytest
+import torch
+
+from render.shared.errors import InputError
+from sdps.core.estimate import Estimate
+from sdps.core.metrics import angle_degrees
+from sdps.methods import pretrained
+from sdps.methods.parse import parse
+from sdps.methods.runner import Runner
+from sdps.refinement.fused import data_term
+from sdps.refinement.image_model import LOBES, State, difference, factors
+from sdps.refinement.refine import RefineConfig, refine
+from sdps.refinement.refined import Refined
+
+QUICK = RefineConfig(coarse_pixels=700, iterations=600, fine_iterations=0)
+
+
+def bumpy(side: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """Return normals (side, side, 3) and mask of a smooth surface with hills, seen from the front."""
+    y, x = np.mgrid[1 : -1 : side * 1j, -1 : 1 : side * 1j]
+    mask = x**2 + y**2 < 0.8
+    height = 0.9 * np.sqrt(np.maximum(1.0 - 0.8 * (x**2 + y**2), 0.05)) + 0.08 * np.sin(5 * x) * np.cos(4 * y)
+    pitch = 2.0 / (side - 1)
+    down, across = np.gradient(height, pitch)
+    normals = np.stack([-across, down, np.ones_like(height)], axis=-1)  # rows run down
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True) * mask[..., None], mask
+
+
+def lit(normals: np.ndarray, count: int, seed: int, gloss: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return images (L, H, W, 3), directions and intensities: Lambert, and one white lobe."""
+    rng = np.random.default_rng(seed)
+    around, up = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.45, 1.0, count)
+    out = np.sqrt(1 - up**2)
+    lights = np.stack([out * np.cos(around), out * np.sin(around), up], axis=-1)
+    half = lights + np.array([0.0, 0.0, 1.0])
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    albedo = np.array([0.7, 0.5, 0.3])
+    shade = np.maximum(np.einsum("hwc,lc->lhw", normals, lights), 0.0)[..., None]
+    lobe = gloss * np.exp(40.0 * (np.einsum("hwc,lc->lhw", normals, half) - 1.0))[..., None]
+    intensities = rng.uniform(0.5, 1.5, count)
+    return ((albedo + lobe) * shade * intensities[:, None, None, None]).astype(np.float32), lights, intensities
+
+
+def turned(vectors: np.ndarray, degrees: float, seed: int) -> np.ndarray:
+    """Return unit vectors turned by that angle, each about an axis of its own."""
+    rng = np.random.default_rng(seed)
+    side = np.cross(vectors, rng.normal(size=vectors.shape))
+    side /= np.linalg.norm(side, axis=-1, keepdims=True) + 1e-12
+    found = np.cos(np.radians(degrees)) * vectors + np.sin(np.radians(degrees)) * side
+    found[..., 2] = np.maximum(found[..., 2], 0.05)
+    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+
+
+def bas_relief(normals: np.ndarray, lights: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return normals and lights under one bas-relief transform: they shade alike but for the albedo."""
+    change = np.array([[1.0, 0.0, 0.12], [0.0, 1.0, -0.08], [0.0, 0.0, 0.8]])
+    bent = normals @ np.linalg.inv(change)
+    bent /= np.linalg.norm(bent, axis=-1, keepdims=True) + 1e-12
+    moved = lights @ change.T
+    return bent * mask[..., None], moved / np.linalg.norm(moved, axis=1, keepdims=True)
+
+
+def errors(found: Refined, normals: np.ndarray, mask: np.ndarray, lights: np.ndarray) -> tuple[float, float]:
+    return (
+        float(angle_degrees(found.normals[mask], normals[mask]).mean()),
+        float(angle_degrees(found.light_directions, lights).mean()),
+    )
+
+
+def random_state(pixels: int, lights: int, seed: int = 0) -> tuple[State, torch.Tensor, torch.Tensor]:
+    torch.manual_seed(seed)
+    front = torch.tensor([0.0, 0.0, 1.5])
+    state = State(
+        torch.randn(pixels, 3) * 0.5 + front, torch.randn(pixels, 3) * 0.3 - 1.0, torch.randn(pixels) * 0.3,
+        torch.randn(LOBES), torch.linspace(5.7, 2.3, LOBES), torch.randn(lights, 3) * 0.5 + front,
+        torch.randn(lights, 3) * 0.2,
+    )  # fmt: skip
+    return state, torch.rand(pixels, 3, lights), (torch.rand(pixels, lights) > 0.1).float()
+
+
+def test_the_fused_term_and_its_gradient_are_those_of_the_plain_one() -> None:
+    state, images, kept = random_state(200, 13)
+    plain = State(*(part.double().requires_grad_() for part in state))
+    fused = State(*(part.clone().requires_grad_() for part in state))
+    slow = difference(factors(plain), images.double(), kept == 0.0).mean()
+    fast = data_term(factors(fused), images, kept)
+    slow.backward()
+    fast.backward()
+    assert float(fast) == pytest.approx(float(slow), rel=1e-5)
+    for name, one, other in zip(State._fields, plain, fused, strict=True):
+        scale = float(one.grad.abs().max())
+        assert float((one.grad - other.grad).abs().max()) < 1e-4 * scale, name
+
+
+@pytest.mark.parametrize("gloss", [0.0, 1.0], ids=["Lambertian", "one lobe"])
+def test_lights_and_normals_ten_degrees_off_are_found(gloss: float) -> None:
+    normals, mask = bumpy()
+    images, lights, intensities = lit(normals, 40, seed=1, gloss=gloss)
+    start = turned(normals, 10.0, seed=2) * mask[..., None]
+    found = refine(images, mask, start, turned(lights, 10.0, seed=3), np.ones(40), config=QUICK)
+    of_normals, of_lights = errors(found, normals, mask, lights)
+    assert of_normals < 2.0 and of_lights < 2.0
+    share = found.intensities.mean(axis=1) / intensities
+    assert np.std(share) / np.mean(share) < 0.03
+
+
+def test_a_bas_relief_transform_of_a_glossy_object_is_undone() -> None:
+    normals, mask = bumpy()
+    images, lights, intensities = lit(normals, 40, seed=1, gloss=1.0)
+    bent, moved = bas_relief(normals, lights, mask)
+    before = float(angle_degrees(bent[mask], normals[mask]).mean())
+    found = refine(images, mask, bent, moved, intensities, config=QUICK)
+    after, of_lights = errors(found, normals, mask, lights)
+    assert before > 4.0 and after < 0.4 * before and of_lights < 2.5
+
+
+def test_given_lights_stay() -> None:
+    normals, mask = bumpy()
+    images, lights, intensities = lit(normals, 16, seed=4)
+    start = turned(normals, 10.0, seed=2) * mask[..., None]
+    found = refine(
+        images, mask, start, lights, intensities, known=frozenset({"directions", "intensities"}), config=QUICK
+    )
+    assert np.allclose(found.light_directions, lights, atol=1e-6)
+    assert np.allclose(found.intensities[:, 0] * intensities.mean(), intensities, rtol=1e-5)
+    assert errors(found, normals, mask, lights)[0] < 1.0
+
+
+def test_a_corrupted_image_among_good_ones_does_not_matter_and_is_told() -> None:
+    normals, mask = bumpy()
+    images, lights, _ = lit(normals, 24, seed=5, gloss=1.0)
+    images[7] = images[7][::-1, ::-1]
+    start = turned(normals, 8.0, seed=2) * mask[..., None]
+    found = refine(images, mask, start, turned(lights, 8.0, seed=3), np.ones(24), config=QUICK)
+    good, begun = np.arange(24) != 7, turned(lights, 8.0, seed=3)
+    without = refine(images[good], mask, start, begun[good], np.ones(23), config=QUICK)
+    assert float(angle_degrees(found.normals[mask], without.normals[mask]).mean()) < 1.0
+    assert found.image_residual.argmax() == 7
+
+
+def test_the_same_twice() -> None:
+    normals, mask = bumpy(32)
+    images, lights, intensities = lit(normals, 12, seed=6)
+    quick = RefineConfig(coarse_pixels=200, iterations=30, fine_iterations=5)
+    first, second = (refine(images, mask, normals, lights, intensities, config=quick) for _ in range(2))
+    assert np.array_equal(first.normals, second.normals)
+    assert np.array_equal(first.light_directions, second.light_directions)
+
+
+def test_every_pixel_is_no_worse_than_the_coarse_grid() -> None:
+    normals, mask = bumpy(96)
+    images, lights, _ = lit(normals, 24, seed=7, gloss=0.5)
+    start, begun = turned(normals, 8.0, seed=2) * mask[..., None], turned(lights, 8.0, seed=3)
+    coarse = refine(images, mask, start, begun, np.ones(24), config=QUICK)
+    fine = refine(
+        images,
+        mask,
+        start,
+        begun,
+        np.ones(24),
+        config=RefineConfig(coarse_pixels=700, iterations=600, fine_iterations=120),
+    )
+    assert errors(fine, normals, mask, lights)[0] < errors(coarse, normals, mask, lights)[0] + 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"images": np.zeros((3, 8, 8, 3), np.float32)}, "at least 4 images, got 3"),
+        ({"images": np.zeros((6, 8, 8, 3), np.float32)}, "black in every image"),
+        ({"mask": np.zeros((8, 8), bool)}, "the mask is empty"),
+        ({"lights": np.ones((5, 3))}, "6 images, but 5 lights"),
+    ],
+)
+def test_what_cannot_be_refined_is_refused_in_one_line(change: dict, message: str) -> None:
+    given = {
+        "images": np.ones((6, 8, 8, 3), np.float32), "mask": np.ones((8, 8), bool),
+        "normals": np.tile([0.0, 0.0, 1.0], (8, 8, 1)), "lights": np.tile([0.0, 0.0, 1.0], (6, 1)),
+        "intensities": np.ones(6),
+    }  # fmt: skip
+    given |= change
+    with pytest.raises(InputError, match=message) as error:
+        refine(**given)
+    assert "\n" not in str(error.value)
+
+
+def test_any_method_that_gives_normals_is_refined_by_its_name() -> None:
+    method = parse("true+least-squares+refine", pretrained.require)
+    assert method.refined and method.name == "least-squares, true lights, refined"
+    normals, mask = bumpy()
+    images, lights, intensities = lit(normals, 16, seed=8, gloss=1.0)
+    estimate = Runner(method, pretrained.require).estimate(images, mask, lights, intensities)
+    start = estimate.diagnostics["start"]
+    assert isinstance(start, Estimate) and isinstance(estimate.diagnostics["refined"], Refined)
+    assert np.allclose(estimate.light_directions, lights, atol=1e-6)  # what is given stays
+    before, after = (float(angle_degrees(item.normals[mask], normals[mask]).mean()) for item in (start, estimate))
+    assert after < 0.3 * before
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("+refine", "want METHOD"), ("refine", "say what is refined"), ("constant+refine", "gives normals"),
+     ("shipped:lcnet+refine", "gives normals")],
+)  # fmt: skip
+def test_what_has_no_normals_is_not_refined(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        parse(text, pretrained.require)
