@@ -20,8 +20,7 @@ from pipelines.shared.flags import add_fields, from_flags
 from pipelines.shared.memory import timed
 from render.planning import light_sets
 from render.records.manifest import View
-from render.shared.config import to_plain
-from render.shared.errors import InputError
+from render.shared.config import check_fields, to_plain
 from render.shared.files import write_json, write_text
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
@@ -61,11 +60,8 @@ class BenchConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("size", "lights", "spp", "repeats", "path_repeats"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.bounces < 0:
-            raise InputError(f"bounces must not be negative, got {self.bounces}")
+        check_fields(self, "at least 1", "size", "lights", "spp", "repeats", "path_repeats")
+        check_fields(self, "not negative", "bounces")
 
 
 LABELS = {

@@ -25,7 +25,7 @@ from pipelines.bench.bench_scenes import write_scenes
 from pipelines.shared.flags import add_fields, add_out, from_flags
 from pipelines.shared.machines import hold, kinds, processor
 from pipelines.shared.memory import apart, peak_bytes, timed
-from render.shared.config import to_plain
+from render.shared.config import check_fields, to_plain
 from render.shared.errors import InputError
 from render.shared.files import write_json, write_text
 from render.shared.progress import progress_bar
@@ -85,9 +85,7 @@ class BenchTrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("seconds", "rounds", "scenes", "images"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
+        check_fields(self, "positive", "seconds", "rounds", "scenes", "images")
         if not self.models:
             raise InputError("models must name at least one; see `sdps models`")
         for model in self.models:

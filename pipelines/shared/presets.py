@@ -11,7 +11,7 @@ import yaml
 from pipelines.shared.stream_config import StreamConfig
 from render.planning import light_sets
 from render.planning.plan import DataConfig
-from render.shared.config import build, read_yaml, to_yaml
+from render.shared.config import build, check_fields, read_yaml, to_yaml
 from render.shared.errors import InputError, unknown
 from render.shared.files import write_text
 from sdps.inference.inference_config import InferenceConfig
@@ -54,9 +54,7 @@ class TestConfig(InferenceConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("spp", "repeats", "pictures"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_fields(self, "at least 1", "spp", "repeats", "pictures")
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 from 16 up, got {self.size}")
         if not 0 < self.intensity_range[0] <= self.intensity_range[1]:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from render.shared.config import check_fields
 from render.shared.errors import InputError
 
 
@@ -26,11 +27,7 @@ class StreamConfig:
     timeout: float = 600.0
 
     def __post_init__(self) -> None:
-        for name in ("window", "fresh", "depth", "recycle"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"stream.{name} must be positive, got {getattr(self, name)}")
-        for name in ("threads", "timeout"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"stream.{name} must not be negative, got {getattr(self, name)}")
+        check_fields(self, "positive", "window", "fresh", "depth", "recycle", section="stream")
+        check_fields(self, "not negative", "threads", "timeout", section="stream")
         if self.fresh > self.window:
             raise InputError(f"stream.fresh {self.fresh} must not exceed stream.window {self.window}")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from render.records.shards import HALF_LIMIT, Shard
+from render.shared.config import check_fields
 from render.shared.errors import InputError
 
 Complaints = Iterator[tuple[str, float]]
@@ -67,9 +68,9 @@ class Limits:
                 raise InputError(f"{name} is a share and must be in [0, 1], got {getattr(self, name)}")
         if self.depth_scale < 1:
             raise InputError(f"depth_scale is a factor and must be at least 1, got {self.depth_scale}")
-        for name in ("unit_error", "margin", "attached", "attached_direct", "dim", "weights_error"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
+        check_fields(
+            self, "not negative", "unit_error", "margin", "attached", "attached_direct", "dim", "weights_error"
+        )
 
 
 def values(shard: Shard, limits: Limits) -> Complaints:

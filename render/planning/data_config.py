@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from render.materials.surfaces import MOST_COMPONENTS, PATTERNS
 from render.planning import light_sets
+from render.shared.config import check_fields
 from render.shared.errors import InputError, unknown
 
 UPRIGHT = ("sculpture", "bunny")  # families that stand; others have no up
@@ -69,11 +70,8 @@ class DataConfig:
     min_normal_spread: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("views", "materials_per_view", "light_count", "spp", "tiles"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.seed < 0:
-            raise InputError(f"seed must not be negative, got {self.seed}")
+        check_fields(self, "at least 1", "views", "materials_per_view", "light_count", "spp", "tiles")
+        check_fields(self, "not negative", "seed")
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 from 16 up, got {self.size}")
         if not 0 <= self.bounces <= 16:

@@ -24,6 +24,7 @@ from render.records.manifest import SceneSpec
 from render.running.isolation import serve
 from render.running.messages import Begun, Done, Ended, Failed, Fatal, Message, Ready, WorkerConfig
 from render.running.process import Worker
+from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 
@@ -57,11 +58,8 @@ class RunOptions:
     keep_free: int = budget.KEEP_FREE
 
     def __post_init__(self) -> None:
-        for name in ("workers", "timeout", "keep_free"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
-        if self.recycle < 1:
-            raise InputError(f"recycle must be at least 1, got {self.recycle}")
+        check_fields(self, "not negative", "workers", "timeout", "keep_free")
+        check_fields(self, "at least 1", "recycle")
         if not 1 <= self.part <= self.parts:
             raise InputError(f"shard must be i/n with i from 1 to n, got {self.part}/{self.parts}")
 

@@ -8,7 +8,7 @@ import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import yaml
 
@@ -19,6 +19,32 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 T = TypeVar("T", bound="DataclassInstance")
+_BOUNDS = {
+    "positive": ("be positive", lambda value: value > 0),
+    "not negative": ("not be negative", lambda value: value >= 0),
+    "at least 1": ("be at least 1", lambda value: value >= 1),
+}
+
+
+def check_fields(
+    config: object, bound: Literal["positive", "not negative", "at least 1"], *names: str, section: str = ""
+) -> None:
+    """Refuse a configuration whose fields are out of bounds; NaN is.
+
+    Args:
+        config: What has the fields, numbers.
+        bound: What they must be.
+        names: The fields.
+        section: Section of the preset, where the field's name alone would not tell.
+
+    Raises:
+        InputError: the first that is not, with its value.
+    """
+    wanted, holds = _BOUNDS[bound]
+    for name in names:
+        value = getattr(config, name)
+        if not holds(value):
+            raise InputError(f"{section}{'.' if section else ''}{name} must {wanted}, got {value}")
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from render.shared.config import check_fields
 from render.shared.errors import InputError
 
 PAPER_TEST_FLOOR, PAPER_TEST_GAIN, PAPER_TEST_CLIP = 0.02, 1.5, 2.0
@@ -58,9 +59,7 @@ class Augmentation:
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
                 raise InputError(f"augmentation.{name} needs 0 < low <= high, got {low} and {high}")
-        for name in ("mean_level", "clip"):
-            if not getattr(self, name) > 0.0:
-                raise InputError(f"augmentation.{name} must be positive, got {getattr(self, name)}")
+        check_fields(self, "positive", "mean_level", "clip", section="augmentation")
         if self.mean_level >= self.clip:
             raise InputError(f"augmentation.mean_level {self.mean_level} must be below augmentation.clip {self.clip}")
         for name in ("biased", "frontal"):

@@ -62,13 +62,11 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
         InputError: an unknown name, weights that are not there, or parts that do not go together.
     """
     parts = [part.strip() for part in text.split("+")]
-    if not all(parts):
-        raise InputError(f"method {text!r}: want METHOD, LIGHTS+NORMALS or LIGHTS+SECOND+NORMALS, and +refine or not")
+    if parts == [REFINE]:
+        raise InputError(f"method {text}: say what is refined, as in sdps-plus+{REFINE}")
     if parts[-1] == REFINE:
-        if len(parts) == 1:
-            raise InputError(f"method {text}: say what is refined, as in sdps-plus+{REFINE}")
         return refined(parse("+".join(parts[:-1]), find))
-    if len(parts) > 3:
+    if not all(parts) or len(parts) > 3:
         raise InputError(f"method {text!r}: want METHOD, LIGHTS+NORMALS or LIGHTS+SECOND+NORMALS")
     if len(parts) > 1:
         return combine(parts[0], parts[-1], parts[1] if len(parts) == 3 else None, None, find)

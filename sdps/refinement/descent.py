@@ -7,12 +7,23 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from render.shared.errors import InputError
 from sdps.refinement.fused import data_term
-from sdps.refinement.image_model import Factors, State, factors, unit
+from sdps.refinement.image_model import Factors, State, factors
 from sdps.refinement.priors import Neighbours, anchor, curl, neighbours, roughness
 
+RATES = {
+    "normals": 0.01,
+    "log_albedo": 0.02,
+    "log_strength": 0.05,
+    "lobes": 0.05,
+    "log_sharpness": 0.01,
+    "directions": 0.003,
+    "log_intensities": 0.003,
+}
+"""Learning rates of Adam, by part of the state, before `boost`."""
 _LEAST_RATE = 0.02
 
 
@@ -37,18 +48,6 @@ class Weights(NamedTuple):
     shift: tuple[float, float] = (10.0, 0.03)
 
 
-class Rates(NamedTuple):
-    """Learning rates of Adam, by part of the state, before `boost`."""
-
-    normals: float = 0.01
-    log_albedo: float = 0.02
-    log_strength: float = 0.05
-    lobes: float = 0.05
-    log_sharpness: float = 0.01
-    directions: float = 0.003
-    log_intensities: float = 0.003
-
-
 class Problem(NamedTuple):
     """One grid of pixels.
 
@@ -71,7 +70,6 @@ def solve(
     iterations: int,
     boost: float,
     weights: Weights,
-    rates: Rates | None = None,
     after: Callable[[], object] = lambda: None,
 ) -> State:
     """Return the state after some iterations of Adam on the data term and the priors.
@@ -81,19 +79,17 @@ def solve(
         state: Where to start.
         free: Names of the parts of the state that move.
         iterations: How many.
-        boost: What the rates are multiplied by; they fall along a cosine.
+        boost: What `RATES` are multiplied by; they fall along a cosine.
         weights: Of the priors.
-        rates: Of Adam.
         after: Called after each iteration.
 
     Raises:
         InputError: the loss is no longer a number.
     """
-    rates, beside = rates or Rates(), neighbours(problem.mask)
+    beside = neighbours(problem.mask)
     state = State(*(part.clone().requires_grad_(name in free) for name, part in zip(State._fields, state, strict=True)))
-    groups = [{"params": [getattr(state, name)], "lr": getattr(rates, name), "base": getattr(rates, name)}
-              for name in State._fields if name in free]  # fmt: skip
-    adam, start = torch.optim.Adam(groups), unit(state.directions.detach())
+    groups = [{"params": [getattr(state, name)], "base": rate} for name, rate in RATES.items() if name in free]
+    adam, start = torch.optim.Adam(groups), normalize(state.directions.detach(), dim=-1)
     for number in range(iterations):
         part = number / max(iterations - 1, 1)
         for group in adam.param_groups:

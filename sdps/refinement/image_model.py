@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize, softplus
 
 LOBES = 8
 DATA_FLOOR = 0.05
@@ -75,23 +76,18 @@ class Factors(NamedTuple):
 
 def factors(state: State) -> Factors:
     """Return what the model multiplies; differentiable."""
-    normals, directions = unit(state.normals), unit(state.directions)
+    normals, directions = normalize(state.normals, dim=-1), normalize(state.directions, dim=-1)
     logs = state.log_intensities
     return Factors(
         normals=normals,
         albedo=state.log_albedo.exp(),
         strength=state.log_strength.exp(),
-        amplitudes=torch.nn.functional.softplus(state.lobes),
+        amplitudes=softplus(state.lobes),
         sharpness=state.log_sharpness.exp(),
         directions=directions,
-        half=unit(directions + directions.new_tensor([0.0, 0.0, 1.0])),
+        half=normalize(directions + directions.new_tensor([0.0, 0.0, 1.0]), dim=-1),
         log_intensities=logs - logs.logsumexp((0, 1)) + np.log(logs.numel()),
     )
-
-
-def unit(vectors: Tensor) -> Tensor:
-    """Return vectors (..., 3) at length 1."""
-    return vectors / vectors.norm(dim=-1, keepdim=True).clamp_min(1e-12)
 
 
 def shadowed(radiance: Tensor) -> Tensor:  # (P, L) bool

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-
-from sdps.refinement.image_model import unit
+from torch.nn.functional import normalize
 
 _STEEPEST = 0.1
 """Least n_z that slopes are taken with."""
@@ -70,7 +69,7 @@ def anchor(directions: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
 
     Bas-relief transforms stretch and shift all lights alike, and photographs of a matte object hardly resist them.
     """
-    unit_length = unit(directions)
+    unit_length = normalize(directions, dim=-1)
     ratio = _variance(unit_length) / _variance(start)
     stretch = ((0.5 * ratio.log()).abs() - _STRETCH_FREE).clamp_min(0.0)
     shift = ((unit_length - start).mean(dim=0).norm() - _SHIFT_FREE).clamp_min(0.0)

@@ -13,6 +13,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
@@ -51,11 +52,8 @@ class RefineConfig:
     fine_curl: float = 0.1
 
     def __post_init__(self) -> None:
-        for name in ("coarse_pixels", "iterations", "boost", "fine_boost", "fine_curl"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.fine_iterations < 0:
-            raise InputError(f"fine_iterations must not be negative, got {self.fine_iterations}")
+        check_fields(self, "positive", "coarse_pixels", "iterations", "boost", "fine_boost", "fine_curl")
+        check_fields(self, "not negative", "fine_iterations")
 
 
 def refine(
@@ -89,7 +87,8 @@ def refine(
     scene = survey(images, mask, 0, stray=stray)
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
     gains = np.broadcast_to(np.reshape(intensities, (len(images), -1)), (len(images), 3))
-    problem = _problem(scene, stride, gains)
+    values = _gathered(scene)
+    problem = _problem(values, scene.mask, stride, gains)
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
     free = set(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
     fine = config.fine_iterations if stride > 1 else 0
@@ -99,7 +98,7 @@ def refine(
             boost=config.boost, weights=Weights(), after=bar.update,
         )  # fmt: skip
         if stride > 1:
-            problem, state = _finer(scene, problem.mask, stride, state)
+            problem, state = _finer(values, scene.mask, problem.mask, stride, state)
         if fine:
             state = solve(
                 problem, state, free=frozenset({"normals", "log_albedo", "log_strength"}), iterations=fine,
@@ -119,26 +118,34 @@ def _check(count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray
         raise InputError(f"refinement: {count} images, but {len(lights)} lights and {len(intensities)} intensities")
 
 
-def _problem(scene: ObjectImages, stride: int, intensities: np.ndarray) -> Problem:
-    """Gather the pixels of a grid, image by image.
+def _gathered(scene: ObjectImages) -> np.ndarray:  # (P, 3, L) float32
+    """Read the object's pixels, image by image."""
+    values = _room((int(scene.mask.sum()), 3, len(scene)))
+    for number in range(len(scene)):
+        values[:, :, number] = scene.read(number, number + 1)[0][scene.mask]
+    return values
+
+
+def _problem(values: np.ndarray, mask: np.ndarray, stride: int, intensities: np.ndarray) -> Problem:
+    """Return the grid of every `stride`-th pixel; at 1 the pixels `values` are divided in place, not copied.
 
     Raises:
         InputError: they are black.
     """
-    grid = scene.mask[::stride, ::stride]
-    values = _room((int(grid.sum()), 3, len(scene)))
-    for number in range(len(scene)):
-        values[:, :, number] = scene.read(number, number + 1)[0, ::stride, ::stride][grid]
+    grid = np.zeros_like(mask)
+    grid[::stride, ::stride] = mask[::stride, ::stride]
+    if stride > 1:
+        values = values[grid[mask]]
     mean = float(np.mean([part.mean(dtype=np.float64) for part in values.transpose(2, 0, 1)]))
     if not mean > 0.0:
         raise InputError("refinement: the object is black in every image")
     gathered = torch.from_numpy(values)
     gathered /= mean
     shares = torch.from_numpy((intensities.mean() / intensities).astype(np.float32)).T  # (3, L)
-    kept = torch.from_numpy(_room((len(values), len(scene))))
+    kept = torch.from_numpy(_room((len(values), values.shape[2])))
     for part in _parts(len(values)):
         kept[part] = (~shadowed(gathered[part] * shares)).float()
-    return Problem(grid, gathered, kept)
+    return Problem(mask[::stride, ::stride], gathered, kept)
 
 
 def _room(shape: tuple[int, ...]) -> np.ndarray:
@@ -182,10 +189,12 @@ def _log_albedo(problem: Problem, state: State) -> Tensor:  # (P, 3)
     return found.nan_to_num(_LEAST_ALBEDO).clamp_min(_LEAST_ALBEDO).log()
 
 
-def _finer(scene: ObjectImages, coarse: np.ndarray, stride: int, state: State) -> tuple[Problem, State]:
+def _finer(
+    values: np.ndarray, mask: np.ndarray, coarse: np.ndarray, stride: int, state: State
+) -> tuple[Problem, State]:
     """Return every pixel, and the state there: interpolated between the coarse pixels, with an albedo of its own."""
-    problem = _problem(scene, 1, factors(state).log_intensities.exp().numpy())
-    up = _interpolation(coarse, scene.mask, stride)
+    problem = _problem(values, mask, 1, factors(state).log_intensities.exp().numpy())
+    up = _interpolation(coarse, mask, stride)
     normals = up(state.normals.numpy())
     state = state._replace(
         normals=normals / normals.norm(dim=1, keepdim=True), log_strength=up(state.log_strength.numpy()[:, None])[:, 0]

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from render.shared.config import check_fields
 from render.shared.errors import InputError
 from sdps.core.lighting import LightClasses, ReadOut
 from sdps.core.precision import Precision
@@ -97,9 +98,16 @@ class TrainingConfig:
             value = getattr(self, name)
             if value is not None and not (value > 0 and math.isfinite(value)):
                 raise InputError(f"{name} must be positive, got {value}")
-        for name in ("seed", "weight_decay", "clip_gradient", "workers", "validate_every", "validation_scenes"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name} must not be negative, got {getattr(self, name)}")
+        check_fields(
+            self,
+            "not negative",
+            "seed",
+            "weight_decay",
+            "clip_gradient",
+            "workers",
+            "validate_every",
+            "validation_scenes",
+        )
         if self.steps is not None and self.minutes is not None:
             raise InputError("steps and minutes are both set; keep one of them")
         if self.batch_scenes % self.accumulate:
@@ -199,8 +207,7 @@ class NormalTraining(TrainingConfig):
             raise InputError(f"light_blend must be in [0, 1], got {self.light_blend}")
         if not 0.0 <= self.min_object < 1.0:
             raise InputError(f"min_object must be in [0, 1), got {self.min_object}")
-        if self.lighting_weight < 0.0:
-            raise InputError(f"lighting_weight must not be negative, got {self.lighting_weight}")
+        check_fields(self, "not negative", "lighting_weight")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,9 +232,7 @@ class PixelTraining(NormalTraining):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("pixels_per_scene", "min_lights", "rotations"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_fields(self, "at least 1", "pixels_per_scene", "min_lights", "rotations")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,5 +259,4 @@ class JointTraining(NormalTraining):
             raise InputError(f"read_out must be expectation, the only one with a gradient, got {self.read_out}")
         if self.light_blend:
             raise InputError("light_blend must be 0: the normals' error reaches the lighting model through its lights")
-        if not self.normal_weight > 0.0:
-            raise InputError(f"normal_weight must be positive, got {self.normal_weight}")
+        check_fields(self, "positive", "normal_weight")
