@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import trimesh
+from threadpoolctl import threadpool_limits
 
 from render.shapes import blobby, primitives
 from render.shapes.geometry.mesh import TriangleMesh, load_mesh
@@ -37,12 +38,19 @@ def families() -> dict[str, str]:
 def load(name: str) -> TriangleMesh:
     """Build or read the shape `name`, centred and scaled so that its farthest vertex is at radius 1.
 
+    Matrix products run on one thread here: their last bits depend on how many there are, and a shape's must not.
+
     Args:
         name: `sphere`, `bunny`, `blobby:<seed>`, `sculpture:<seed>`, or the path of a mesh file.
 
     Raises:
         InputError: unknown name (with the nearest), bad seed, or a file that cannot be used.
     """
+    with threadpool_limits(1, "blas"):
+        return _load(name)
+
+
+def _load(name: str) -> TriangleMesh:
     base, colon, text = name.partition(":")
     family = FAMILIES.get(base)
     if family is None:
