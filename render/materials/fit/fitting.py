@@ -2,7 +2,6 @@
 
 python -m render.materials.fit.fitting --networks FILE.npz --out assets/materials [--only NAME ...]
 python -m render.materials.fit.fitting --networks FILE.npz --database rgl- --out assets/materials/held-out --only NAME
-... python -m render.materials.fit.fitting --networks FILE.npz --compare TABLE.md --published FILE.json
 """
 
 import argparse
@@ -18,7 +17,7 @@ from tqdm import tqdm
 
 from render.materials import model
 from render.materials.categories import category
-from render.materials.fit import candidates, solver, spheres
+from render.materials.fit import solver, spheres
 from render.materials.fit.network import Brdf, NetworkFile
 from render.materials.fit.spheres import Samples
 from render.materials.model import Material
@@ -203,10 +202,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--networks", type=Path, required=True, help="npz of weights, keys <database>__<name>__<layer>")
     parser.add_argument("--database", default="merl", choices=sorted(DATABASES), help="which networks (default: merl)")
-    parser.add_argument("--out", type=Path, help="folder for <name>.yaml")
+    parser.add_argument("--out", type=Path, required=True, help="folder for <name>.yaml")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="fit these materials only")
-    parser.add_argument("--compare", type=Path, metavar="FILE.md", help="fit other models too, write the table")
-    parser.add_argument("--published", type=Path, metavar="FILE.json", help="published ABC and SGD constants")
     arguments = parser.parse_args(argv)
     try:
         _run(arguments)
@@ -223,13 +220,6 @@ def _run(arguments: argparse.Namespace) -> None:
     for name in names:
         if name not in networks.names:
             raise unknown("material", name, networks.names)
-    if not (arguments.out or arguments.compare):
-        raise InputError("nothing to write: give --out, --compare or both")
-    if arguments.compare and arguments.database != "merl":
-        raise InputError("--compare: the published constants are of the MERL materials only; leave it out")
-    if arguments.compare and not arguments.published:
-        raise InputError("--compare needs --published FILE.json with the ABC and SGD constants")
-    published = candidates.read_published(arguments.published, names) if arguments.compare else {}
     fitter, errors = Fitter(), []
     for name in tqdm(names, desc="fit", disable=None):
         material = fitter.fit(
@@ -237,13 +227,8 @@ def _run(arguments: argparse.Namespace) -> None:
             terms=database.terms,
         )  # fmt: skip
         errors.append(material.fit_error)
-        if arguments.out:
-            write_text(arguments.out / f"{material.name}.yaml", to_yaml(material))
+        write_text(arguments.out / f"{material.name}.yaml", to_yaml(material))
     sys.stdout.write(f"{len(names)} materials, median sphere error {np.median(errors):.2%}, worst {max(errors):.2%}\n")
-    if arguments.compare:
-        table = candidates.compare(fitter.samples, fitter.test, networks, names, errors, published)
-        write_text(arguments.compare, table)
-        sys.stdout.write(table)
 
 
 if __name__ == "__main__":

@@ -1,25 +1,23 @@
 """The fitter recovers BRDFs that are known in closed form; the metric and the network reader behave."""
 
+import runpy
+from pathlib import Path
+
 import numpy as np
 import pytest
+from merl_support import glossy
 
 from render.materials import model
 from render.materials.categories import category
-from render.materials.fit import candidates, fitting, solver, spheres
+from render.materials.fit import fitting, solver, spheres
 from render.materials.fit.network import NetworkFile, half_difference
+from render.shared.errors import InputError
 from render.shared.seeds import generator
 
 
 @pytest.fixture(scope="module")
 def fitter() -> fitting.Fitter:
     return fitting.Fitter(samples=16_000)
-
-
-def glossy(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
-    """A diffuse term with a GGX lobe of roughness 0.1, coloured differently per channel."""
-    at = candidates.angles(wi, wo)
-    lobe = candidates.ggx(at, 0.1) * (0.04 + 0.96 * (1 - at.difference) ** 5)
-    return np.array([0.4, 0.1, 0.02]) / np.pi + lobe[:, None]
 
 
 def test_the_fit_recovers_a_known_glossy_brdf(fitter):
@@ -106,28 +104,32 @@ def test_the_command_line_explains_mistakes(tmp_path, capsys):
     network_file(tmp_path / "weights.npz")
     network_file(tmp_path / "broken.npz", drop="b2")
     (tmp_path / "text.npz").write_text("no")
-    (tmp_path / "published.json").write_text('{"abc": {"nylon": []}, "sgd": {}}')
     good = ["--networks", str(tmp_path / "weights.npz"), "--out", str(tmp_path)]
     for arguments, message in (
         ([*good, "--only", "nylom"], "did you mean 'nylon'"),
         (["--networks", str(tmp_path / "broken.npz"), "--out", str(tmp_path)], "merl__nylon__b2"),
         (["--networks", str(tmp_path / "text.npz"), "--out", str(tmp_path)], "cannot be read"),
-        (["--networks", str(tmp_path / "weights.npz")], "--out"),
-        ([*good, "--compare", str(tmp_path / "c.md")], "--published"),
-        ([*good, "--compare", "c.md", "--published", str(tmp_path / "published.json")], "no constants for 'nylon'"),
-        ([*good, "--compare", "c.md", "--published", str(tmp_path / "text.npz")], "expected JSON"),
     ):
         assert fitting.main(arguments) == 2
         assert message in capsys.readouterr().err
 
 
-def test_candidates_recover_their_own_form():
+def test_the_models_of_the_study_recover_their_own_form():
+    models = runpy.run_path(str(Path(__file__).parents[3] / "docs/scripts/material_models.py"))
     samples = spheres.fitting_samples(3000, generator(0, "candidates"))
-    at, target = candidates.angles(samples.wi, samples.wo), glossy(samples.wi, samples.wo)
-    fit = candidates.fit_two_ggx(target, candidates.residual_weight(target, samples), at)
+    at, target = models["angles"](samples.wi, samples.wo), glossy(samples.wi, samples.wo)
+    fit = models["fit_two_ggx"](target, models["residual_weight"](target, samples), at)
     test = spheres.sphere_image(48, spheres.hemisphere_lights(5, generator(1, "candidates")))
-    value = fit(candidates.angles(test.wi, test.wo))
+    value = fit(models["angles"](test.wi, test.wo))
     assert spheres.sphere_error(value, glossy(test.wi, test.wo), test) < 0.02
+
+
+def test_the_study_explains_missing_constants(tmp_path):
+    read = runpy.run_path(str(Path(__file__).parents[3] / "docs/scripts/material_models.py"))["read_published"]
+    for text, message in (('{"abc": {"nylon": []}, "sgd": {}}', "no constants for 'nylon'"), ("no", "expected JSON")):
+        (tmp_path / "published.json").write_text(text)
+        with pytest.raises(InputError, match=message):
+            read(tmp_path / "published.json", ["nylon"])
 
 
 def test_categories_of_names():
