@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fit_library import DATABASES, NetworkFile
 from scipy.optimize import least_squares
 from tqdm import tqdm
 
 from render.materials import model
-from render.materials.fit.fitting import DATABASES, Fitter
-from render.materials.fit.network import Brdf, NetworkFile
+from render.materials.fit.fitting import Brdf, Fitter
 from render.materials.fit.spheres import Samples, radiance_limit, sphere_error
 from render.shared.errors import InputError
 from render.shared.files import read_text

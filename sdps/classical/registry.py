@@ -1,4 +1,4 @@
-"""The classical methods by name, behind one call; a new one is a module and an entry in assets/classical_methods.yaml."""
+"""The classical methods by name, behind one call; a new one is a module and an entry of classical_methods.yaml."""
 
 import importlib
 import time
