@@ -128,21 +128,14 @@ def _scenes(sources: Sequence[Source], boxes: Sequence[Box], options: ImportOpti
     scenes = []
     ids = unique_names([_scene_id(source) for source in sources])
     for name, source, box in zip(ids, sources, boxes, strict=True):
-        directions = _directions(source, options)
-        scenes.append(
-            SceneSpec(
-                id=name,
-                seed=0,
-                split=options.split or source.split,
-                shape=f"imported:{source.shape}",
-                material=f"imported:{source.material}",
-                view=View(),
-                lights=tuple((float(x), float(y), float(z)) for x, y, z in directions.round(8)),
-                size=box.height if box.height == box.width else (box.height, box.width),
-                spp=0,
-                bounces=0,
-            )
-        )
+        directions = source.directions * (1.0, -1.0 if options.y_down else 1.0, 1.0)
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        scenes.append(SceneSpec(
+            id=name, seed=0, split=options.split or source.split, shape=f"imported:{source.shape}",
+            material=f"imported:{source.material}", view=View(),
+            lights=tuple((float(x), float(y), float(z)) for x, y, z in directions.round(8)),
+            size=box.height if box.height == box.width else (box.height, box.width), spp=0, bounces=0,
+        ))  # fmt: skip
     return scenes
 
 
@@ -151,12 +144,6 @@ def _scene_id(source: Source) -> str:
     if source.material == source.shape:
         return legal_name(source.shape)
     return f"{legal_name(source.shape)}_{legal_name(source.material)}"
-
-
-def _directions(source: Source, options: ImportOptions) -> np.ndarray:  # (L, 3) float64
-    """Return unit directions in our frame."""
-    directions = source.directions * (1.0, -1.0 if options.y_down else 1.0, 1.0)
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def crop_box(mask: np.ndarray, margin: int | None) -> Box:

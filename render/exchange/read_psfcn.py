@@ -10,8 +10,6 @@ from render.shared.files import read_text
 from render.shared.images import decode_normals, read_image
 from render.shared.tables import read_light_list, read_names
 
-SPLIT_LISTS = ("train", "val", "test")
-
 
 def psfcn_sources(tree: str | Path, note: Note | None = None) -> list[Source]:
     """List the samples of a PS-FCN / SDPS-Net training tree, by its train, val and test lists.
@@ -24,7 +22,7 @@ def psfcn_sources(tree: str | Path, note: Note | None = None) -> list[Source]:
         InputError: not such a tree, several trees, or a list the loaders would misread.
     """
     root = Path(tree)
-    lists = {split: root / f"{split}_mtrl.txt" for split in SPLIT_LISTS}
+    lists = {split: root / f"{split}_mtrl.txt" for split in ("train", "val", "test")}
     if not any(path.is_file() for path in lists.values()):
         refuse_several(root, "*/train_mtrl.txt", 1)
         raise InputError(f"{root}: no train_mtrl.txt or val_mtrl.txt; give the folder that holds them and Images/")

@@ -3,7 +3,6 @@
 Under a moving lamp the object changes and a dark, distant background does not, whatever steady light the room adds.
 """
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -30,23 +29,11 @@ the University of Washington's set).
 _SMALLEST = 1e-4
 
 
-@dataclass(eq=False)
 class Variation:
-    """Mean and variance of every pixel's brightness, gathered image by image (Welford's recurrence).
+    """Mean and variance of every pixel's brightness (H, W), gathered image by image (Welford's recurrence)."""
 
-    Attributes:
-        mean: (H, W) float32.
-        squares: (H, W) float32, sum of squared deviations from the mean.
-        count: Images so far.
-    """
-
-    shape: tuple[int, int]
-    mean: np.ndarray = field(init=False)
-    squares: np.ndarray = field(init=False)
-    count: int = 0
-
-    def __post_init__(self) -> None:
-        self.mean, self.squares = np.zeros(self.shape, np.float32), np.zeros(self.shape, np.float32)
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.mean, self.squares, self.count = np.zeros(shape, np.float32), np.zeros(shape, np.float32), 0
 
     def add(self, grey: np.ndarray) -> None:
         """Take in an image, (H, W) float32, finite."""

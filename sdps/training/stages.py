@@ -5,7 +5,7 @@ The trainer (`sdps.training.trainer`) knows nothing else about them.
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast, get_args
 
 import numpy as np
 import torch
@@ -80,12 +80,9 @@ class Stage(ABC):
         """Return how training samples are made."""
         config = self.config
         return SampleOptions(
-            seed=config.seed,
-            images=config.images,
-            size=config.size,
-            rescale=config.rescale,
+            seed=config.seed, images=config.images, size=config.size, rescale=config.rescale,
             augmentation=config.augmentation,
-        )
+        )  # fmt: skip
 
     def validation_options(self) -> SampleOptions:
         """Return how validation samples are made: whole images in the pose they were rendered."""
@@ -125,8 +122,7 @@ class LightingStage(Stage):
         """Return the loss, and direction and intensity errors of every read-out."""
         prediction = self.predict(batch)
         values = {"loss": float(self.network.loss(prediction, batch.directions, batch.intensities)["total"])}
-        read_outs: tuple[ReadOut, ...] = ("centre", "expectation", "peak")
-        for how in read_outs:
+        for how in get_args(ReadOut):
             suffix = "" if how == "centre" else f"_{how}"
             values |= light_errors(self.network.lights(prediction, how), batch, suffix)
         return values
