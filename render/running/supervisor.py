@@ -190,13 +190,10 @@ class _Run:
                 worker.take(self.queue.popleft())
         while self.queue and len(self.workers) < self.count:
             config = WorkerConfig(
-                folder=self.folder,
-                number=self.started,
-                threads=max(1, budget.cores() // self.count),
-                variant=self.variant,
-                llvm=str(self.llvm) if self.llvm else None,
+                folder=self.folder, number=self.started, threads=max(1, budget.cores() // self.count),
+                variant=self.variant, llvm=str(self.llvm) if self.llvm else None,
                 errors=self.errors / f"{self.started}.txt",
-            )
+            )  # fmt: skip
             self.workers.append(Worker(self.serve, config))
             self.started += 1
             self.workers[-1].take(self.queue.popleft())

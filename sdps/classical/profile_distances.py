@@ -86,15 +86,12 @@ def profile_distances(
         shapes = compressed(profiles * inverse)
         rows, normals, diagnostics = _embed_samples(shapes, observations.mask, samples, slope, rng)
         lights = find_lights(profiles[rows], shapes[rows], normals)
-        inverse = _inverse(lights.intensities)
+        gains = lights.intensities
+        inverse = np.where(gains > 0.0, 1.0 / np.maximum(gains, 1e-3), 1.0).astype(np.float32)
     mean = _mean_direction(lights)
     directions, intensities = lights.directions.astype(np.float32), lights.intensities.astype(np.float32)
     maps = observations.to_map(_spread(normalised(shapes), rows, normals))
     return Estimate(maps, directions, intensities, diagnostics | {"light_mean": mean, "curve": lights.curve})
-
-
-def _inverse(intensities: np.ndarray) -> np.ndarray:  # (L,) float32
-    return np.where(intensities > 0.0, 1.0 / np.maximum(intensities, 1e-3), 1.0).astype(np.float32)
 
 
 def _mean_direction(lights: Lights) -> float:

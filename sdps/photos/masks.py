@@ -64,7 +64,9 @@ def automatic_mask(variation: Variation) -> tuple[np.ndarray, str]:
     if changes.max() < 1e-3:
         raise InputError("nothing changes between the pictures; is the lamp on and moved? otherwise give a mask")
     threshold = threshold_otsu(changes)
-    mask = _largest_part(changes > threshold)
+    parts, count = ndimage.label(changes > threshold)  # 4-connected
+    largest = 1 + int(np.argmax(np.bincount(parts.ravel())[1:])) if count else 1
+    mask = ndimage.binary_fill_holes(parts == largest)
     doubt = _doubt(changes, mask, float(threshold))
     if doubt:
         return np.ones_like(mask), (
@@ -101,14 +103,6 @@ def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
 def border_share(mask: np.ndarray) -> float:
     """Return which share of the frame's outermost pixels belongs to the mask (H, W)."""
     return float(np.concatenate([mask[0], mask[-1], mask[1:-1, 0], mask[1:-1, -1]]).mean())
-
-
-def _largest_part(mask: np.ndarray) -> np.ndarray:
-    """Keep the largest 4-connected part and fill its holes."""
-    parts, count = ndimage.label(mask)
-    if count > 1:
-        mask = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
-    return ndimage.binary_fill_holes(mask)
 
 
 def _doubt(changes: np.ndarray, mask: np.ndarray, threshold: float) -> str:

@@ -153,7 +153,9 @@ class NormalStage(Stage):
         name: str | None = None,
     ) -> None:
         model = model or self.usual
-        super().__init__(name or model, model, config, normal_options(model, config))
+        options = {"intensity_range": list(config.augmentation.intensity_range)}
+        known = registry.network_options(model)
+        super().__init__(name or model, model, config, options if "intensity_range" in known else {})
         self.source = config.lights or registry.entry(model).lights
         assert lighting is not None or self.source in (TRUE_LIGHTS, ""), f"{model} needs a trained lighting model"
         self.lighting = freeze(lighting) if lighting and self.source not in (TRUE_LIGHTS, "") else None
@@ -230,13 +232,6 @@ def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:
         "intensity_range": [low, high],
     }
     return {name: value for name, value in values.items() if name in registry.network_options(model)}
-
-
-def normal_options(model: str, config: NormalTraining) -> dict[str, Any]:
-    """Return the options of a normal network that the configuration decides."""
-    if "intensity_range" not in registry.network_options(model):
-        return {}
-    return {"intensity_range": list(config.augmentation.intensity_range)}
 
 
 def freeze(model: TrainedModel) -> TrainedModel:
