@@ -73,12 +73,7 @@ def profile_distances(
         InputError: fewer than 10 images, bad options, no contour, profiles that vary along one direction only
             (coplanar lights, a planar or cylindrical object), or that have nothing to do with the contour.
     """
-    if slope not in ("contour", "distribution"):
-        raise InputError(f"slope must be 'contour' or 'distribution', got {slope!r}")
-    if samples < 100 or rounds < 1:
-        raise InputError("profile distances need samples >= 100 and rounds >= 1")
-    if _MINIMUM <= len(images) < _FEW:
-        _log.warning("%d images are few for profile distances; 100 or more are wanted", len(images))
+    _check(len(images), samples, slope, rounds)
     observations = observe(images, mask, minimum=_MINIMUM)
     profiles = np.maximum(observations.grey(), 0.0).astype(np.float32)
     rng, inverse = generator(seed, "profile_distances"), _first_inverse(profiles)
@@ -92,6 +87,16 @@ def profile_distances(
     directions, intensities = lights.directions.astype(np.float32), lights.intensities.astype(np.float32)
     maps = observations.to_map(_spread(normalised(shapes), rows, normals))
     return Estimate(maps, directions, intensities, diagnostics | {"light_mean": mean, "curve": lights.curve})
+
+
+def _check(images: int, samples: int, slope: str, rounds: int) -> None:
+    """Refuse options that make no sense, and warn of few images."""
+    if slope not in ("contour", "distribution"):
+        raise InputError(f"slope must be 'contour' or 'distribution', got {slope!r}")
+    if samples < 100 or rounds < 1:
+        raise InputError("profile distances need samples >= 100 and rounds >= 1")
+    if _MINIMUM <= images < _FEW:
+        _log.warning("%d images are few for profile distances; 100 or more are wanted", images)
 
 
 def _mean_direction(lights: Lights) -> float:
