@@ -88,22 +88,22 @@ class Plan:
     def describe(self, preset: Preset) -> str:
         """Say what will be done and how long that takes."""
         total = _OTHER_MINUTES + sum(self.minutes.values()) + self.evaluation_minutes
-        shapes = " and ".join(preset.test.shapes)
+        images = {name: 60 * minutes * self.images_per_second[name] for name, minutes in self.minutes.items()}
         lines = [
             f"Networks compute in {self.arithmetic}.",
             "1. Render the training scenes: about 3 to 5 minutes on two cores.",
             "2. Train, from random weights:",
             *(
-                f"   {name}: {minutes:.1f} minutes at about {self.images_per_second[name]:.0f} images/s, "
-                f"{60 * minutes * self.images_per_second[name]:,.0f} images"
-                for name, minutes in self.minutes.items()
+                f"   {name}: {self.minutes[name]:.1f} minutes at about {self.images_per_second[name]:.0f} images/s, "
+                f"{count:,.0f} images"
+                for name, count in images.items()
             ),
-            f"3. Render and score {shapes} in {self.materials} materials: about {self.evaluation_minutes:.0f} minutes.",
+            f"3. Render and score {' and '.join(preset.test.shapes)} in {self.materials} materials: about "
+            f"{self.evaluation_minutes:.0f} minutes.",
             "4. Regenerate test scenes in materials of your choice: seconds.",
             f"In all about {total:.0f} minutes. Stopped with Ctrl-C, the same command goes on where it was.",
         ]
-        short = [name for name, minutes in self.minutes.items()
-                 if 60 * minutes * self.images_per_second[name] < 0.8 * NEEDS[name].images]  # fmt: skip
+        short = [name for name, count in images.items() if count < 0.8 * NEEDS[name].images]
         if short:
             lines.append(
                 f"This machine is slower than those the demo is made for: expect less of {', '.join(short)}, or give "

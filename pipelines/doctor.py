@@ -51,6 +51,9 @@ def _fix() -> None:
 
 def examine(folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
     """Return the report's (name, text) lines and the remedies for what is missing."""
+    from sdps.core.precision import arithmetic
+    from sdps.inference.estimator import default_device
+
     problems: list[str] = []
     lines = [("python", f"{platform.python_version()} ({platform.machine()}, {platform.system()})")]
     for package in PACKAGES:
@@ -60,7 +63,7 @@ def examine(folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
             lines.append((package, "not installed"))
             problems.append(f"{package}: pip install -c constraints.txt .")
     lines += _variant_lines(problems)
-    lines.append(("arithmetic", _arithmetic()))
+    lines.append(("arithmetic", arithmetic("auto", default_device()).describe()))
     lines.append(("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())))
     free = shutil.disk_usage(folder).free / 1e9
     lines.append(("free disk", f"{free:.1f} GB"))
@@ -98,14 +101,6 @@ def _variant_lines(problems: list[str]) -> list[tuple[str, str]]:
     else:
         lines.append(("GPU", "none; everything runs on the CPU"))
     return lines
-
-
-def _arithmetic() -> str:
-    """Say what networks compute in on this machine, and why."""
-    from sdps.core.precision import arithmetic
-    from sdps.inference.estimator import default_device
-
-    return arithmetic("auto", default_device()).describe()
 
 
 def _loads(library: str) -> bool:

@@ -157,17 +157,10 @@ def render_views(
     if not covers:
         raise InputError("materials: at least one is needed")
     first = SceneSpec(
-        id="view-0",
-        seed=seed,
-        split="test",
-        shape=str(shape) if isinstance(shape, str | Path) else "mesh",
-        material=covers[0].name,
-        view=_view(rotation, scale, offset),
-        lights=tuple(map(tuple, _lights(lights).tolist())),
-        size=size,
-        spp=spp,
-        bounces=bounces,
-    )
+        id="view-0", seed=seed, split="test", shape=str(shape) if isinstance(shape, str | Path) else "mesh",
+        material=covers[0].name, view=_view(rotation, scale, offset),
+        lights=tuple(map(tuple, _lights(lights).tolist())), size=size, spp=spp, bounces=bounces,
+    )  # fmt: skip
     return _rendered(_shape(shape), covers, first)
 
 

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from sdps.surface.meshing import mesh, write_mesh
 from sdps.surface.relight import fit_albedo, lit, relit, residuals
 from sdps.surface.views import strip
 
-T = TypeVar("T")
 GRAZING, DARK = 0.1, 0.5
 """A pixel is in cast shadow where n . l is over the first, and its radiance under the second times Lambert's."""
 STEPS = ("integrate", "discontinuities", "mesh", ".ply", ".glb", ".obj", "views", "cast shadows", "albedo", "residuals")
@@ -134,16 +133,16 @@ def _work(step: str, config: BenchClassicalConfig) -> dict[str, Any]:
     if step not in ("albedo", "residuals"):
         images = images[:1]
     kind = step.partition(".")[0]  # of file formats, nothing
-    depth = integrate(normals, mask) if kind in ("mesh", "views", "cast shadows", "") else None
-    surface = mesh(_made(depth), normals=normals) if not kind else None
+    depth: Any = integrate(normals, mask) if kind in ("mesh", "views", "cast shadows", "") else None
+    surface: Any = mesh(depth, normals=normals) if not kind else None
     albedo = np.full((*mask.shape, 3), 0.5, np.float32)
     with tempfile.TemporaryDirectory() as folder:
         actions = {
             "integrate": lambda: integrate(normals, mask),
             "discontinuities": lambda: integrate(normals, mask, discontinuities=True),
-            "mesh": lambda: mesh(_made(depth), normals=normals),
-            "": lambda: write_mesh(_made(surface), Path(folder) / f"object{step}"),
-            "views": lambda: strip(_made(depth)),
+            "mesh": lambda: mesh(depth, normals=normals),
+            "": lambda: write_mesh(surface, Path(folder) / f"object{step}"),
+            "views": lambda: strip(depth),
             "cast shadows": lambda: relit(normals, albedo, LOW_LIGHT, depth=depth),
             "albedo": lambda: fit_albedo(images, mask, normals, lights, gains),
             "residuals": lambda: residuals(images, mask, normals, lights, gains, albedo),
@@ -151,12 +150,6 @@ def _work(step: str, config: BenchClassicalConfig) -> dict[str, Any]:
         before = peak_gib()
         seconds = timed(actions[kind])
     return {"seconds": seconds, "before_gib": before, "peak_gib": peak_gib(), "pixels": int(mask.sum())}
-
-
-def _made(thing: T | None) -> T:
-    """Return what a step works on, which was made because the step needs it."""
-    assert thing is not None
-    return thing
 
 
 def _depth_table(depths: Sequence[dict[str, Any]]) -> str:

@@ -182,8 +182,8 @@ def _ways(
             continue
         trainer = make_trainer(replace(training(config, model), **changes), model, folder, scratch / name)
         if name == MUON:
-            step = partial(_note_time, updates, trainer.optimiser.step)
-            trainer.optimiser.step = step  # type: ignore[method-assign]
+            update = trainer.optimiser.step
+            trainer.optimiser.step = lambda update=update: updates.append(timed(update))  # type: ignore
         ways[name] = partial(trainer.take_step, batch, 0.5)
 
     def one_thread() -> None:
@@ -198,10 +198,6 @@ def _ways(
     else:
         skipped[ONE_THREAD] = "there is no other"
     return ways, skipped
-
-
-def _note_time(seconds: list[float], action: Callable[[], object]) -> None:
-    seconds.append(timed(action))
 
 
 def _warm_up(ways: dict[str, Callable[[], object]]) -> dict[str, str]:

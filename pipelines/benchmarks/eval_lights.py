@@ -6,14 +6,13 @@ Gourd&Apple (Alldrin et al. 2008) and the Light Stage Data Gallery (Einarsson et
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from pipelines.benchmarks import suite
 from pipelines.benchmarks.lit_photographs import GOURD_APPLE, LIGHT_STAGE, gourd_apple_objects, light_stage_objects
 from pipelines.evaluate.evaluation import TestObject
 from render.shared.errors import InputError
 from sdps.methods import select
-from sdps.methods.method import CONSTANT, Method
+from sdps.methods.method import CONSTANT
 from sdps.models.registry import TRUE_LIGHTS
 
 
@@ -56,7 +55,10 @@ def main(args: argparse.Namespace) -> int:
         raise InputError(f"--methods: {given.name} is given the lights, so there is nothing to score")
     items, about = read(args)
     items = suite.pick(items, args.objects)
-    chosen = chosen or default_methods(select.runs_folder(args.models))
+    if not chosen:  # every method that finds lights, and the paper's pair for its normals
+        models = select.runs_folder(args.models)
+        pairs = [method for method in select.every_method(models) if method.paper == "B1" or method.second]
+        chosen = [*select.lighting_rows(models), *pairs, *select.classical_rows(calibrated=False)]
     return suite.evaluate(
         bench, args, items, chosen, text=definition(bench, items, about, args.longest_side),
         protocol={name: getattr(args, name) for name in ("measured_lights", "least_z", "gamma", "longest_side")},
@@ -81,12 +83,6 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError(f"--gamma {args.gamma:g}: must be positive")
     if args.longest_side < 0 or 0 < args.longest_side < 16:
         raise InputError(f"--longest-side {args.longest_side}: must be 0 or at least 16 pixels")
-
-
-def default_methods(models: Path | None) -> list[Method]:
-    """Return every method that finds lights, and the paper's pair for its normals."""
-    pairs = [method for method in select.every_method(models) if method.paper == "B1" or method.second]
-    return [*select.lighting_rows(models), *pairs, *select.classical_rows(calibrated=False)]
 
 
 def definition(bench: suite.Benchmark, items: Sequence[TestObject], about: str, longest: int) -> str:

@@ -74,10 +74,11 @@ def object_table(
     official = any(name in known for name in present)
     columns = [*(known if official else ()), *(name for name in present if name not in known)]
     entries: list[tuple[str, str, dict[str, float], float | None, Sequence[str]]] = [
-        (name, OURS, _scores(found, metric), None, [key for key, one in found.items() if one.reason])
+        (name, OURS, {key: one.scores[metric] for key, one in found.items() if metric in one.scores}, None,
+         [key for key, one in found.items() if one.reason])
         for name, found in results.items()
         if any(metric in result.scores or result.reason for result in found.values())
-    ]
+    ]  # fmt: skip
     ours = len(entries)
     entries += [(one.method, one.source, one.figures, one.average, ()) for one in published] if official else []
     rows = []
@@ -90,10 +91,6 @@ def object_table(
     last += [f"all {len(known)}"] if official else []
     header, theirs = ("method", "source", *columns, *last), tuple(range(ours, len(rows)))
     return Table(title=title, header=header, rows=tuple(rows), published=theirs, note=note)
-
-
-def _scores(found: Mapping[str, Result], metric: str) -> dict[str, float]:
-    return {name: result.scores[metric] for name, result in found.items() if metric in result.scores}
 
 
 def _mean(figures: Mapping[str, float], names: Sequence[str]) -> float | None:

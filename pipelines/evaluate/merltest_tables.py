@@ -73,7 +73,7 @@ def normal_table(results: Sequence[SceneScores], methods: Sequence[Method], *, a
 def _rows(
     results: Sequence[SceneScores],
     methods: Sequence[Method],
-    paper: dict[str, tuple[Any, ...]],
+    paper: dict[str, list[Any]],
     metrics: tuple[str, ...],
     all_rows: bool,
 ) -> tuple[tuple[str, ...], ...]:

@@ -30,20 +30,13 @@ def test_scenes(config: TestConfig) -> list[SceneSpec]:
     directions = tuple((round(x, 6), round(y, 6), round(z, 6)) for x, y, z in loaded)
     scenes = [
         SceneSpec(
-            id=f"{slug(shape)}-{slug(material)}",
-            seed=derived_seed(config.seed, "test", shape),
-            split="test",
-            shape=shape,
-            material=material,
-            view=View(scale=config.scale),
-            lights=directions,
-            size=config.size,
-            spp=config.spp,
-            bounces=config.bounces,
+            id=f"{slug(shape)}-{slug(material)}", seed=derived_seed(config.seed, "test", shape), split="test",
+            shape=shape, material=material, view=View(scale=config.scale), lights=directions, size=config.size,
+            spp=config.spp, bounces=config.bounces,
         )
         for shape in config.shapes
         for material in pool
-    ]
+    ]  # fmt: skip
     names = [scene.id for scene in scenes]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:

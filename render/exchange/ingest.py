@@ -126,37 +126,18 @@ def ingest(tree: str | Path, out: str | Path, options: ImportOptions) -> ImportR
 def _scenes(sources: Sequence[Source], boxes: Sequence[Box], options: ImportOptions) -> list[SceneSpec]:
     """Describe each sample as a manifest line; fields only a renderer has are zero."""
     scenes = []
-    ids = unique_names([_scene_id(source) for source in sources])
-    for name, source, box in zip(ids, sources, boxes, strict=True):
-        directions = _directions(source, options)
-        scenes.append(
-            SceneSpec(
-                id=name,
-                seed=0,
-                split=options.split or source.split,
-                shape=f"imported:{source.shape}",
-                material=f"imported:{source.material}",
-                view=View(),
-                lights=tuple((float(x), float(y), float(z)) for x, y, z in directions.round(8)),
-                size=box.height if box.height == box.width else (box.height, box.width),
-                spp=0,
-                bounces=0,
-            )
-        )
+    # `_` parts shape and material.
+    ids = ["_".join(map(legal_name, dict.fromkeys((source.shape, source.material)))) for source in sources]
+    for name, source, box in zip(unique_names(ids), sources, boxes, strict=True):
+        directions = source.directions * (1.0, -1.0 if options.y_down else 1.0, 1.0)
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        scenes.append(SceneSpec(
+            id=name, seed=0, split=options.split or source.split, shape=f"imported:{source.shape}",
+            material=f"imported:{source.material}", view=View(),
+            lights=tuple((float(x), float(y), float(z)) for x, y, z in directions.round(8)),
+            size=box.height if box.height == box.width else (box.height, box.width), spp=0, bounces=0,
+        ))  # fmt: skip
     return scenes
-
-
-def _scene_id(source: Source) -> str:
-    """Name a scene after its sample; `_` parts shape and material."""
-    if source.material == source.shape:
-        return legal_name(source.shape)
-    return f"{legal_name(source.shape)}_{legal_name(source.material)}"
-
-
-def _directions(source: Source, options: ImportOptions) -> np.ndarray:  # (L, 3) float64
-    """Return unit directions in our frame."""
-    directions = source.directions * (1.0, -1.0 if options.y_down else 1.0, 1.0)
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def crop_box(mask: np.ndarray, margin: int | None) -> Box:
@@ -185,15 +166,10 @@ def _shard(source: Source, box: Box, scene: SceneSpec, options: ImportOptions) -
     found = frame.faults(images, normals, mask, scene.light_directions())
     provenance = _provenance(source, truth, box, scene, options, bits, exposure)
     shard = Shard(
-        scene_id=scene.id,
-        images=to_half(images),
-        normals=normals,
-        depth=np.zeros(mask.shape, np.float32),
-        mask=mask,
-        coverage=mask.astype(np.float32),
-        light_directions=scene.light_directions(),
+        scene_id=scene.id, images=to_half(images), normals=normals, depth=np.zeros(mask.shape, np.float32), mask=mask,
+        coverage=mask.astype(np.float32), light_directions=scene.light_directions(),
         provenance=provenance | {"frame_check": "; ".join(found) or "passed"},
-    )
+    )  # fmt: skip
     return shard, found
 
 

@@ -15,7 +15,7 @@ from render.exchange.foreign_samples import (
     read_mask,
     refuse_several,
     size_text,
-)  # fmt: skip
+)
 from render.shared.errors import InputError
 from render.shared.files import read_text
 from render.shared.images import decode_normals, read_image

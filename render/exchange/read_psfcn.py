@@ -4,13 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from render.exchange.foreign_samples import Note, Source, Truth, checked_truth, noted, refuse_several
+from render.exchange.foreign_samples import Note, Source, checked_truth, noted, refuse_several
 from render.shared.errors import InputError
 from render.shared.files import read_text
 from render.shared.images import decode_normals, read_image
 from render.shared.tables import read_light_list, read_names
-
-SPLIT_LISTS = ("train", "val", "test")
 
 
 def psfcn_sources(tree: str | Path, note: Note | None = None) -> list[Source]:
@@ -24,7 +22,7 @@ def psfcn_sources(tree: str | Path, note: Note | None = None) -> list[Source]:
         InputError: not such a tree, several trees, or a list the loaders would misread.
     """
     root = Path(tree)
-    lists = {split: root / f"{split}_mtrl.txt" for split in SPLIT_LISTS}
+    lists = {split: root / f"{split}_mtrl.txt" for split in ("train", "val", "test")}
     if not any(path.is_file() for path in lists.values()):
         refuse_several(root, "*/train_mtrl.txt", 1)
         raise InputError(f"{root}: no train_mtrl.txt or val_mtrl.txt; give the folder that holds them and Images/")
@@ -51,14 +49,9 @@ def _psfcn_source(root: Path, entry: str, split: str, listed: Path) -> Source:
     shape, material = entry.split("/")
     folder = root / "Images" / shape / material
     names, directions = read_light_list(folder / f"{shape}_{material}.txt")
+    normals = root / "Images" / shape / f"{shape}_normal.png"  # its background tells the mask
     return Source(
         name=f"{shape}_{material}", shape=shape, material=material, split=split, folder=folder,
         where=f"Images/{entry}", images=tuple(names), directions=directions, intensities=np.ones_like(directions),
-        truth=lambda: _coloured_truth(root / "Images" / shape / f"{shape}_normal.png"),
+        truth=lambda: checked_truth(*decode_normals(read_image(normals)), normals),
     )  # fmt: skip
-
-
-def _coloured_truth(path: Path) -> Truth:
-    """Read a normal map and the mask that follows from it."""
-    normals, mask = decode_normals(read_image(path))
-    return checked_truth(normals, mask, path)

@@ -117,16 +117,12 @@ class Work:
 
     def _done(self, scene: Any) -> None:
         stages = self.stages.lap()
-        line = {
-            "id": scene.id,
-            "spec": scene.digest(),
-            "bytes": (self.config.folder / scene.file).stat().st_size,
+        self.send(Done({
+            "id": scene.id, "spec": scene.digest(), "bytes": (self.config.folder / scene.file).stat().st_size,
             "seconds": round(sum(stages.values()), 4),
             "stages": {name: round(seconds, 4) for name, seconds in stages.items()},
-            "time": now(),
-            "worker": self.config.number,
-        }
-        self.send(Done(line))
+            "time": now(), "worker": self.config.number,
+        }))  # fmt: skip
         self.start = time.perf_counter()
 
     def _failed(self, ids: Collection[str], error: Exception) -> None:

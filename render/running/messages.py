@@ -1,12 +1,10 @@
 """What a rendering process is told at its start, and what it tells its parent through a pipe."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 
-@dataclass(frozen=True)
-class WorkerConfig:
+class WorkerConfig(NamedTuple):
     """What a rendering process is told at its start.
 
     Attributes:
@@ -26,27 +24,23 @@ class WorkerConfig:
     errors: Path
 
 
-@dataclass(frozen=True)
-class Ready:
+class Ready(NamedTuple):
     """The renderer has started."""
 
 
-@dataclass(frozen=True)
-class Begun:
+class Begun(NamedTuple):
     """Scenes are at work."""
 
     ids: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Done:
+class Done(NamedTuple):
     """A shard is written; its ledger line."""
 
     line: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Failed:
+class Failed(NamedTuple):
     """Scenes cannot be rendered: why, the end of the traceback of a defect, and the seconds they took."""
 
     ids: tuple[str, ...]
@@ -55,15 +49,13 @@ class Failed:
     seconds: float
 
 
-@dataclass(frozen=True)
-class Ended:
+class Ended(NamedTuple):
     """A chunk is finished, or given up where the process is no longer sound."""
 
     sound: bool
 
 
-@dataclass(frozen=True)
-class Fatal:
+class Fatal(NamedTuple):
     """A mistake that concerns the whole run."""
 
     reason: str

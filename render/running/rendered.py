@@ -54,17 +54,11 @@ class RenderedView:
         """
         scene = self.scene if name is None else replace(self.scene, id=name)
         return Shard(
-            scene_id=scene.id,
-            images=to_half(self.images),
-            normals=self.normals,
-            depth=self.depth,
-            mask=self.mask,
-            coverage=self.coverage,
-            light_directions=self.light_directions,
-            weights=self.weights,
+            scene_id=scene.id, images=to_half(self.images), normals=self.normals, depth=self.depth, mask=self.mask,
+            coverage=self.coverage, light_directions=self.light_directions, weights=self.weights,
             materials=surface_names.split(scene.material)[1] if self.weights is not None else (),
             provenance=_describe(scene),
-        )
+        )  # fmt: skip
 
 
 def rendered_views(

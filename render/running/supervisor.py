@@ -98,7 +98,6 @@ def render_supervised(
     folder: str | Path,
     options: RunOptions | None = None,
     *,
-    on_shard: Callable[[dict[str, Any]], None] | None = None,
     serve: Callable[..., None] = serve,
 ) -> RunSummary:
     """Render every scene that has no whole shard yet and did not fail before; go on after failures.
@@ -107,7 +106,6 @@ def render_supervised(
         scenes: The manifest, whole.
         folder: Data folder; its `shards/`, `log/` and `failed.jsonl` are written.
         options: How to run it.
-        on_shard: Called with the ledger line of each shard.
         serve: What a rendering process runs, a module-level function.
 
     Raises:
@@ -125,20 +123,14 @@ def render_supervised(
     measured = [(by_id[id], line["bytes"]) for id, line in list(found.lines.items())[-1000:]]
     if wanted:
         budget.require_space(folder, budget.disk_bytes(wanted, measured), options.keep_free)
-    skipped = len(scenes) - len(found.done) - len(wanted)
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as errors, Ledger(folder) as ledger, _sigterm_as_interrupt():
-        run = _Run(scenes, wanted, found, folder, options, ledger, Path(errors), serve, on_shard)
+        run = _Run(scenes, wanted, found, folder, options, ledger, Path(errors), serve)
         run.go()
     return RunSummary(
-        scenes=len(scenes),
-        done=len(found.done) + len(run.lines),
-        lines=run.lines,
-        failed=run.failed,
-        skipped=skipped,
-        seconds=time.monotonic() - start,
-        workers=run.count,
-    )
+        scenes=len(scenes), done=len(found.done) + len(run.lines), lines=run.lines, failed=run.failed,
+        skipped=len(scenes) - len(found.done) - len(wanted), seconds=time.monotonic() - start, workers=run.count,
+    )  # fmt: skip
 
 
 class _Run:
@@ -154,10 +146,8 @@ class _Run:
         ledger: Ledger,
         errors: Path,
         serve: Callable[..., None],
-        on_shard: Callable[[dict[str, Any]], None] | None,
     ) -> None:
-        self.folder, self.options, self.ledger = folder, options, ledger
-        self.errors, self.serve, self.on_shard = errors, serve, on_shard
+        self.folder, self.options, self.ledger, self.errors, self.serve = folder, options, ledger, errors, serve
         self.total, self.initial = len(scenes), len(scenes) - len(wanted)
         self.wanted = {scene.id: scene for scene in wanted}
         self.attempts = {id: len(rows) for id, rows in found.failed.items()}
@@ -173,13 +163,12 @@ class _Run:
 
     def go(self) -> None:
         """Render until the queue is empty."""
-        bar = progress_bar(
+        self.bar = progress_bar(
             total=self.total, initial=self.initial, unit="scene", desc="render",
             bar_format="{desc}: {percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]",
         )  # fmt: skip
-        self.bar = bar
         try:
-            with bar:
+            with self.bar:
                 while self.queue or any(worker.busy for worker in self.workers):
                     self._hand_out()
                     self._listen()
@@ -201,13 +190,10 @@ class _Run:
                 worker.take(self.queue.popleft())
         while self.queue and len(self.workers) < self.count:
             config = WorkerConfig(
-                folder=self.folder,
-                number=self.started,
-                threads=max(1, budget.cores() // self.count),
-                variant=self.variant,
-                llvm=str(self.llvm) if self.llvm else None,
+                folder=self.folder, number=self.started, threads=max(1, budget.cores() // self.count),
+                variant=self.variant, llvm=str(self.llvm) if self.llvm else None,
                 errors=self.errors / f"{self.started}.txt",
-            )
+            )  # fmt: skip
             self.workers.append(Worker(self.serve, config))
             self.started += 1
             self.workers[-1].take(self.queue.popleft())
@@ -261,8 +247,6 @@ class _Run:
         self.lines.append(line)
         self.ledger.add(line)
         self._tick(1)
-        if self.on_shard:
-            self.on_shard(line)
         if budget.free_bytes(self.folder) < self.options.keep_free:
             raise InputError(
                 f"{self.folder}: less than {budget.gigabytes(self.options.keep_free)} of disk are free; "
@@ -275,16 +259,10 @@ class _Run:
             scene = self.wanted[id]
             self.attempts[id] = self.attempts.get(id, 0) + 1
             line = {
-                "id": id,
-                "seed": scene.seed,
-                "shape": scene.shape,
-                "material": scene.material,
-                "reason": failure.reason,
-                "traceback": failure.traceback,
-                "seconds": round(failure.seconds, 3),
-                "attempt": self.attempts[id],
-                "time": now(),
-            }
+                "id": id, "seed": scene.seed, "shape": scene.shape, "material": scene.material,
+                "reason": failure.reason, "traceback": failure.traceback, "seconds": round(failure.seconds, 3),
+                "attempt": self.attempts[id], "time": now(),
+            }  # fmt: skip
             self.failed.append(line)
             self.ledger.fail(line)
         self._tick(len(failure.ids))

@@ -7,6 +7,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -160,21 +161,13 @@ def _convert_union(kinds: tuple[Any, ...], value: Any, name: str) -> Any:
 
 def _scalar(hint: Any, value: Any, name: str) -> Any:
     """Check and convert bool, int, float and str; other annotations pass unchanged."""
-    if hint is float and isinstance(value, int | float | str) and not isinstance(value, bool):
-        try:
-            return float(value)
-        except ValueError:
-            pass
-    elif hint is int and isinstance(value, int | float | str) and not isinstance(value, bool):
-        try:
-            if float(value) == int(float(value)):
-                return int(float(value))
-        except (ValueError, OverflowError):
-            pass
-    elif hint is bool and isinstance(value, bool):
+    if hint not in (float, int, bool, str):
         return value
-    elif hint is str and isinstance(value, str | int | float) and not isinstance(value, bool):
-        return str(value)
-    elif hint not in (float, int, bool, str):
-        return value
+    if isinstance(value, bool):
+        if hint is bool:
+            return value
+    elif hint is not bool and isinstance(value, int | float | str):
+        with suppress(ValueError, OverflowError):
+            if hint is not int or float(value) == int(float(value)):
+                return hint(float(value)) if hint is int else hint(value)
     raise InputError(f"{name}: expected {hint.__name__}, got {value!r}")

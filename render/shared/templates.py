@@ -7,8 +7,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+from render.shared.config import to_yaml
 
 _CODE = re.compile(r"(`[^`]*`)")
 
@@ -35,7 +36,7 @@ def _environment(folder: Path) -> Environment:
         loader=FileSystemLoader(folder), autoescape=select_autoescape(["html.j2"], default=False),
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    environment.filters |= {"inline": inline, "commas": "{:,}".format, "spelled": spelled, "yaml": to_block}
+    environment.filters |= {"inline": inline, "commas": "{:,}".format, "spelled": spelled, "yaml": to_yaml}
     environment.globals["table"] = markdown_table
     return environment
 
@@ -57,8 +58,3 @@ def spelled(counts: Mapping[Any, int]) -> str:
     if len(counts) == 1:
         return str(next(iter(counts)))
     return ", ".join(f"{value} ({count:,} scenes)" for value, count in counts.items())
-
-
-def to_block(values: Any) -> str:
-    """Write plain values as YAML in the order they have."""
-    return yaml.safe_dump(values, sort_keys=False, width=120)

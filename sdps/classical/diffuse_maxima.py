@@ -68,9 +68,7 @@ def diffuse_maxima(
     """Estimate normals and lights by local diffuse maxima (Favaro & Papadhimitri, CVPR 2012; IJCV 2014).
 
     Args:
-        images: (L, H, W, 3) or (L, H, W), linear radiance.
-        mask: (H, W) bool.
-        front: How highlights and shadows are kept out of the factorisation; see `prepare`.
+        images, mask, front: As for `prepare`.
         smoothing: Standard deviation in pixels of the Gaussian before the search for maxima.
         limit: Most maxima to intersect; more are thinned at random.
         seed: Seed of that choice.
@@ -87,8 +85,7 @@ def diffuse_maxima(
     maxima = find_maxima(prepared.cleaned, prepared.mask, smoothing=smoothing)
     crossings, lambdas = intersect(prepared.factors, maxima, limit=limit, seed=seed)
     gbr = median_gbr(crossings, lambdas)
-    quartiles = np.percentile(crossings, [25, 75], axis=0), np.percentile(lambdas, [25, 75])
-    spread = (*np.diff(quartiles[0], axis=0)[0] / 2, np.diff(quartiles[1])[0] / 2)
+    spread = [np.diff(np.percentile(values, [25, 75]))[0] / 2 for values in (*crossings.T, lambdas)]
     found = np.full(int(prepared.mask.sum()), -1)
     found[maxima.pixels] = maxima.images
     diagnostics = {

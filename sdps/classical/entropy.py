@@ -21,8 +21,8 @@ _log = logging.getLogger(__name__)
 _BOX = 4.0
 """mu and nu are sought in [-4, 4], lambda in [1/4, 4], from the standard form on (Alldrin et al., sec. 4)."""
 
-_RANGE = 4.0
-"""Albedo over its mean at the upper end of the histogram; what is above falls into the last bin."""
+_BINS, _RANGE = 256, 4.0
+"""Bins of the histogram, and albedo over its mean at its upper end; what is above falls into the last bin."""
 
 _COARSEST, _MIDDLE, _FINEST = 0.5, 0.1, 0.01
 """Steps of mu, nu and log lambda: of the first grid, where few descents go on with all samples, and of the end."""
@@ -40,7 +40,6 @@ def entropy(
     mask: np.ndarray,
     *,
     front: Front = "low-rank",
-    bins: int = 256,
     starts: int = 8,
     samples: int = 20000,
     seed: int = 0,
@@ -54,10 +53,7 @@ def entropy(
     its logarithm; and the search descends from the `starts` best cells of the coarse grid instead of one.
 
     Args:
-        images: (L, H, W, 3) or (L, H, W), linear radiance.
-        mask: (H, W) bool.
-        front: How highlights and shadows are kept out of the factorisation; see `prepare`.
-        bins: Bins of the histogram between 0 and 4 times the mean albedo.
+        images, mask, front: As for `prepare`.
         starts: Cells of the coarse grid from which the search descends.
         samples: Most pixels in the histogram, drawn at random.
         seed: Root seed of that draw.
@@ -70,13 +66,13 @@ def entropy(
     Raises:
         InputError: parameters out of range, or degenerate input; see `prepare`.
     """
-    if bins < 8 or starts < 1 or samples < 100:
-        raise InputError(f"want at least 8 bins, 1 start and 100 samples, got {bins}, {starts} and {samples}")
+    if starts < 1 or samples < 100:
+        raise InputError(f"want at least 1 start and 100 samples, got {starts} and {samples}")
     prepared = prepare(images, mask, front=front)
     standard = standard_form(prepared.factors)
     surface = prepared.factors.transformed(standard).surface
     surface = generator(seed, "entropy").permutation(surface)[:samples]
-    minima, evaluations = _search(surface, bins, starts)
+    minima, evaluations = _search(surface, starts)
     best = Gbr(*minima[0, 1:])
     if max(abs(best.mu), abs(best.nu)) > 0.99 * _BOX or abs(np.log(best.lam)) > 0.99 * np.log(_BOX):
         _log.warning("the lowest entropy lies on the edge of the search (%s); expect large errors", best)
@@ -103,12 +99,11 @@ def standard_form(factors: Factors) -> Gbr:
 class _Cost:
     """Entropy of the albedo histogram, for many transformations at once."""
 
-    def __init__(self, surface: np.ndarray, bins: int) -> None:
+    def __init__(self, surface: np.ndarray) -> None:
         first, second, third = surface.T
         # |B G|^2 is linear in the six products of columns, so that one matrix product serves a whole batch.
         products = (first**2 + second**2, 2.0 * first * third, 2.0 * second * third, third**2)
         self._products = np.stack(products).astype(np.float32)  # (4, P)
-        self._bins = bins
         self.evaluations = 0
 
     def __call__(self, parameters: np.ndarray, step: float) -> np.ndarray:
@@ -122,19 +117,19 @@ class _Cost:
         mu, nu, depth = parameters.T
         weights = np.stack([np.ones_like(mu), mu, nu, mu**2 + nu**2 + np.exp(2.0 * depth)], axis=1)
         albedo = np.sqrt(np.maximum(weights.astype(np.float32) @ self._products, 0.0))  # (N, P)
-        albedo *= self._bins / (_RANGE * albedo.mean(1, keepdims=True))
-        cell = np.minimum(albedo.astype(np.int64), self._bins - 1)
-        cell += np.arange(len(mu))[:, None] * self._bins
-        counts = np.bincount(cell.ravel(), minlength=len(mu) * self._bins).reshape(len(mu), self._bins)
+        albedo *= _BINS / (_RANGE * albedo.mean(1, keepdims=True))
+        cell = np.minimum(albedo.astype(np.int64), _BINS - 1)
+        cell += np.arange(len(mu))[:, None] * _BINS
+        counts = np.bincount(cell.ravel(), minlength=len(mu) * _BINS).reshape(len(mu), _BINS)
         # A step of the grid moves albedos by about that share of their mean; peaks narrower than that are missed.
-        width = max(0.25 * step * self._bins / _RANGE, 0.7)
+        width = max(0.25 * step * _BINS / _RANGE, 0.7)
         shares = ndimage.gaussian_filter1d(counts / albedo.shape[1], width, axis=1, mode="nearest")
         return -(shares * np.log2(np.maximum(shares, 1e-12))).sum(1)
 
 
-def _search(surface: np.ndarray, bins: int, starts: int) -> tuple[np.ndarray, int]:
+def _search(surface: np.ndarray, starts: int) -> tuple[np.ndarray, int]:
     """Return rows (entropy, mu, nu, lambda) of the minima found, best first, (N, 4), and the number of evaluations."""
-    coarse, fine = _Cost(surface[:_COARSE_SAMPLES], bins), _Cost(surface, bins)
+    coarse, fine = _Cost(surface[:_COARSE_SAMPLES]), _Cost(surface)
     limit = np.array([_BOX, _BOX, np.log(_BOX)])
     found = np.stack([_descend(coarse, centre, limit, _COARSEST, _MIDDLE) for centre in _cells(coarse, starts, limit)])
     found = found[np.argsort(coarse(found, _MIDDLE), kind="stable")][:_FINALISTS]

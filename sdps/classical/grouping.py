@@ -35,12 +35,7 @@ _DARK = 0.05
 
 
 def grouping(
-    images: np.ndarray,
-    mask: np.ndarray,
-    *,
-    front: Front = "low-rank",
-    draws: int = 50,
-    seed: int = 0,
+    images: np.ndarray, mask: np.ndarray, *, front: Front = "low-rank", draws: int = 50, seed: int = 0
 ) -> Estimate:
     """Choose the bas-relief transformation that makes albedos equal within every group of one chromaticity.
 

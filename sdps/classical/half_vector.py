@@ -34,6 +34,9 @@ _log = logging.getLogger(__name__)
 _FEWEST, _ENOUGH = 10, 50
 """Images below which the method refuses, and below which it warns: neighbours in theta_h are then far apart."""
 
+_PRIOR = 0.002
+"""Weight of the variance of the log intensities when the bas-relief transformation is searched."""
+
 
 def half_vector(
     images: np.ndarray,
@@ -43,7 +46,6 @@ def half_vector(
     intensities: np.ndarray | None = None,
     samples: int = 2500,
     updates: int = 1,
-    prior: float = 0.002,
     seed: int = 0,
 ) -> Estimate:
     """Find the normals under which every pixel's reflectance is a smooth function of theta_h and theta_d.
@@ -58,7 +60,6 @@ def half_vector(
         intensities: (L,) or (L, 3), with known directions only; equal ones when absent.
         samples: Most pixels that are solved on their own.
         updates: How often intensities that are not known are re-estimated from the solved pixels.
-        prior: Weight of the variance of the log intensities when the bas-relief transformation is searched.
         seed: Root seed of the draw of pixels.
 
     Returns:
@@ -70,14 +71,14 @@ def half_vector(
         InputError: fewer than 10 images, lights that do not fit them, or degenerate input; see `prepare`.
     """
     given = intensities is not None
-    if samples < 100 or updates < 0 or prior < 0.0:
-        raise InputError(f"need samples >= 100, updates >= 0 and prior >= 0, got {samples}, {updates}, {prior}")
+    if samples < 100 or updates < 0:
+        raise InputError(f"need samples >= 100 and updates >= 0, got {samples} and {updates}")
     if given and light_directions is None:
         raise InputError("intensities were given without light_directions; give both, or neither")
     if _FEWEST <= len(images) < _ENOUGH:
         _log.warning("half-vector symmetry wants %d images or more, got %d; expect rough normals", _ENOUGH, len(images))
     if light_directions is None:
-        scene, start, info = _uncalibrated(images, mask, prior, seed)
+        scene, start, info = _uncalibrated(images, mask, seed)
     else:
         known = calibrate(images, mask, light_directions, intensities, weights=MEAN, minimum=_FEWEST)
         lights = known.directions / np.linalg.norm(known.directions, axis=1, keepdims=True)
@@ -119,13 +120,8 @@ def _normals(
     return np.where(better[:, None], carried, start), intensities, info
 
 
-def _uncalibrated(
-    images: np.ndarray, mask: np.ndarray, prior: float, seed: int
-) -> tuple[_Scene, np.ndarray, dict[str, Any]]:
-    """Choose the bas-relief transformation by the asymmetry of some pixels; return its lights, normals and diagnostics.
-
-    Its lights are in the scene, its normals (P, 3).
-    """
+def _uncalibrated(images: np.ndarray, mask: np.ndarray, seed: int) -> tuple[_Scene, np.ndarray, dict[str, Any]]:
+    """Choose the bas-relief transformation by the asymmetry of some pixels; return lights, normals (P, 3) and facts."""
     prepared = prepare(images, mask, front="diffuse", minimum=_FEWEST, seed=seed)
     start = equal_intensity(prepared.factors)
     glossy = np.flatnonzero(prepared.specular().sum(1) > 0.05 * prepared.profiles.sum(1))
@@ -133,7 +129,7 @@ def _uncalibrated(
     info: dict[str, Any] = {"highlights": len(glossy) >= 30}
     if info["highlights"]:
         pixels = generator(seed, "half_vector lights").permutation(glossy)[:150]
-        energy = _bas_relief_energy(prepared, pixels, prior)
+        energy = _bas_relief_energy(prepared, pixels)
         gbr, lowest, count = minimise_over_bas_reliefs(energy, [start, Gbr()])
         info |= {"bas_relief_energy": lowest, "energy_of_equal_intensities": energy(start), "evaluations": count}
     else:
@@ -143,7 +139,7 @@ def _uncalibrated(
     return scene, found.normals[prepared.mask], found.diagnostics
 
 
-def _bas_relief_energy(prepared: Prepared, pixels: np.ndarray, prior: float) -> Callable[[Gbr], float]:
+def _bas_relief_energy(prepared: Prepared, pixels: np.ndarray) -> Callable[[Gbr], float]:
     surface, profiles = prepared.factors.surface[pixels], prepared.profiles[pixels]
 
     def energy(gbr: Gbr) -> float:
@@ -153,7 +149,7 @@ def _bas_relief_energy(prepared: Prepared, pixels: np.ndarray, prior: float) -> 
         if normals[:, 2].mean() < 0.0:
             return np.inf
         found = asymmetry(log_values(profiles, strength), normals, (sources / strength).T)
-        return float(found.mean()) + prior * float(np.var(np.log(strength)))
+        return float(found.mean()) + _PRIOR * float(np.var(np.log(strength)))
 
     return energy
 

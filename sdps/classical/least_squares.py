@@ -1,6 +1,6 @@
 """Calibrated least squares (Woodham 1980): Lambert's law solved per pixel under known lights."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,15 +72,12 @@ class Calibrated:
     directions: np.ndarray
     intensities: np.ndarray
 
-    def chunks(self) -> Iterator[slice]:
-        """Yield ranges of pixels that bound the memory of per-pixel work."""
+    def in_chunks(self, solve: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.ndarray) -> np.ndarray:
+        """Return `solve(profiles, start)` of all pixels in flat memory; `start` and the result are (P, 3)."""
         pixels, count = self.profiles.shape
         step = max(_CHUNK_VALUES // count, 1)
-        yield from (slice(begin, begin + step) for begin in range(0, pixels, step))
-
-    def in_chunks(self, solve: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.ndarray) -> np.ndarray:
-        """Return `solve(profiles, start)` of all pixels, chunk by chunk; `start` and the result are (P, 3)."""
-        return np.concatenate([solve(self.profiles[part], start[part]) for part in self.chunks()])
+        parts = (slice(begin, begin + step) for begin in range(0, pixels, step))
+        return np.concatenate([solve(self.profiles[part], start[part]) for part in parts])
 
     def conclude(self, vectors: np.ndarray, diagnostics: dict[str, Any] | None = None) -> Estimate:
         """Turn vectors (P, 3), albedo times normal, into an estimate with the given lights."""
@@ -106,10 +103,7 @@ def calibrate(
     """Check images and lights, and divide out the intensities; errors as in `least_squares`.
 
     Args:
-        images: (L, H, W, 3) or (L, H, W), linear radiance.
-        mask: (H, W) bool.
-        light_directions: (L, 3), unit, from the surface to the light.
-        intensities: (L,) or (L, 3) known intensities; equal ones when absent.
+        images, mask, light_directions, intensities: As for `least_squares`.
         weights: What R, G and B contribute to grey.
         minimum: Fewest images the method can work with.
     """

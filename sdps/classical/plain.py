@@ -17,9 +17,7 @@ def factorisation(images: np.ndarray, mask: np.ndarray, *, front: Front = "low-r
     are equally strong.
 
     Args:
-        images: (L, H, W, 3) or (L, H, W), linear radiance.
-        mask: (H, W) bool.
-        front: See `prepare`.
+        images, mask, front: As for `prepare`.
 
     Raises:
         InputError: degenerate input; see `prepare`.

@@ -34,13 +34,15 @@ _TRUSTED = np.radians(60.0)
 _MINIMUM, _FEW = 10, 50
 """Images below which profiles say nothing, and below which they say little."""
 
+_NEIGHBOURS = 12
+"""Neighbours of a sample in the graph."""
+
 
 def profile_distances(
     images: np.ndarray,
     mask: np.ndarray,
     *,
     samples: int = 1500,
-    neighbours: int = 12,
     slope: str = "contour",
     rounds: int = 2,
     seed: int = 0,
@@ -55,7 +57,6 @@ def profile_distances(
         images: (L, H, W, 3) or (L, H, W), linear radiance; 100 or more are wanted.
         mask: (H, W) bool.
         samples: Pixels embedded; all others follow from the nearest ones.
-        neighbours: Neighbours of a sample in the graph.
         slope: Radians per unit of distance, from the `contour` (normals there are a right angle off the view) or from
             the `distribution` of intensities (lights uniform over the sphere; no closed contour needed).
         rounds: Passes; each divides the images by the light intensities of the one before.
@@ -72,23 +73,30 @@ def profile_distances(
         InputError: fewer than 10 images, bad options, no contour, profiles that vary along one direction only
             (coplanar lights, a planar or cylindrical object), or that have nothing to do with the contour.
     """
-    _check(len(images), samples, neighbours, slope, rounds)
+    _check(len(images), samples, slope, rounds)
     observations = observe(images, mask, minimum=_MINIMUM)
     profiles = np.maximum(observations.grey(), 0.0).astype(np.float32)
     rng, inverse = generator(seed, "profile_distances"), _first_inverse(profiles)
     for _ in progress_bar(range(rounds), desc="profile distances", unit="round", disable=rounds < 2):
         shapes = compressed(profiles * inverse)
-        rows, normals, diagnostics = _embed_samples(shapes, observations.mask, samples, neighbours, slope, rng)
+        rows, normals, diagnostics = _embed_samples(shapes, observations.mask, samples, slope, rng)
         lights = find_lights(profiles[rows], shapes[rows], normals)
-        inverse = _inverse(lights.intensities)
+        gains = lights.intensities
+        inverse = np.where(gains > 0.0, 1.0 / np.maximum(gains, 1e-3), 1.0).astype(np.float32)
     mean = _mean_direction(lights)
     directions, intensities = lights.directions.astype(np.float32), lights.intensities.astype(np.float32)
     maps = observations.to_map(_spread(normalised(shapes), rows, normals))
     return Estimate(maps, directions, intensities, diagnostics | {"light_mean": mean, "curve": lights.curve})
 
 
-def _inverse(intensities: np.ndarray) -> np.ndarray:  # (L,) float32
-    return np.where(intensities > 0.0, 1.0 / np.maximum(intensities, 1e-3), 1.0).astype(np.float32)
+def _check(images: int, samples: int, slope: str, rounds: int) -> None:
+    """Refuse options that make no sense, and warn of few images."""
+    if slope not in ("contour", "distribution"):
+        raise InputError(f"slope must be 'contour' or 'distribution', got {slope!r}")
+    if samples < 100 or rounds < 1:
+        raise InputError("profile distances need samples >= 100 and rounds >= 1")
+    if _MINIMUM <= images < _FEW:
+        _log.warning("%d images are few for profile distances; 100 or more are wanted", images)
 
 
 def _mean_direction(lights: Lights) -> float:
@@ -100,16 +108,6 @@ def _mean_direction(lights: Lights) -> float:
             "hemisphere); profile distances are then no measure of angle: expect a distorted shape", mean,
         )  # fmt: skip
     return mean
-
-
-def _check(images: int, samples: int, neighbours: int, slope: str, rounds: int) -> None:
-    """Refuse options that make no sense, and warn of few images."""
-    if slope not in ("contour", "distribution"):
-        raise InputError(f"slope must be 'contour' or 'distribution', got {slope!r}")
-    if samples < 100 or not 3 <= neighbours < 100 or rounds < 1:
-        raise InputError("profile distances need samples >= 100, 3 <= neighbours < 100 and rounds >= 1")
-    if _MINIMUM <= images < _FEW:
-        _log.warning("%d images are few for profile distances; 100 or more are wanted", images)
 
 
 def compressed(profiles: np.ndarray) -> np.ndarray:  # (P, L)
@@ -224,7 +222,7 @@ def _spread_samples(unit: np.ndarray, usable: np.ndarray, count: int, rng: np.ra
 
 
 def _embed_samples(
-    shapes: np.ndarray, mask: np.ndarray, count: int, neighbours: int, slope: str, rng: np.random.Generator
+    shapes: np.ndarray, mask: np.ndarray, count: int, slope: str, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """Return the rows of samples (S,), their normals (S, 3) in the camera frame, and diagnostics."""
     unit = normalised(shapes)
@@ -241,10 +239,10 @@ def _embed_samples(
     picked = around[np.unique(np.linspace(0, len(edge) - 1, min(len(edge), max(count // 8, 12))).astype(int))]
     inside = _spread_samples(unit, usable, count - len(picked), rng)
     rows = np.unique(np.concatenate([inside, edge[picked]]))
-    ways = geodesics(unit[rows], min(neighbours, len(rows) - 1))
+    ways = geodesics(unit[rows], min(_NEIGHBOURS, len(rows) - 1))
     joined = np.isfinite(ways[np.isfinite(ways).sum(1).argmax()])
     if joined.mean() < 0.9:
-        _log.warning("only %.0f%% of the profiles hang together; raise `neighbours`", 100.0 * joined.mean())
+        _log.warning("only %.0f%% of the profiles hang together; the others are left out", 100.0 * joined.mean())
     rows, ways = rows[joined], ways[np.ix_(joined, joined)]
     known = np.isin(edge[picked], rows)
     places, outward = np.searchsorted(rows, edge[picked][known]), outward[picked][known]

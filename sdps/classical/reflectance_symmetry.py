@@ -57,9 +57,7 @@ def reflectance_symmetry(
     images. Where there are none the transformation of equal light intensities is returned, with a warning.
 
     Args:
-        images: (L, H, W, 3) or (L, H, W), linear radiance.
-        mask: (H, W) bool.
-        front: How highlights and shadows are kept out of the factorisation; see `prepare`.
+        images, mask, front: As for `prepare`.
         samples: Most pixels per image the energy is computed from.
         seed: Root seed of the draw of pixels.
 

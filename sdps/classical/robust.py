@@ -5,6 +5,7 @@ law; they differ in which observations they believe.
 """
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 
@@ -32,10 +33,7 @@ def position_threshold(
     the DiLiGenT benchmark) apply before least squares. Intensities are divided by the lights' before sorting.
 
     Args:
-        images: (L, H, W, 3) or (L, H, W), linear radiance.
-        mask: (H, W) bool.
-        light_directions: (L, 3), unit, from the surface to the light.
-        intensities: (L,) or (L, 3) known intensities; equal ones when absent.
+        images, mask, light_directions, intensities: As for `least_squares`.
         drop_lowest: Share of the observations dropped at the dark end, rounded down.
         drop_highest: The same at the bright end.
 
@@ -61,8 +59,7 @@ def position_threshold(
         np.put_along_axis(weights, order, 1.0, axis=1)
         return solve_weighted(known.directions, profiles, weights, start)
 
-    vectors = known.in_chunks(solve, np.full((len(known.profiles), 3), np.nan))
-    return _conclude(known, vectors, {"kept": last - first})
+    return _conclude(known, solve, {"kept": last - first})
 
 
 def robust_least_squares(
@@ -80,10 +77,7 @@ def robust_least_squares(
     pixel's may be so. The norm is convex, so the answer does not depend on where the iteration starts.
 
     Args:
-        images: (L, H, W, 3) or (L, H, W), linear radiance.
-        mask: (H, W) bool.
-        light_directions: (L, 3), unit, from the surface to the light.
-        intensities: (L,) or (L, 3) known intensities; equal ones when absent.
+        images, mask, light_directions, intensities: As for `least_squares`.
         iterations: Most reweighting steps; pixels that have settled leave earlier.
         floor: Residual, as a share of the pixel's brightest intensity, below which the weight grows no more.
 
@@ -97,11 +91,7 @@ def robust_least_squares(
     if not (iterations >= 1 and floor > 0.0):
         raise InputError(f"robust least squares needs iterations >= 1 and floor > 0, got {iterations} and {floor}")
     known = calibrate(images, mask, light_directions, intensities)
-
-    def solve(profiles: np.ndarray, start: np.ndarray) -> np.ndarray:
-        return _least_absolute(known.directions, profiles, start, iterations, floor)
-
-    return _conclude(known, known.in_chunks(solve, np.full((len(known.profiles), 3), np.nan)), {})
+    return _conclude(known, lambda rows, start: _least_absolute(known.directions, rows, start, iterations, floor), {})
 
 
 def _least_absolute(
@@ -125,20 +115,14 @@ def _least_absolute(
 
 
 def low_rank_least_squares(
-    images: np.ndarray,
-    mask: np.ndarray,
-    light_directions: np.ndarray,
-    intensities: np.ndarray | None = None,
+    images: np.ndarray, mask: np.ndarray, light_directions: np.ndarray, intensities: np.ndarray | None = None
 ) -> Estimate:
     """Split highlights and shadows off as a sparse part, then solve Lambert's law with the low-rank rest.
 
     Wu et al. (ACCV 2010), with shadows as part of the sparse errors instead of missing data.
 
     Args:
-        images: (L, H, W, 3) or (L, H, W), linear radiance.
-        mask: (H, W) bool.
-        light_directions: (L, 3), unit, from the surface to the light.
-        intensities: (L,) or (L, 3) known intensities; equal ones when absent.
+        images, mask, light_directions, intensities: As for `least_squares`.
 
     Returns:
         As `least_squares`; diagnostics `rank` of the low-rank part, and `sparse`, the mean absolute sparse part over
@@ -157,8 +141,11 @@ def low_rank_least_squares(
     return known.conclude(solve_plain(known.directions, low), {"rank": rank, "sparse": sparse})
 
 
-def _conclude(known: Calibrated, vectors: np.ndarray, diagnostics: dict[str, object]) -> Estimate:
-    """Use plain least squares where `vectors` has NaN, and say so when that is much of the object."""
+def _conclude(
+    known: Calibrated, solve: Callable[[np.ndarray, np.ndarray], np.ndarray], diagnostics: dict[str, object]
+) -> Estimate:
+    """Solve from NaN on; use plain least squares where it stays, and say so when that is much of the object."""
+    vectors = known.in_chunks(solve, np.full((len(known.profiles), 3), np.nan))
     missing = np.isnan(vectors[:, 0])
     vectors[missing] = solve_plain(known.directions, known.profiles[missing])
     share = float(missing.mean())

@@ -80,16 +80,12 @@ def check_precision(precision: str) -> None:
 def _resolved(precision: str, device: str) -> Arithmetic:
     ratio, source = _speed(device)
     fast = ratio >= _WORTHWHILE
-    said = f"bfloat16 is {_times(ratio)} as fast as float32 here ({source})"
+    said = f"bfloat16 is {ratio:.2g} times as fast as float32 here ({source})"
     if precision == "auto":
         return Arithmetic("bfloat16" if fast else "float32", device, said)
     if precision == "bfloat16" and not fast:
         _log.warning("precision bfloat16 was asked for, but %s; use auto or float32", said)
     return Arithmetic("bfloat16" if precision == "bfloat16" else "float32", device, f"asked for; {said}")
-
-
-def _times(ratio: float) -> str:
-    return f"{ratio:.2g} times"
 
 
 @cache

@@ -63,7 +63,8 @@ def normal_map(network: NormalNetwork, view: AnyView, lights: Lights | None, aut
     mask = view.mask
     feature: Tensor | None = None
     for part, images in view:
-        seen = network.observe(images, mask, some_lights(lights, part), mean_square)
+        some = None if lights is None else Lights(lights.directions[:, part], lights.intensities[:, part])
+        seen = network.observe(images, mask, some, mean_square)
         with autocast():
             feature = _maximum(feature, network.encode(seen))
     assert feature is not None  # a view has an image
@@ -121,11 +122,6 @@ def pad_to(multiple: int) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
         return functional.pad(images, border), functional.pad(mask, border)
 
     return fit
-
-
-def some_lights(lights: Lights | None, part: slice) -> Lights | None:
-    """Return the lights of some of the images."""
-    return None if lights is None else Lights(lights.directions[:, part], lights.intensities[:, part])
 
 
 def _maximum(first: Tensor | None, second: Tensor) -> Tensor:

@@ -15,6 +15,9 @@ from sdps.models.lcnet import LCNet, LightingLogits, LightingTrunk, head
 _LEAST_INTENSITY = 0.02
 """Regressed intensities are kept above this, a tenth of the least drawn in training, before dividing by them."""
 
+_EXPECTATION_WEIGHT = 4.0
+"""Weight of the errors of the expected light in the loss of `LCNetSoft`."""
+
 
 class RegressedLights(NamedTuple):
     """What `LCNetReg` predicts."""
@@ -64,15 +67,7 @@ class LCNetSoft(LCNet):
     The idea is GCNet's (Chen et al., ECCV 2020): a soft-argmax over the same classes. Labels share their weight between
     the two nearest classes, so that their expectation is the exact angle; to their cross-entropy come the chord between
     expected and true direction and the relative error of the expected intensity. Same layers as LCNet.
-
-    Args:
-        expectation_weight: Weight of the last two terms.
-        options: LCNet's.
     """
-
-    def __init__(self, *, expectation_weight: float = 4.0, **options: Any) -> None:
-        super().__init__(**options)
-        self.expectation_weight = expectation_weight
 
     def loss(self, prediction: LightingLogits, directions: Tensor, intensities: Tensor) -> dict[str, Tensor]:
         """Return soft cross-entropies, the errors of the expectation, and their weighted sum."""
@@ -83,7 +78,7 @@ class LCNetSoft(LCNet):
         # The tiny constant keeps the gradient of the length finite where the estimate is perfect.
         chord = ((expected.directions - directions).square().sum(-1) + 1e-8).sqrt().mean()
         relative = ((expected.intensities - intensities).abs() / intensities).mean()
-        total = torch.stack(list(terms.values())).sum() + self.expectation_weight * (chord + relative)
+        total = torch.stack(list(terms.values())).sum() + _EXPECTATION_WEIGHT * (chord + relative)
         return {"total": total, **terms, "chord": chord, "relative": relative}
 
     def lights(self, prediction: LightingLogits, read_out: ReadOut = "expectation") -> Lights:

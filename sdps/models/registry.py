@@ -1,4 +1,4 @@
-"""Every learned model by name. Adding one is a network and a line in `MODELS`.
+"""Every learned model by name. Adding one is a network, its class in `NETWORKS`, and an entry in assets/models.yaml.
 
 A model is a network with fixed options and a way to train it. Several models share one network: NENet, PS-FCN and NENet
 on the lights of LCNet_reg differ in their training only. The recipes are the paper's; presets override them.
@@ -7,10 +7,12 @@ on the lights of LCNet_reg differ in their training only. The recipes are the pa
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import resources
 from typing import Any, Literal
 
 from torch import nn
 
+from render.shared.config import read_yaml
 from render.shared.errors import InputError, unknown
 from sdps.models.cnnps import CNNPS
 from sdps.models.lcnet import LCNet
@@ -52,89 +54,6 @@ class ModelEntry:
     reconstruction: str = ""
 
 
-# Chen et al., ECCV 2018, and its code (spec of the schedules: A.8): 32 x 32 crops, learning rate 1e-3.
-_PSFCN = {
-    "epochs": 30.0, "batch_scenes": 32, "learning_rate": 1e-3, "halve_after": (5.0, 10.0, 15.0, 20.0, 25.0), "crop": 32,
-}  # fmt: skip
-_UPSFCN = {**_PSFCN}
-
-MODELS: dict[str, ModelEntry] = {
-    "lcnet": ModelEntry(
-        role="lighting", build=LCNet, parameters=4_409_692, paper="A0",
-        summary="LCNet, Lighting Calibration Network: classes of light direction and intensity",
-    ),
-    "lcnet-reg": ModelEntry(
-        role="lighting", build=LCNetReg, parameters=4_387_524, paper="A1",
-        summary="LCNet_reg: regresses directions and intensities", reconstruction="heads and loss",
-    ),
-    "lcnet-nomask": ModelEntry(
-        role="lighting", build=LCNet, options={"use_mask": False}, parameters=4_409_116, paper="A2",
-        summary="LCNet without the object mask",
-    ),
-    "lcnet-local": ModelEntry(
-        role="lighting", build=LCNet, options={"use_global": False}, parameters=3_819_868, paper="A3",
-        summary="LCNet_local: every image on its own",
-    ),
-    "lcnet-soft": ModelEntry(
-        role="lighting", build=LCNetSoft, parameters=4_409_692,
-        summary="LCNet trained for the expectation over its classes (soft-argmax)", reconstruction="loss",
-    ),
-    "lcnet-second": ModelEntry(
-        role="second", build=LCNetSecond, parameters=1_584_988, lights="lcnet-soft", normals="nenet-plus",
-        summary="second lighting pass that sees estimated normals and shading (GCNet's idea)",
-        reconstruction="layers and loss",
-    ),
-    "nenet": ModelEntry(
-        role="normals", build=NENet, parameters=2_210_048, paper="B1", lights="lcnet",
-        summary="NENet, Normal Estimation Network, trained on LCNet's lights",
-    ),
-    "nenet-reg": ModelEntry(
-        role="normals", build=NENet, parameters=2_210_048, paper="B3", lights="lcnet-reg",
-        summary="NENet trained on LCNet_reg's lights",
-    ),
-    "nenet-norm": ModelEntry(
-        role="normals", build=NENet, options={"per_pixel": True}, parameters=2_210_048, lights="lcnet",
-        summary="NENet on images divided by each pixel's norm over the lights",
-    ),
-    "nenet-plus": ModelEntry(
-        role="normals", build=NENet, parameters=2_210_048, lights="lcnet-soft",
-        summary="NENet trained on lcnet-soft's lights",
-    ),
-    "psfcn": ModelEntry(
-        role="normals", build=NENet, parameters=2_210_048, paper="B0", lights=TRUE_LIGHTS, recipe=_PSFCN,
-        summary="PS-FCN, trained on true lights",
-    ),
-    "psfcn-norm": ModelEntry(
-        role="normals", build=NENet, options={"per_pixel": True}, parameters=2_210_048, lights=TRUE_LIGHTS,
-        recipe=_PSFCN, summary="PS-FCN (Norm.), Chen et al., TPAMI 2020",
-    ),
-    "upsfcn": ModelEntry(
-        role="normals", build=UPSFCN, parameters=2_208_320, paper="B9", recipe=_UPSFCN,
-        summary="UPS-FCN retrained with random intensities: no lights at all",
-    ),
-    "upsfcn-light": ModelEntry(
-        role="normals", build=UPSFCNLight, parameters=5_804_124, paper="B8", recipe={**_UPSFCN, "crop": 0},
-        summary="UPS-FCN with lighting as an additional task", reconstruction="layers and the tasks' weights",
-    ),
-    "upsfcn-wide": ModelEntry(
-        role="normals", build=UPSFCN, options={"width": 1.7}, parameters=6_386_644, paper="B7", recipe=_UPSFCN,
-        summary="UPS-FCN, wider", reconstruction="widths",
-    ),
-    "upsfcn-deep": ModelEntry(
-        role="normals", build=UPSFCN, options={"deep": True}, parameters=6_043_968, paper="B6", recipe=_UPSFCN,
-        summary="UPS-FCN, deeper", reconstruction="where the layers are added",
-    ),
-    "upsfcn-deep-mask": ModelEntry(
-        role="normals", build=UPSFCN, options={"deep": True, "use_mask": True}, parameters=6_044_544, paper="B5",
-        recipe=_UPSFCN, summary="UPS-FCN, deeper, sees the mask", reconstruction="where the layers are added",
-    ),
-    "cnnps": ModelEntry(
-        role="pixels", build=CNNPS, parameters=2_654_051, paper="IS18", lights=TRUE_LIGHTS,
-        summary="CNN-PS (Ikehata, ECCV 2018): observation maps, pixel by pixel",
-    ),
-}  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Combination:
     """Models that work together.
@@ -166,17 +85,19 @@ class Combination:
         return sum(MODELS[name].parameters for name in self.members())
 
 
-COMBINATIONS = {
-    "sdps": Combination("lcnet", "nenet", summary="SDPS-Net", paper="B1"),
-    "sdps-reg": Combination("lcnet-reg", "nenet-reg", summary="SDPS-Net with regressed lights", paper="B3"),
-    "sdps-plus": Combination(
-        "lcnet-soft", "nenet-plus", summary="soft-argmax lights; lights averaged over eight views, normals over four",
-        light_views=8, normal_views=4,
-    ),
-    "sdps-second": Combination(
-        "lcnet-soft", "nenet-plus", "lcnet-second", "soft-argmax lights and a second lighting pass"
-    ),
-}  # fmt: skip
+def _entries() -> tuple[dict[str, ModelEntry], dict[str, Combination]]:
+    """Return what assets/models.yaml lists."""
+    listed = read_yaml(str(resources.files("assets") / "models.yaml"))
+    models = {
+        name: ModelEntry(build=NETWORKS[values.pop("network")], **values) for name, values in listed["models"].items()
+    }
+    return models, {name: Combination(**values) for name, values in listed["combinations"].items()}
+
+
+NETWORKS: dict[str, type[nn.Module]] = {
+    kind.__name__: kind for kind in (LCNet, LCNetReg, LCNetSoft, LCNetSecond, NENet, UPSFCN, UPSFCNLight, CNNPS)
+}
+MODELS, COMBINATIONS = _entries()
 
 
 def entry(name: str) -> ModelEntry:

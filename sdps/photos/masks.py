@@ -3,7 +3,6 @@
 Under a moving lamp the object changes and a dark, distant background does not, whatever steady light the room adds.
 """
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -30,23 +29,11 @@ the University of Washington's set).
 _SMALLEST = 1e-4
 
 
-@dataclass(eq=False)
 class Variation:
-    """Mean and variance of every pixel's brightness, gathered image by image (Welford's recurrence).
+    """Mean and variance of every pixel's brightness (H, W), gathered image by image (Welford's recurrence)."""
 
-    Attributes:
-        mean: (H, W) float32.
-        squares: (H, W) float32, sum of squared deviations from the mean.
-        count: Images so far.
-    """
-
-    shape: tuple[int, int]
-    mean: np.ndarray = field(init=False)
-    squares: np.ndarray = field(init=False)
-    count: int = 0
-
-    def __post_init__(self) -> None:
-        self.mean, self.squares = np.zeros(self.shape, np.float32), np.zeros(self.shape, np.float32)
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.mean, self.squares, self.count = np.zeros(shape, np.float32), np.zeros(shape, np.float32), 0
 
     def add(self, grey: np.ndarray) -> None:
         """Take in an image, (H, W) float32, finite."""
@@ -77,7 +64,9 @@ def automatic_mask(variation: Variation) -> tuple[np.ndarray, str]:
     if changes.max() < 1e-3:
         raise InputError("nothing changes between the pictures; is the lamp on and moved? otherwise give a mask")
     threshold = threshold_otsu(changes)
-    mask = _largest_part(changes > threshold)
+    parts, count = ndimage.label(changes > threshold)  # 4-connected
+    largest = 1 + int(np.argmax(np.bincount(parts.ravel())[1:])) if count else 1
+    mask = ndimage.binary_fill_holes(parts == largest)
     doubt = _doubt(changes, mask, float(threshold))
     if doubt:
         return np.ones_like(mask), (
@@ -114,14 +103,6 @@ def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
 def border_share(mask: np.ndarray) -> float:
     """Return which share of the frame's outermost pixels belongs to the mask (H, W)."""
     return float(np.concatenate([mask[0], mask[-1], mask[1:-1, 0], mask[1:-1, -1]]).mean())
-
-
-def _largest_part(mask: np.ndarray) -> np.ndarray:
-    """Keep the largest 4-connected part and fill its holes."""
-    parts, count = ndimage.label(mask)
-    if count > 1:
-        mask = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
-    return ndimage.binary_fill_holes(mask)
 
 
 def _doubt(changes: np.ndarray, mask: np.ndarray, threshold: float) -> str:

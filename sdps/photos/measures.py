@@ -74,14 +74,9 @@ def measure(photos: Photographs) -> Measures:
         if len(pixels) < grey.size:
             rest = (grey.sum(dtype=np.float64) - bright.sum(dtype=np.float64)) / (grey.size - len(pixels))
             outside[number] = rest / max(float(bright.mean()), 1e-6)
-
-    def again(number: int) -> np.ndarray:
-        return brightness(photos[number : number + 1][0])
-
-    return Measures(
-        observations, levels, float(np.median(outside)), saturated,
-        _casts(photos, observations), digests, settings, second_look(tracker, shifts, again),
-    )  # fmt: skip
+    moved = second_look(tracker, shifts, lambda number: brightness(photos[number : number + 1][0]))
+    casts = _casts(photos, observations)
+    return Measures(observations, levels, float(np.median(outside)), saturated, casts, digests, settings, moved)
 
 
 def _casts(photos: Photographs, observations: np.ndarray) -> np.ndarray:  # (L,)

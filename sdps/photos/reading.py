@@ -152,7 +152,13 @@ def _survey(folder: Path, files: tuple[str, ...], gamma: str | float, mask_file:
             broken[(broken < 0) & ~np.isfinite(pixels).all(-1)] = number
         if given is None:
             variation.add(brightness(to_linear(pixels, applied)))
-    notes = [why, *_orientation_note(first.orientation, turns)]
+    notes = [why]
+    if len(turns) > 1:
+        notes.append(
+            "the pictures' orientation tags differ, as happens when the camera looks down; all were turned as the first"
+        )
+    elif first.orientation != 1:
+        notes.append("all pictures were turned upright as their orientation tag says")
     try:
         known = None if given is None or mask_file is None else (given, f"the mask is {mask_file.name}")
         mask, said = known or automatic_mask(variation)
@@ -190,14 +196,6 @@ def _refuse_broken(folder: Path, files: tuple[str, ...], broken: np.ndarray, mas
             f"{folder / name}: NaN or infinite values inside the mask ({len(bad)} pixels over all pictures); write it "
             "again or cut them out of the mask"
         )
-
-
-def _orientation_note(first: int, turns: set[int]) -> list[str]:
-    if len(turns) > 1:
-        return [
-            "the pictures' orientation tags differ, as happens when the camera looks down; all were turned as the first"
-        ]
-    return [] if first == 1 else ["all pictures were turned upright as their orientation tag says"]
 
 
 def _lights(

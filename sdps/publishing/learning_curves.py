@@ -3,13 +3,13 @@
 import json
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from render.shared.errors import InputError, unknown
@@ -80,7 +80,8 @@ def write_curves(metrics_file: str | Path, picture: str | Path) -> None:
             axes = figure.add_subplot(high, columns, number + 1)
             _draw(axes, rows, panel)
             _hours_above(axes, rows, label=number < columns)
-        _save(figure, picture)
+        with atomic_path(picture) as temporary:
+            figure.savefig(temporary)
 
 
 def compare_curves(
@@ -124,7 +125,8 @@ def compare_curves(
             axes.autoscale()
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_formatter("{x:g}")
-        _save(figure, picture)
+        with atomic_path(picture) as temporary:
+            figure.savefig(temporary)
 
 
 def metric_figure(runs: Mapping[str, Rows], value: str, title: str) -> Figure:
@@ -205,13 +207,7 @@ def _hours_above(axes: Axes, rows: Rows, *, label: bool) -> None:
     if not _timed(rows):
         axes.spines["top"].set_visible(False)
         return
-    above = axes.secondary_xaxis(
-        "top",
-        functions=(
-            lambda steps: _hours(rows, np.asarray(steps)),
-            lambda hours: _hours(rows, np.asarray(hours), inverse=True),
-        ),
-    )
+    above = axes.secondary_xaxis("top", functions=(partial(_hours, rows), partial(_hours, rows, inverse=True)))
     if label:
         above.set_xlabel("hours of training", fontsize=8.5)
     above.tick_params(labelsize=8)
@@ -263,9 +259,3 @@ def _unit(name: str) -> str:
 
 def _spoken(name: str) -> str:
     return name.replace("val_", "validation ").replace("_", " ").replace("mae", "MAE")
-
-
-def _save(figure: Figure, picture: str | Path) -> None:
-    """Write the figure as PNG, whatever backend the user's matplotlib is set to."""
-    with atomic_path(picture) as temporary:
-        FigureCanvasAgg(figure).print_png(str(temporary))

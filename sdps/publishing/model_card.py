@@ -7,6 +7,8 @@ none of them tells is "not recorded".
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import yaml
 
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
 from render.records.shards import file_hash
+from render.shared.config import read_yaml
 from render.shared.errors import InputError
 from render.shared.files import read_text, write_text
 from render.shared.templates import fill
@@ -27,23 +30,12 @@ UNKNOWN = "not recorded"
 _METRICS, _DATASET_CARD = "metrics.jsonl", "DATASET_CARD.md"
 _PRESET, _TRAINING = "config.yaml", "training.yaml"  # what `sdps train` leaves beside the weights
 _LICENCES = re.compile(r"^## Licences\n(.*?)(?=^## |\Z)", re.DOTALL | re.MULTILINE)  # section of a dataset card
-_GIVES = {
-    "lighting": "direction and relative intensity of the light of every image",
-    "second": "direction and relative intensity of the light of every image, from the images and a first estimate of "
-    "lights and normals",
-    "normals": "the surface normal of every pixel of the object",
-    "pixels": "the surface normal of every pixel of the object, each pixel by itself",
-}
-_DEFINITIONS = {
-    "normal_mae": ("degrees", "mean angle between estimated and true normals over the pixels of the mask"),
-    "direction_mae": ("degrees", "mean angle between estimated and true light directions over the images"),
-    "intensity_error": ("relative", "scale-invariant relative error of the light intensities (SDPS-Net, eq. 4)"),
-    "loss": ("", "the loss that training minimises"),
-}
-_READ_OUTS = {"expectation": "lights read out as expectation over the classes", "peak": "lights read out at the "
-              "interpolated peak of the class probabilities"}  # fmt: skip
-_LIGHTS = {TRUE_LIGHTS: "the true ones", "": "does not apply", "none": "it is told none"}
 _TEMPLATE = Path(__file__).with_name("model_card.md.j2")
+
+
+@cache
+def _words() -> dict[str, Any]:
+    return read_yaml(str(resources.files("assets") / "model_card.yaml"))
 
 
 def write_model_card(
@@ -85,9 +77,9 @@ def render_card(weights: str | Path, data: str | Path | None = None, shipped: st
         model=model,
         network=model.network,
         entry=entry,
-        gives=_GIVES[entry.role],
+        gives=_words()["gives"][entry.role],
         parameters=parameter_count(model.network),
-        lights=_LIGHTS.get(lights, f"those of `{lights}`"),
+        lights=_words()["lights"].get(lights, f"those of `{lights}`"),
         options=_value(model.options),
         input=model.augmentation(),
         training=_training(metadata, rows),
@@ -127,7 +119,7 @@ def _front_matter(model: TrainedModel, name: str, scores: Mapping[str, float], *
     licence = {"license_name": "terms-of-the-training-data"}
     if pretrained:
         licence = {"license_name": "research-use", "license_link": "LICENSE-DATA"}
-    kind = "surface-normals" if "normal" in _GIVES[model.role] else "lighting"
+    kind = "surface-normals" if "normal" in _words()["gives"][model.role] else "lighting"
     values: dict[str, Any] = {
         "library_name": "sdps",
         "license": "other",
@@ -196,9 +188,9 @@ def _composition(scenes: Sequence[SceneSpec]) -> list[tuple[str, str]]:
 
 def _defined(name: str) -> tuple[str, str]:
     """Return unit and definition of a metric."""
-    for key, (unit, text) in _DEFINITIONS.items():
+    for key, (unit, text) in _words()["metrics"].items():
         if name.startswith(key):
-            how = _READ_OUTS.get(name.removeprefix(f"{key}_"))
+            how = _words()["read_outs"].get(name.removeprefix(f"{key}_"))
             return unit or "-", f"{text}; {how}" if how else text
     return UNKNOWN, UNKNOWN
 

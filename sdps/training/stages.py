@@ -5,7 +5,7 @@ The trainer (`sdps.training.trainer`) knows nothing else about them.
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast, get_args
 
 import numpy as np
 import torch
@@ -80,12 +80,9 @@ class Stage(ABC):
         """Return how training samples are made."""
         config = self.config
         return SampleOptions(
-            seed=config.seed,
-            images=config.images,
-            size=config.size,
-            rescale=config.rescale,
+            seed=config.seed, images=config.images, size=config.size, rescale=config.rescale,
             augmentation=config.augmentation,
-        )
+        )  # fmt: skip
 
     def validation_options(self) -> SampleOptions:
         """Return how validation samples are made: whole images in the pose they were rendered."""
@@ -125,8 +122,7 @@ class LightingStage(Stage):
         """Return the loss, and direction and intensity errors of every read-out."""
         prediction = self.predict(batch)
         values = {"loss": float(self.network.loss(prediction, batch.directions, batch.intensities)["total"])}
-        read_outs: tuple[ReadOut, ...] = ("centre", "expectation", "peak")
-        for how in read_outs:
+        for how in get_args(ReadOut):
             suffix = "" if how == "centre" else f"_{how}"
             values |= light_errors(self.network.lights(prediction, how), batch, suffix)
         return values
@@ -157,7 +153,9 @@ class NormalStage(Stage):
         name: str | None = None,
     ) -> None:
         model = model or self.usual
-        super().__init__(name or model, model, config, normal_options(model, config))
+        options = {"intensity_range": list(config.augmentation.intensity_range)}
+        known = registry.network_options(model)
+        super().__init__(name or model, model, config, options if "intensity_range" in known else {})
         self.source = config.lights or registry.entry(model).lights
         assert lighting is not None or self.source in (TRUE_LIGHTS, ""), f"{model} needs a trained lighting model"
         self.lighting = freeze(lighting) if lighting and self.source not in (TRUE_LIGHTS, "") else None
@@ -234,13 +232,6 @@ def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:
         "intensity_range": [low, high],
     }
     return {name: value for name, value in values.items() if name in registry.network_options(model)}
-
-
-def normal_options(model: str, config: NormalTraining) -> dict[str, Any]:
-    """Return the options of a normal network that the configuration decides."""
-    if "intensity_range" not in registry.network_options(model):
-        return {}
-    return {"intensity_range": list(config.augmentation.intensity_range)}
 
 
 def freeze(model: TrainedModel) -> TrainedModel:

@@ -5,13 +5,17 @@ from functools import cache
 import numpy as np
 
 from render.materials import library, merl, model
-from render.materials.fit import candidates
 
 
 def glossy(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     """A diffuse term with a GGX lobe of roughness 0.1, coloured differently per channel; (N, 3) in 1/sr."""
-    at = candidates.angles(wi, wo)
-    lobe = candidates.ggx(at, 0.1) * (0.04 + 0.96 * (1 - at.difference) ** 5)
+    half = wi + wo
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    alpha2, difference = 0.1**2, np.clip((wi * half).sum(1), 0, 1)
+    normal = alpha2 / (np.pi * (np.minimum(half[:, 2], 1) ** 2 * (alpha2 - 1) + 1) ** 2)
+    cosines = [np.maximum(vector[:, 2], 1e-3) for vector in (wi, wo)]
+    visible = [cosine + np.sqrt(alpha2 + (1 - alpha2) * cosine**2) for cosine in cosines]
+    lobe = normal / (visible[0] * visible[1]) * (0.04 + 0.96 * (1 - difference) ** 5)
     return np.array([0.4, 0.1, 0.02]) / np.pi + lobe[:, None]
 
 

@@ -15,7 +15,6 @@ from pipelines.shared import charts
 from pipelines.shared.text_tables import number
 from render.shared.errors import InputError
 from render.shared.files import read_text
-from sdps.methods.method import Method
 
 SHAPE = "bunny"
 FILE = "published/sdps_bunny_per_brdf.csv"
@@ -85,7 +84,10 @@ def make(bench: Workbench) -> Drawn:
     objects = ((s.material, lit_object(s, folder, bench.config, repeat)) for s in wanted for repeat in repeats)
     for material, runner, result in bench.evaluated(objects, runners, len(wanted) * len(repeats), "materials"):
         found[runner.method.name].setdefault(material, []).append(result.scores.get("normal_mae", np.nan))
-    curves = [_curve(runner.method, found[runner.method.name]) for runner in runners]
+    curves = []
+    for method in (runner.method for runner in runners):  # without what it failed on in any of the repeats
+        kept = {name: float(np.mean(e)) for name, e in found[method.name].items() if np.isfinite(e).all()}
+        curves.append(Curve(method.name, kept, COLUMNS.get(paper_row(method), "SDPS_Net")))
     names = [scene.material for scene in wanted]
     reference = published["SDPS_Net"]
     order = sorted(names, key=lambda name: (reference.get(name, np.inf), name))
@@ -106,12 +108,6 @@ def make(bench: Workbench) -> Drawn:
             for rho in curve.rank_correlation(published)[:1]
         },
     )  # fmt: skip
-
-
-def _curve(method: Method, errors: dict[str, list[float]]) -> Curve:
-    """Average over the repeats, and drop materials the method failed on in any of them."""
-    means = {name: float(np.mean(values)) for name, values in errors.items() if np.isfinite(values).all()}
-    return Curve(method.name, means, COLUMNS.get(paper_row(method), "SDPS_Net"))
 
 
 def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:

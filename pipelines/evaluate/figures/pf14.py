@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pipelines.evaluate.figures.drawn import METRICS, Drawn, LeftOut, finds, paper_row
+from pipelines.evaluate.published import POSTER
 from pipelines.evaluate.results import Mean, mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.report.sections import Table
@@ -22,16 +23,6 @@ LIGHT_SETS = ("near-uniform:100", "biased:100")
 GROUPS = ("lambertian", "fabric", "plastic", "phenolic")
 SHAPE = "bunny"
 LAMBERTIAN = 15
-# Read off the poster of the paper (github.com/guanyingc/SDPS-Net_Poster_LaTex, Compare_PF14.png), BUNNY: for each group
-# the figure under near-uniform and under biased lights. B1 is LCNet + NENet.
-PUBLISHED = {
-    ("direction_mae", "B1"): ((7.2, 9.1), (5.8, 8.1), (4.8, 7.0), (5.2, 10.2)),
-    ("direction_mae", "PF14"): ((8.1, 6.8), (9.7, 10.2), (11.4, 18.0), (11.1, 18.5)),
-    ("intensity_error", "B1"): ((0.12, 0.11), (0.08, 0.08), (0.08, 0.06), (0.10, 0.09)),
-    ("intensity_error", "PF14"): ((0.69, 0.32), (0.21, 0.13), (0.35, 0.31), (0.50, 0.48)),
-    ("normal_mae", "B1"): ((7.2, 9.8), (4.9, 6.7), (3.6, 5.0), (4.3, 6.9)),
-    ("normal_mae", "PF14"): ((9.2, 10.1), (10.6, 12.1), (12.9, 18.7), (33.2, 39.6)),
-}
 Means = dict[tuple[str, str, str, str], Mean]
 """(method, light set, group, metric)."""
 
@@ -128,7 +119,7 @@ def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[s
 
 def published(method: Method, metric: str, group: str, lights: str, shape: str) -> float | None:
     """Return the paper's figure, or None."""
-    row = PUBLISHED.get((metric, paper_row(method)))
+    row = POSTER[metric].get(paper_row(method))
     return row[GROUPS.index(group)][LIGHT_SETS.index(lights)] if row and shape == SHAPE else None
 
 

@@ -1,74 +1,24 @@
-"""Fit the library's materials to Neural-BRDF networks and write them as YAML.
+"""Fit the built-in model to any BRDF and write it as YAML; docs/scripts/fit_library.py made the library so."""
 
-python -m render.materials.fit.fitting --networks FILE.npz --out assets/materials [--only NAME ...]
-python -m render.materials.fit.fitting --networks FILE.npz --database rgl- --out assets/materials/held-out --only NAME
-... python -m render.materials.fit.fitting --networks FILE.npz --compare TABLE.md --published FILE.json
-"""
-
-import argparse
 import dataclasses
 import json
-import sys
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import yaml
-from tqdm import tqdm
 
 from render.materials import model
 from render.materials.categories import category
-from render.materials.fit import candidates, solver, spheres
-from render.materials.fit.network import Brdf, NetworkFile
+from render.materials.fit import solver, spheres
 from render.materials.fit.spheres import Samples
 from render.materials.model import Material
-from render.shared.errors import InputError, unknown
-from render.shared.files import write_text
+from render.shared.errors import InputError
 from render.shared.seeds import generator
 
-TERMS = "MERL BRDF database: research use; cite Matusik et al., A Data-Driven Reflectance Model, SIGGRAPH 2003"
+Brdf = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Of (N, 3) `wi`, `wo`, unit vectors in the frame of the surface: the (N, 3) BRDF in 1/sr."""
+
 _IMAGE_SIZE, _LIGHTS = 128, 20
-
-
-@dataclasses.dataclass(frozen=True)
-class Database:
-    """Where networks come from.
-
-    Attributes:
-        title: The data they were trained on.
-        terms: Its terms of use.
-        prefix: Put before the names of its materials, which the MERL materials do not have.
-        family: Category of its materials; None for that of the name.
-    """
-
-    title: str
-    terms: str
-    prefix: str = ""
-    family: str | None = None
-
-    def name(self, network: str) -> str:
-        """Return the library's name of a network's material."""
-        return self.prefix + network.removesuffix("_rgb").replace("_", "-")
-
-    @property
-    def source(self) -> str:
-        """Where a fit comes from, for its file."""
-        return f"fit to the Neural-BRDF network (Sztrajman et al. 2021, MIT licence) of the {self.title}"
-
-
-DATABASES = {
-    "merl": Database("MERL BRDF database (Matusik et al. 2003)", TERMS),
-    "rgl-": Database(
-        "RGL material database (Dupuy & Jakob 2018)",
-        "RGL material database: cite Dupuy & Jakob, An Adaptive Parameterization, SIGGRAPH Asia 2018",
-        "rgl-", "held-out",
-    ),
-    "niel": Database(
-        "BRDF measurements of Nielsen et al. 2015",
-        "cite Nielsen, Jensen & Ramamoorthi, On Optimal, Minimal BRDF Sampling, SIGGRAPH Asia 2015",
-        "nielsen-", "held-out",
-    ),
-}  # fmt: skip
 
 
 class Fitter:
@@ -81,9 +31,7 @@ class Fitter:
         lights = spheres.hemisphere_lights(_LIGHTS, generator(seed, "materials", "test"))
         self.test = spheres.sphere_image(_IMAGE_SIZE, lights)
 
-    def fit(
-        self, name: str, brdf: Brdf, *, family: str | None = None, source: str = "", terms: str = TERMS
-    ) -> Material:
+    def fit(self, name: str, brdf: Brdf, *, family: str | None = None, source: str = "", terms: str = "") -> Material:
         """Fit one material.
 
         A sample brighter than the metric's clipping level counts by its relative error, as bright as the level, so that
@@ -94,7 +42,7 @@ class Fitter:
             brdf: Function of (N, 3) `wi`, `wo` giving the (N, 3) BRDF in 1/sr; reciprocal. NaN where it is not known:
                 such pairs are left out of the fit and of its error.
             family: Its category; by default the one of a MERL material of this name.
-            source: Where the data come from; by default the networks of the MERL materials.
+            source: Where the data come from.
             terms: Terms of use of the data.
 
         Returns:
@@ -120,7 +68,7 @@ class Fitter:
         fitted = Material(
             name=name,
             category=category(name) if family is None else family,
-            source=source or DATABASES["merl"].source,
+            source=source,
             terms=terms,
             bivariate=bivariate,
             shadowing=shadowing,
@@ -194,57 +142,3 @@ def to_yaml(material: Material) -> str:
 def _plain(value: str | float) -> str:
     """Return a scalar as YAML, in quotes only where it would be read as something else."""
     return str(value) if yaml.safe_load(str(value)) == value else json.dumps(value)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line of the fitter; returns the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="python -m render.materials.fit.fitting", description=__doc__.split("\n\n")[0]
-    )
-    parser.add_argument("--networks", type=Path, required=True, help="npz of weights, keys <database>__<name>__<layer>")
-    parser.add_argument("--database", default="merl", choices=sorted(DATABASES), help="which networks (default: merl)")
-    parser.add_argument("--out", type=Path, help="folder for <name>.yaml")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="fit these materials only")
-    parser.add_argument("--compare", type=Path, metavar="FILE.md", help="fit other models too, write the table")
-    parser.add_argument("--published", type=Path, metavar="FILE.json", help="published ABC and SGD constants")
-    arguments = parser.parse_args(argv)
-    try:
-        _run(arguments)
-    except InputError as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 2
-    return 0
-
-
-def _run(arguments: argparse.Namespace) -> None:
-    networks = NetworkFile(arguments.networks, arguments.database)
-    database = DATABASES[arguments.database]
-    names = arguments.only or networks.names
-    for name in names:
-        if name not in networks.names:
-            raise unknown("material", name, networks.names)
-    if not (arguments.out or arguments.compare):
-        raise InputError("nothing to write: give --out, --compare or both")
-    if arguments.compare and arguments.database != "merl":
-        raise InputError("--compare: the published constants are of the MERL materials only; leave it out")
-    if arguments.compare and not arguments.published:
-        raise InputError("--compare needs --published FILE.json with the ABC and SGD constants")
-    published = candidates.read_published(arguments.published, names) if arguments.compare else {}
-    fitter, errors = Fitter(), []
-    for name in tqdm(names, desc="fit", disable=None):
-        material = fitter.fit(
-            database.name(name), networks.brdf(name), family=database.family, source=database.source,
-            terms=database.terms,
-        )  # fmt: skip
-        errors.append(material.fit_error)
-        if arguments.out:
-            write_text(arguments.out / f"{material.name}.yaml", to_yaml(material))
-    sys.stdout.write(f"{len(names)} materials, median sphere error {np.median(errors):.2%}, worst {max(errors):.2%}\n")
-    if arguments.compare:
-        table = candidates.compare(fitter.samples, fitter.test, networks, names, errors, published)
-        write_text(arguments.compare, table)
-        sys.stdout.write(table)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

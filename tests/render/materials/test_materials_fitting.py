@@ -1,25 +1,22 @@
 """The fitter recovers BRDFs that are known in closed form; the metric and the network reader behave."""
 
+import fit_library
+import material_models
 import numpy as np
 import pytest
+from fit_library import NetworkFile, half_difference
+from merl_support import glossy
 
 from render.materials import model
 from render.materials.categories import category
-from render.materials.fit import candidates, fitting, solver, spheres
-from render.materials.fit.network import NetworkFile, half_difference
+from render.materials.fit import fitting, solver, spheres
+from render.shared.errors import InputError
 from render.shared.seeds import generator
 
 
 @pytest.fixture(scope="module")
 def fitter() -> fitting.Fitter:
     return fitting.Fitter(samples=16_000)
-
-
-def glossy(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
-    """A diffuse term with a GGX lobe of roughness 0.1, coloured differently per channel."""
-    at = candidates.angles(wi, wo)
-    lobe = candidates.ggx(at, 0.1) * (0.04 + 0.96 * (1 - at.difference) ** 5)
-    return np.array([0.4, 0.1, 0.02]) / np.pi + lobe[:, None]
 
 
 def test_the_fit_recovers_a_known_glossy_brdf(fitter):
@@ -97,7 +94,7 @@ def test_the_command_line_fits_a_network_file(tmp_path, capsys):
     brdf = NetworkFile(tmp_path / "weights.npz").brdf("nylon")
     wi, wo = (spheres.hemisphere_lights(50, np.random.default_rng(seed)) for seed in (1, 2))
     np.testing.assert_allclose(brdf(wi, wo), brdf(wo, wi), rtol=1e-9)
-    assert fitting.main(["--networks", str(tmp_path / "weights.npz"), "--out", str(tmp_path / "out")]) == 0
+    assert fit_library.main(["--networks", str(tmp_path / "weights.npz"), "--out", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "nylon.yaml").exists()
     assert "1 materials" in capsys.readouterr().out
 
@@ -106,28 +103,30 @@ def test_the_command_line_explains_mistakes(tmp_path, capsys):
     network_file(tmp_path / "weights.npz")
     network_file(tmp_path / "broken.npz", drop="b2")
     (tmp_path / "text.npz").write_text("no")
-    (tmp_path / "published.json").write_text('{"abc": {"nylon": []}, "sgd": {}}')
     good = ["--networks", str(tmp_path / "weights.npz"), "--out", str(tmp_path)]
     for arguments, message in (
         ([*good, "--only", "nylom"], "did you mean 'nylon'"),
         (["--networks", str(tmp_path / "broken.npz"), "--out", str(tmp_path)], "merl__nylon__b2"),
         (["--networks", str(tmp_path / "text.npz"), "--out", str(tmp_path)], "cannot be read"),
-        (["--networks", str(tmp_path / "weights.npz")], "--out"),
-        ([*good, "--compare", str(tmp_path / "c.md")], "--published"),
-        ([*good, "--compare", "c.md", "--published", str(tmp_path / "published.json")], "no constants for 'nylon'"),
-        ([*good, "--compare", "c.md", "--published", str(tmp_path / "text.npz")], "expected JSON"),
     ):
-        assert fitting.main(arguments) == 2
+        assert fit_library.main(arguments) == 2
         assert message in capsys.readouterr().err
 
 
-def test_candidates_recover_their_own_form():
+def test_the_models_of_the_study_recover_their_own_form():
     samples = spheres.fitting_samples(3000, generator(0, "candidates"))
-    at, target = candidates.angles(samples.wi, samples.wo), glossy(samples.wi, samples.wo)
-    fit = candidates.fit_two_ggx(target, candidates.residual_weight(target, samples), at)
+    at, target = material_models.angles(samples.wi, samples.wo), glossy(samples.wi, samples.wo)
+    fit = material_models.fit_two_ggx(target, material_models.residual_weight(target, samples), at)
     test = spheres.sphere_image(48, spheres.hemisphere_lights(5, generator(1, "candidates")))
-    value = fit(candidates.angles(test.wi, test.wo))
+    value = fit(material_models.angles(test.wi, test.wo))
     assert spheres.sphere_error(value, glossy(test.wi, test.wo), test) < 0.02
+
+
+def test_the_study_explains_missing_constants(tmp_path):
+    for text, message in (('{"abc": {"nylon": []}, "sgd": {}}', "no constants for 'nylon'"), ("no", "expected JSON")):
+        (tmp_path / "published.json").write_text(text)
+        with pytest.raises(InputError, match=message):
+            material_models.read_published(tmp_path / "published.json", ["nylon"])
 
 
 def test_categories_of_names():

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from fit_library import half_difference
 from merl_support import glossy, hemisphere, values
 
 from render.materials import library, merl
-from render.materials.fit.network import half_difference
 from render.shared.errors import InputError
 
 ENTRIES = 90 * 90 * 180

@@ -17,6 +17,7 @@ from pretend_renderer import pretend, stillborn
 from render.planning import budget, chunks
 from render.planning.plan import DataConfig, plan
 from render.records import ledger
+from render.records.ledger import Ledger
 from render.records.manifest import SceneSpec, View
 from render.records.shards import file_hash
 from render.running.supervisor import RunOptions, render_supervised
@@ -113,16 +114,18 @@ def test_disk_is_watched_before_and_while_running(tmp_path, monkeypatch):
     assert run(scenes, tmp_path).done == 6
 
 
-def test_interrupt_stops_all_processes_and_keeps_what_is_finished(tmp_path):
-    scenes = planned([["ok"], ["ok", "hang"]])
+def test_interrupt_stops_all_processes_and_keeps_what_is_finished(tmp_path, monkeypatch):
+    scenes, add = planned([["ok"], ["ok", "hang"]]), Ledger.add
 
-    def stop(line: dict) -> None:
+    def stop(ledger: Ledger, line: dict) -> None:
+        add(ledger, line)
         if line["id"] == "s1-m0":
             os.kill(os.getpid(), signal.SIGTERM)
 
+    monkeypatch.setattr(Ledger, "add", stop)
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(KeyboardInterrupt):
-        render_supervised(scenes, tmp_path, RunOptions(workers=1), serve=pretend, on_shard=stop)
+        render_supervised(scenes, tmp_path, RunOptions(workers=1), serve=pretend)
     assert files(tmp_path) == {"s0-m0.exr", "s1-m0.exr"} and not active_children()
     assert signal.getsignal(signal.SIGTERM) is before and not (tmp_path / "failed.jsonl").exists()
 

@@ -53,7 +53,7 @@ def test_same_seed_same_answer():
     assert (np.diff(minima[:, 0]) >= 0.0).all()
 
 
-@pytest.mark.parametrize("options", [{"bins": 4}, {"starts": 0}, {"samples": 10}])
+@pytest.mark.parametrize("options", [{"starts": 0}, {"samples": 10}])
 def test_options_out_of_range(options):
     scene = few_albedos(0)
     with pytest.raises(InputError):

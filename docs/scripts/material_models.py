@@ -1,21 +1,27 @@
-"""Other analytic models, fitted or published, measured as the project's own is (docs/studies/material-fits.md).
+"""Other analytic models, fitted or published, measured as the project's own is: the tables of a study.
 
-Each is a function of (N, 3) `wi`, `wo` to the (N, 3) BRDF in 1/sr: a diffuse term with two GGX lobes per channel
-(Walter et al. 2007), Disney's principled model (Burley 2012), ABC (Low et al. 2012) and SGD (Bagher et al. 2012).
+python docs/scripts/material_models.py --networks nbrdf_weights.npz --published merl_sgd_abc.json [--only NAME ...]
+
+docs/studies/material-fits.md has what it prints. Each model is a function of (N, 3) `wi`, `wo` to the (N, 3) BRDF in
+1/sr: a diffuse term with two GGX lobes per channel (Walter et al. 2007), Disney's principled model (Burley 2012), ABC
+(Low et al. 2012) and SGD (Bagher et al. 2012).
 """
 
+import argparse
 import json
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fit_library import DATABASES, NetworkFile
 from scipy.optimize import least_squares
 from tqdm import tqdm
 
 from render.materials import model
-from render.materials.fit.network import Brdf, NetworkFile
+from render.materials.fit.fitting import Brdf, Fitter
 from render.materials.fit.spheres import Samples, radiance_limit, sphere_error
 from render.shared.errors import InputError
 from render.shared.files import read_text
@@ -240,3 +246,22 @@ def by_material(rows: dict[str, list[float]], names: Sequence[str]) -> str:
     worst_first = np.argsort(rows[keys[-1]])[::-1]
     table = [(names[index], *(f"{100 * rows[key][index]:.1f}" for key in keys)) for index in worst_first]
     return markdown_table(("material", *keys), table)
+
+
+def main() -> None:
+    """Fit the project's own model to the materials of MERL, then the others, and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--networks", type=Path, required=True, help="npz of weights, keys merl__<name>__<layer>")
+    parser.add_argument("--published", type=Path, required=True, help="JSON of published ABC and SGD constants")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="compare on these materials only")
+    arguments = parser.parse_args()
+    networks, fitter = NetworkFile(arguments.networks), Fitter()
+    names = arguments.only or networks.names
+    published = read_published(arguments.published, names)
+    fitted = [fitter.fit(DATABASES["merl"].name(name), networks.brdf(name)) for name in tqdm(names, desc="fit")]
+    errors = [material.fit_error for material in fitted]
+    sys.stdout.write(compare(fitter.samples, fitter.test, networks, names, errors, published))
+
+
+if __name__ == "__main__":
+    main()
