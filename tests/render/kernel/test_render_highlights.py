@@ -9,7 +9,7 @@ from scipy import stats
 from render import shapes
 from render.backend import variant
 from render.kernel import highlights, many_lights, scene
-from render.kernel.paths import Camera
+from render.kernel.camera import Camera
 from render.materials import library, model
 from render.records.manifest import View
 
