@@ -40,6 +40,14 @@ class Camera:
         """Turn a camera-frame direction into the object frame."""
         return mi.Vector3f(self.rotation.T @ mi.Vector3f(x, y, z))
 
+    def towards(self, _position: Any) -> "mi.Vector3f":
+        """Return the unit vectors from points to the camera; one for all."""
+        return self.to_object(0, 0, 1)
+
+    def image_area(self, area: Any, _position: Any) -> Any:
+        """Return the image area of a small piece of surface at points, from its vector area (normal times area)."""
+        return dr.abs(dr.dot(area, self.to_object(0, 0, 1))) * dr.square(self.scale)
+
     def ray(self, x: Any, y: Any) -> "mi.Ray3f":
         """Return the ray through image point (x, y) in [-1, 1]^2, x right, y up."""
         origin = self.to_object((x - self.offset.x) / self.scale, (y - self.offset.y) / self.scale, 4)
@@ -59,6 +67,24 @@ class PerspectiveCamera(Camera):
     start: Any  # Float, z of the plane that rays start from: near the object, so that no digits are lost on the way
     narrowed: Any  # Float, width of the view in that plane over that in the plane z = 0
     parallel: ClassVar[bool] = False
+
+    def towards(self, position: Any) -> "mi.Vector3f":
+        """Return the unit vectors from points to the camera."""
+        return mi.Vector3f(dr.normalize(self._eye() - mi.Vector3f(position)))
+
+    def image_area(self, area: Any, position: Any) -> Any:
+        """Return the image area of small pieces of surface at points, from their vector areas (normal times area).
+
+        With r the way to the camera and z its part along the axis, one covers |area . r| / r^3 of solid angle, and a
+        solid angle covers D^2 (r / z)^3 of the frame's plane, at the distance D.
+        """
+        sight = self._eye() - mi.Vector3f(position)
+        along = dr.dot(sight, self.to_object(0, 0, 1))
+        return dr.abs(dr.dot(area, sight)) / along * dr.square(self.distance / along)
+
+    def _eye(self) -> "mi.Vector3f":
+        """Return the position of the pinhole."""
+        return self.to_object(*(value / self.scale for value in (-self.offset.x, -self.offset.y, self.distance)))
 
     def ray(self, x: Any, y: Any) -> "mi.Ray3f":
         """Return the ray through point (x, y) of the plane z = 0; on film, that image point."""

@@ -25,6 +25,10 @@ class DistantLights:
         direction = dr.gather(mi.Vector3f, self.directions, number)
         return direction, start.spawn_ray(direction)
 
+    def towards(self, light: Any, _position: Any) -> tuple:
+        """Return the unit directions from points to their lights, and the lights' irradiance / pi."""
+        return dr.gather(mi.Vector3f, self.directions, light), mi.Float(1)
+
     def reach(self, light: Any, _position: Any) -> Callable[[Any], tuple]:
         """Return the function from vertex numbers to the unit directions to a lane's light and its irradiance / pi."""
         direction = dr.gather(mi.Vector3f, self.directions, light)
@@ -46,16 +50,22 @@ class NearLights:
         position = dr.gather(mi.Point3f, self.positions, number)
         return position - start.p, start.spawn_ray_to(position)
 
+    def towards(self, light: Any, position: Any) -> tuple:
+        """Return the unit directions from points to their lights, and the lights' irradiance / pi."""
+        source, distance2 = dr.gather(mi.Point3f, self.positions, light), dr.gather(mi.Float, self.distance2, light)
+        return _from(source, distance2, position)
+
     def reach(self, light: Any, position: Any) -> Callable[[Any], tuple]:
         """Return the function from vertex numbers to the unit directions to a lane's light and its irradiance / pi."""
         source, distance2 = dr.gather(mi.Point3f, self.positions, light), dr.gather(mi.Float, self.distance2, light)
+        return lambda at: _from(source, distance2, dr.gather(mi.Point3f, position, at))
 
-        def reach(at: Any) -> tuple:
-            towards = source - dr.gather(mi.Point3f, position, at)
-            inverse = dr.rcp(dr.squared_norm(towards))
-            return mi.Vector3f(towards * dr.sqrt(inverse)), distance2 * inverse
 
-        return reach
+def _from(source: Any, distance2: Any, position: Any) -> tuple:
+    """Return the unit directions from points to a source, and irradiance / pi there."""
+    towards = source - position
+    inverse = dr.rcp(dr.squared_norm(towards))
+    return mi.Vector3f(towards * dr.sqrt(inverse)), distance2 * inverse
 
 
 def place(camera: Camera, lights: np.ndarray, distances: np.ndarray | None) -> DistantLights | NearLights:

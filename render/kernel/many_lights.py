@@ -11,7 +11,7 @@ number of threads. Noise is correlated between the lights and materials of a vie
 Estimator: next-event estimation at every vertex (Kajiya 1986; Veach 1997, eq. 8.10), with bounce directions drawn from
 the mixture of the sampling lobes of all materials of the view, weighted by the mixture's density (one-sample balance
 heuristic, Veach 1997, eq. 9.15), and narrow highlights sampled from the lights' side as well
-(`render.kernel.highlights`) where camera and lights are distant. The slow counterpart is `render.kernel.reference`.
+(`render.kernel.highlights`). The slow counterpart is `render.kernel.reference`.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

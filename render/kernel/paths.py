@@ -35,6 +35,7 @@ class Vertices:
     bitmask: Any  # UInt32 (ceil(L / 32) * N)
     throughput: tuple  # K Color3f (N, or 1 at the camera hits): f cos / density along the path so far
     weights: tuple  # K tuples of Float (N), weights of each surface's materials; None for a single material
+    centre: Any  # Point3f (N), centroid of the triangle, or None where no highlight needs it
     spread: Any  # Float (N), d(solid angle of normals) / d(image area), or None where no highlight needs it
     pixels: Any  # UInt32 (Q), pixels with at least one vertex
     start: Any  # UInt32 (Q), first vertex of the pixel
@@ -50,6 +51,7 @@ class Paths:
         glints: Points found from the lights' mirror directions, or None.
         emitters: The lights in the object frame.
         parallel: Whether camera and lights are distant, so that the camera's hits share the directions to both.
+        halves: Half vectors of `render.kernel.highlights`, or None where no highlight is narrow.
         lights, size, spp: Counts.
         hits: (P,) uint32, samples per pixel that hit the object.
         normal_sum: (P, 3) float64, sum of shading normals of the hits, camera frame.
@@ -61,6 +63,7 @@ class Paths:
     glints: Any
     emitters: DistantLights | NearLights
     parallel: bool
+    halves: Any
     lights: int
     size: int
     spp: int
@@ -85,7 +88,8 @@ def trace(
     emitters = place(camera, lights, distances)
     ray, sample = _camera_rays(camera, spp, seed, first)
     parallel = camera.parallel and isinstance(emitters, DistantLights)
-    glossy, pixel_count = any(surfaces.glossy) and parallel, size * size
+    pixel_count = size * size
+    halves = highlights.half_vectors(camera, emitters, parallel) if any(surfaces.glossy) else None
     depths: list[Vertices] = []
     throughput = (mi.Color3f(1),) * len(surfaces)
     for depth in range(bounces + 1):
@@ -115,16 +119,18 @@ def trace(
             seen = probed_visibility(*rays, probes, segments[1:])
         else:
             seen = visibility(*rays, coherent=depth == 0)
-        spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and glossy else None
+        centre, spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and halves else (None, None)
         weights = surfaces.weights(position, prim)
-        depths.append(Vertices(len(kept), position, normal, wi, sample, seen, throughput, weights, spread, *segments))
+        depths.append(
+            Vertices(len(kept), position, normal, wi, sample, seen, throughput, weights, centre, spread, *segments)
+        )
         if depth < bounces:
             ray, factors = _bounce(depths[-1], facet, surfaces, seed, depth + 1, first, spp)
             throughput = tuple(value * factor for value, factor in zip(throughput, factors, strict=True))
     glints = None
-    if glossy and depths and isinstance(emitters, DistantLights):
-        glints = highlights.find(scene, camera, emitters.directions, surfaces, spp, seed, first)
-    return Paths(tuple(depths), glints, emitters, parallel, len(lights), size, spp, *_sums(depths, camera))
+    if halves and depths:
+        glints = highlights.find(scene, camera, emitters, halves, len(lights), surfaces, spp, seed, first)
+    return Paths(tuple(depths), glints, emitters, parallel, halves, len(lights), size, spp, *_sums(depths, camera))
 
 
 def take(kind: type, source: Any, index: Any) -> Any:

@@ -181,10 +181,11 @@ def _partition(paths: Paths, vertices: Vertices, lanes: _Lanes, surfaces: Packed
     """Return the function that weighs a camera hit against the normals drawn around the half vector."""
     if vertices.spread is None or not surfaces.glossy[number]:
         return lambda at, normal: mi.Float(1)
-    direction = dr.gather(mi.Vector3f, paths.directions, lanes.light)
-    half = dr.normalize(mi.Vector3f(vertices.wi) + direction)
+    if paths.parallel:
+        shared = dr.normalize(mi.Vector3f(vertices.wi) + dr.gather(mi.Vector3f, paths.directions, lanes.light))
 
     def weigh(at: Any, normal: Any) -> Any:
+        half = shared if paths.parallel else paths.halves.of(lanes.light, dr.gather(mi.Point3f, vertices.centre, at))
         spread = dr.gather(mi.Float, vertices.spread, at)
         return highlights.partition(spread, highlights.one_minus_cos(normal, half), paths.size, paths.spp)
 
@@ -195,8 +196,8 @@ def _add_glints(stack: np.ndarray, paths: Paths, surfaces: PackedSurfaces, numbe
     """Add the points found from the lights' mirror directions, in their order."""
     glints = paths.glints
     frame = mi.Frame3f(glints.normal)
-    wo = frame.to_local(dr.gather(mi.Vector3f, paths.directions, glints.light))
-    value = surfaces.eval(number, frame.to_local(glints.wi), wo, glints.weights[number]) * glints.factor * math.pi
+    wi, wo, factor = frame.to_local(glints.wi), frame.to_local(glints.wo), glints.factor * glints.strength
+    value = surfaces.eval(number, wi, wo, glints.weights[number]) * factor * math.pi
     dr.eval(value)
     pixels = stack.reshape(-1, 3)
     for channel in range(3):

@@ -89,6 +89,9 @@ CASES = [
     Case("bowl", "lambertian:0.9", 2, camera=3.0, near=NEAR),
     Case("sculpture:5", "patches:2:gold-paint+lambertian:0.7+black-fabric", 2, camera=2.5, near=NEAR),
     Case("sphere", "steel", 1, 8, 2048, camera=2.5, near=NEAR),
+    Case("sphere", "chrome", 0, 8, 2048, camera=2.5),
+    Case("bowl", "chrome", 1, 8, 2048, near=NEAR),
+    Case("blobby:8", "nickel", 2, 8, 1024, camera=2.5, near=NEAR),
 ]
 
 
@@ -282,8 +285,8 @@ def test_an_unchanged_family_passes_without_the_fast_path():
     assert p_value(ours(case, case.material, change=with_family(Changed)), expected(case, case.material)) > 0.01
 
 
-def test_notices_highlights_counted_twice(monkeypatch):
-    case = CASES[4]
+@pytest.mark.parametrize("case", [CASES[4], CASES[28]], ids=str)
+def test_notices_highlights_counted_twice(case, monkeypatch):
     monkeypatch.setattr(highlights, "partition", lambda spread, s, size, spp: dr.full(mi.Float, 0.6, 1))
     assert p_value(ours(case, case.material), expected(case, case.material)) < 1e-4
 
