@@ -48,6 +48,7 @@ class Case:
     spp: int = 144
     camera: float | None = None  # distance
     near: tuple[float, ...] = ()  # distances of the lights
+    slow: bool = False
 
     @property
     def seed(self) -> int:
@@ -89,9 +90,9 @@ CASES = [
     Case("bowl", "lambertian:0.9", 2, camera=3.0, near=NEAR),
     Case("sculpture:5", "patches:2:gold-paint+lambertian:0.7+black-fabric", 2, camera=2.5, near=NEAR),
     Case("sphere", "steel", 1, 8, 2048, camera=2.5, near=NEAR),
-    Case("sphere", "chrome", 0, 8, 2048, camera=2.5),
-    Case("bowl", "chrome", 1, 8, 2048, near=NEAR),
-    Case("blobby:8", "nickel", 2, 8, 1024, camera=2.5, near=NEAR),
+    Case("sphere", "chrome", 0, 8, 2048, camera=2.5, slow=True),
+    Case("bowl", "chrome", 1, 8, 2048, near=NEAR, slow=True),
+    Case("blobby:8", "nickel", 2, 8, 1024, camera=2.5, near=NEAR, slow=True),
 ]
 
 
@@ -162,7 +163,7 @@ def p_value(first: np.ndarray, second: np.ndarray) -> float:
     return worst
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
+@pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.slow] * case.slow) for case in CASES], ids=str)
 def test_agrees_with_path(case, material):
     name = material(case.material)
     level = -np.expm1(np.log1p(-FAMILY_SIGNIFICANCE) / len(CASES))  # Sidak once more, over the scenes
