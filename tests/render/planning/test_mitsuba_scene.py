@@ -145,8 +145,8 @@ def test_near_lights_and_perspective(saved):
     """Both as a point emitter and a perspective sensor; the parameters' defaults are the first light's."""
     mesh, spec, folder, images = saved["near lights, perspective"]
     compare(images, ours(spec, mesh), "near lights, perspective", 0.0)
-    assert p_value(images, ours(replace(spec, light_distances=(2.2, 2.5, 3.5)), mesh)) < 1e-4
-    assert p_value(images, ours(replace(spec, view=replace(spec.view, camera_distance=2.7)), mesh)) < 1e-4
+    assert p_value(images, ours(replace(spec, light_distances=(4.0, 5.0, 7.0)), mesh)) < 1e-4
+    assert p_value(images, ours(replace(spec, view=replace(spec.view, camera_distance=4.0)), mesh)) < 1e-4
     xml, words = (folder / "scene.xml").read_text(), (folder / "README.txt").read_text()
     assert 'type="point"' in xml and 'type="perspective"' in xml and "directional" not in xml
     assert "x, y, z, intensity = map(float" in words and "irradiance" not in words
