@@ -106,7 +106,8 @@ def render_view(shape: ShapeLike, material: MaterialLike, lights: LightsLike, **
         shape: See `shape`.
         material: See `material`.
         lights: See `lights`; L directions.
-        options: Those of `render_views`: `size`, `spp`, `bounces`, `scale`, `rotation`, `offset`, `seed`.
+        options: Those of `render_views`: `size`, `spp`, `bounces`, `scale`, `rotation`, `offset`, `camera_distance`,
+            `light_distance`, `seed`.
 
     Returns:
         The view; its `images` are (L, size, size, 3) float32, linear radiance in which a white Lambertian surface that
@@ -130,20 +131,26 @@ def render_views(
     scale: float = 0.9,
     rotation: np.ndarray | None = None,
     offset: tuple[float, float] = (0.0, 0.0),
+    camera_distance: float | None = None,
+    light_distance: float | Sequence[float] | None = None,
     seed: int = 0,
 ) -> Iterator[RenderedView]:
-    """Render one object in several materials, which share all rays; the camera is orthographic and looks along -z.
+    """Render one object in several materials, which share all rays; the camera looks along -z.
 
     Args:
         shape: See `shape`.
         materials: At least one, each as in `material`.
-        lights: See `lights`; L directional lights of irradiance pi.
+        lights: See `lights`; L lights of irradiance pi; directions from the object's centre where they are near.
         size: Image side in pixels.
         spp: Camera samples per pixel.
         bounces: Interreflection bounces after the first hit, 0 to 16; 0 is direct light with cast shadows.
         scale: Radius of the object's unit sphere in half image widths, in (0, 10]; 1 touches the frame.
         rotation: (3, 3) rotation of column vectors, object to camera frame; None for as it is.
         offset: Translation in half image widths, (right, up).
+        camera_distance: Distance of a perspective camera, a pinhole, from the plane of the object's centre, in half
+            image widths, above `scale`: the field of view is 2 atan(1 / distance). None: orthographic.
+        light_distance: Distance of near lights from the object's centre, in half image widths, above `scale`; one for
+            all or L. Each has irradiance pi there, falling with the inverse square of the distance. None: distant.
         seed: Of the sampler; the same call gives the same bytes on one machine.
 
     Returns:
@@ -157,9 +164,9 @@ def render_views(
     if not covers:
         raise InputError("materials: at least one is needed")
     first = SceneSpec(
-        id="view-0", seed=seed, split="test", shape=str(shape) if isinstance(shape, str | Path) else "mesh",
-        material=covers[0].name, view=_view(rotation, scale, offset),
-        lights=tuple(map(tuple, _lights(lights).tolist())), size=size, spp=spp, bounces=bounces,
+        id="view-0", split="test", shape=str(shape) if isinstance(shape, str | Path) else "mesh",
+        material=covers[0].name, view=_view(rotation, scale, offset, camera_distance), size=size, spp=spp,
+        bounces=bounces, seed=seed, **_lit(_lights(lights), light_distance),
     )  # fmt: skip
     return _rendered(_shape(shape), covers, first)
 
@@ -181,12 +188,30 @@ def _rendered(mesh: TriangleMesh, covers: Sequence[Surface], first: SceneSpec) -
     return rendered_views(build(mesh), scenes, PackedSurfaces(covers, mesh), range(len(covers)))
 
 
-def _view(rotation: np.ndarray | None, scale: float, offset: tuple[float, float]) -> View:
+def _lit(directions: np.ndarray, distance: float | Sequence[float] | None) -> dict[str, Any]:
+    """Return the lights of a scene and, of near ones, their distances, or say what is wrong with these."""
+    found: dict[str, Any] = {"lights": tuple(map(tuple, directions.tolist()))}
+    if distance is None:
+        return found
+    values, count = np.asarray(distance, np.float64), len(directions)
+    if values.shape not in ((), (count,)):
+        raise InputError(f"light_distance: expected one number or {count}, got {values.size}")
+    return found | {"light_distances": tuple(np.broadcast_to(values, count).tolist())}
+
+
+def _view(
+    rotation: np.ndarray | None, scale: float, offset: tuple[float, float], camera_distance: float | None
+) -> View:
     """Return the pose, or say what is wrong with it."""
     matrix = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
     if matrix.shape != (3, 3) or not np.linalg.det(matrix) > 0:
         raise InputError(f"rotation: expected a (3, 3) rotation matrix that does not mirror, got {matrix.tolist()}")
-    return View(rotation=tuple(matrix.ravel().tolist()), scale=scale, offset=(float(offset[0]), float(offset[1])))
+    return View(
+        rotation=tuple(matrix.ravel().tolist()),
+        scale=scale,
+        offset=(float(offset[0]), float(offset[1])),
+        camera_distance=None if camera_distance is None else float(camera_distance),
+    )
 
 
 def render_plan(scenes: Sequence[SceneSpec], folder: str | Path, *, workers: int = 1) -> list[Path]:

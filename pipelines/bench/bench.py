@@ -8,7 +8,7 @@ out. `pipelines.bench.bench_data` adds what concerns whole runs: steady state, m
 import argparse
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,12 +64,17 @@ class BenchConfig:
         check_fields(self, "not negative", "bounces")
 
 
+_CAMERA = 5.0  # distance of the perspective camera, in radii of the object
+_NEAR = (2.0, 5.0)  # those of near lights
 LABELS = {
     "rays": "rays alone (camera, bounces, shadows), nothing shaded",
     "rays, every sample": "the same with a shadow ray for every sample and light",
     "one material": "all lights at once",
     "two materials": "all lights at once, two materials",
     "mirror-like": "all lights at once, a mirror-like material",
+    "near lights": "all lights at once, near ones",
+    "perspective": "all lights at once, perspective camera",
+    "near lights, perspective": "all lights at once, near ones, perspective camera",
     "twice the lights": "all lights at once, twice as many",
     "twice the size": "all lights at once, twice the image side",
     "path": "Mitsuba `path`, one light after another",
@@ -83,6 +88,9 @@ RATIOS = {
     "128 / 64 lights": ("twice the lights", "one material", 0, "at most 2"),
     "256x256 / 128x128": ("twice the size", "one material", 0, "at most 4.4"),
     "mirror-like / plain material": ("mirror-like", "one material", 0, ""),
+    "near / distant lights": ("near lights", "one material", 0, "at most 1.3"),
+    "perspective / orthographic": ("perspective", "one material", 0, ""),
+    "near and perspective / plain": ("near lights, perspective", "one material", 0, ""),
 }
 
 
@@ -131,10 +139,13 @@ def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], 
     one, two, mirror = pack([config.material]), pack([config.material, config.second]), pack([config.mirror])
     settings: dict[str, Any] = {"size": config.size, "spp": config.spp, "bounces": config.bounces, "seed": config.seed}
 
-    def all_lights(surfaces: Any = one, count: int = config.lights, **changes: int) -> None:
-        truth, images = many_lights.render(built, view, surfaces, lights[:count], **settings | changes)
+    pinhole = replace(view, camera_distance=_CAMERA * config.scale)
+    near = np.linspace(*_NEAR, config.lights) * config.scale
+
+    def all_lights(surfaces: Any = one, count: int = config.lights, seen: View = view, **changes: Any) -> None:
+        truth, images = many_lights.render(built, seen, surfaces, lights[:count], **settings | changes)
         means = [float(image[0].mean()) for _, image in images]
-        if surfaces is one and not changes and count == config.lights:
+        if surfaces is one and seen is view and not changes and count == config.lights:
             found["coverage"], found["mean"] = float(truth.coverage.mean()), means[0]
 
     def rays_alone(probe: bool = True) -> None:
@@ -147,6 +158,9 @@ def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], 
         "one material": all_lights,
         "two materials": lambda: all_lights(two),
         "mirror-like": lambda: all_lights(mirror),
+        "near lights": lambda: all_lights(distances=near),
+        "perspective": lambda: all_lights(seen=pinhole),
+        "near lights, perspective": lambda: all_lights(seen=pinhole, distances=near),
         "twice the lights": lambda: all_lights(count=2 * config.lights),
         "twice the size": lambda: all_lights(size=2 * config.size),
     }

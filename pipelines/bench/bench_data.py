@@ -24,7 +24,10 @@ _VIEWS = 40
 
 
 def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
-    """Count the kernels compiled while shapes, views, materials and lights change."""
+    """Count the kernels compiled while shapes, views, materials, lights and cameras change.
+
+    Every second view is seen in perspective, half of these under near lights.
+    """
     from render.backend import variant
 
     variant.load()
@@ -36,14 +39,18 @@ def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
 
     config = presets.load("small").data
     config = replace(config, families={"blobby": 8, "sculpture": 18}, views=2, spatially_varying=0.0, spp=16)
-    planned = plan(config)[: 2 * (_WARM_UP + _VIEWS)]
+    near = replace(config, near_lights=0.5, camera="perspective")
+    plans = [plan(each)[: 2 * (_WARM_UP + _VIEWS)] for each in (config, near)]
+    planned = plans[0]
 
     def render(first: int) -> None:
-        pair = planned[first : first + 2]
+        pair = plans[first // 2 % 2][first : first + 2]
+        distances = np.asarray(pair[0].light_distances) if pair[0].light_distances else None
         built = scene.build(shapes.load(pair[0].shape))
         _, images = many_lights.render(
             built, pair[0].view, pack([one.material for one in pair], built.mesh), pair[0].light_directions(),
             size=config.size, spp=config.spp, bounces=config.bounces, seed=pair[0].seed,
+            distances=distances,
         )  # fmt: skip
         for _ in images:
             pass
@@ -58,8 +65,8 @@ def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
     compiled = sum(not kernel["cache_hit"] or bool(kernel["cache_disk"]) for kernel in history)
     values = {"views": _VIEWS, "launches": len(history), "kernels_compiled": compiled}
     return values, (
-        f"Steady state: {_VIEWS} views of {len({s.shape for s in planned})} shapes with other poses, materials and "
-        f"lights, {len(history):,} kernel launches, {compiled} kernels compiled.\n"
+        f"Steady state: {_VIEWS} views of {len({s.shape for s in planned})} shapes with other poses, materials, "
+        f"lights and cameras, {len(history):,} kernel launches, {compiled} kernels compiled.\n"
     )
 
 

@@ -100,8 +100,9 @@ def _about(counts: Composition) -> str:
     """Say in two sentences what the data are."""
     sizes = ", ".join(counts.sizes)
     families = ", ".join(counts.families)
+    kind, place = ("lights", "direction or position") if counts.near else ("directional lights", "direction")
     return (
-        f"{counts.scenes:,} scenes for photometric stereo ({families}), each one object under directional lights "
-        f"of known direction: {counts.images:,} linear RGB images ({sizes} pixels) with normals and mask. "
+        f"{counts.scenes:,} scenes for photometric stereo ({families}), each one object under {kind} "
+        f"of known {place}: {counts.images:,} linear RGB images ({sizes} pixels) with normals and mask. "
         f"{len(counts.materials):,} materials; {counts.varying:,} scenes vary spatially."
     )

@@ -2,13 +2,14 @@
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 from render.exchange.layouts import LAYOUTS
 from render.exchange.rules import RuleReport, check_tree
 from render.exchange.samples import ExportOptions
-from render.records.manifest import read_manifest
+from render.records.manifest import SceneSpec, read_manifest
 from render.shared.errors import InputError
 
 _SHOWN = 20
@@ -54,12 +55,31 @@ def main(args: argparse.Namespace) -> int:
     sys.stdout.write(
         f"{args.out}: {len(done.scenes)} scenes as {args.layout}, {done.written} written now, {done.kept} kept\n"
     )
+    sys.stdout.write(_lost(chosen, args.layout))
     for field, words in (("clipped", "clipped"), ("black", "lit but rounded to black")):
         mean, most, worst = done.worst(field)
         sys.stdout.write(f"{words}: {mean:.2%} of the object's values on average, at most {most:.2%} ({worst})\n")
     if args.layout == "psfcn" and not any(scene["split"] == "val" for scene in done.scenes.values()):
         sys.stdout.write(f"{args.out}: val_mtrl.txt is empty; export scenes of split 'val' too before training on it\n")
     return _report(check_tree(args.out, args.layout, source=args.folder), args.out) if args.check else 0
+
+
+def _lost(scenes: Sequence[SceneSpec], layout: str) -> str:
+    """Say what of near lights and perspective has no place in a layout; nothing where there are none."""
+    near = sum(bool(scene.light_distances) for scene in scenes)
+    perspective = sum(scene.view.camera_distance is not None for scene in scenes)
+    lines = []
+    if near:
+        lines.append(
+            f"{near} scenes have near lights, which {layout} has no place for: directions are those from the object's "
+            "centre; positions are in scene.json\n"
+        )
+    if perspective:
+        lines.append(
+            f"{perspective} scenes have a perspective camera, which {layout} has no place for; its distance is in "
+            "scene.json\n"
+        )
+    return "".join(lines)
 
 
 def _exposure(text: str | None) -> float | Literal["auto"] | None:

@@ -21,6 +21,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--materials", action="append", help="names, categories, all, lambertian:0.5, .yaml, .binary "
                         "and .bsdf files, mixtures such as stripes:7:chrome+blue-fabric")  # fmt: skip
     parser.add_argument("--lights", action="append", help="merltest, diligent, biased:64, or a file of directions")
+    parser.add_argument("--camera-distance", type=float, default=None, metavar="D", help="perspective camera at D half "
+                        "image widths from the object's centre (default: orthographic)")  # fmt: skip
+    parser.add_argument("--light-distance", type=float, default=None, metavar="D", help="near lights at D half image "
+                        "widths from the object's centre (default: distant lights)")  # fmt: skip
     parser.add_argument("--mitsuba", action="store_true",
                         help="also save each scene for stock Mitsuba, in <out>/mitsuba/<id>")  # fmt: skip
     presets.add_common_arguments(parser)
@@ -37,6 +41,8 @@ def main(args: argparse.Namespace) -> int:
         shapes=tuple(split_list(args.shapes)) or preset.test.shapes,
         materials=tuple(split_list(args.materials)) or preset.test.materials,
         lights=lights[0],
+        camera_distance=preset.test.camera_distance if args.camera_distance is None else args.camera_distance,
+        light_distance=preset.test.light_distance if args.light_distance is None else args.light_distance,
     )
     wanted = scenes.test_scenes(test)
     folder = Path(args.out or "out/regenerated")

@@ -32,6 +32,9 @@ class TestConfig(InferenceConfig):
         spp: Camera samples per pixel.
         bounces: Interreflection bounces.
         scale: Radius of the object's unit sphere, in half image widths.
+        camera_distance: Distance of a perspective camera (`render.records.manifest.View`), in half image widths; none:
+            orthographic.
+        light_distance: Distance of near lights from the object's centre, in half image widths; none: distant lights.
         seed: Root seed of the renderer and of the random intensities.
         intensity_range: Range the light intensities are drawn from, uniformly.
         repeats: Draws of random intensities per scene; scores are averaged over them.
@@ -46,6 +49,8 @@ class TestConfig(InferenceConfig):
     spp: int = 128
     bounces: int = 2
     scale: float = 0.95
+    camera_distance: float | None = None
+    light_distance: float | None = None
     seed: int = 0
     intensity_range: tuple[float, float] = (0.2, 2.0)
     repeats: int = 1

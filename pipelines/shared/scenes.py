@@ -28,11 +28,20 @@ def test_scenes(config: TestConfig) -> list[SceneSpec]:
         load_shape(shape)
     loaded = light_sets.load(config.lights).tolist()
     directions = tuple((round(x, 6), round(y, 6), round(z, 6)) for x, y, z in loaded)
+    distances = () if config.light_distance is None else (config.light_distance,) * len(directions)
     scenes = [
         SceneSpec(
-            id=f"{slug(shape)}-{slug(material)}", seed=derived_seed(config.seed, "test", shape), split="test",
-            shape=shape, material=material, view=View(scale=config.scale), lights=directions, size=config.size,
-            spp=config.spp, bounces=config.bounces,
+            id=f"{slug(shape)}-{slug(material)}",
+            seed=derived_seed(config.seed, "test", shape),
+            split="test",
+            shape=shape,
+            material=material,
+            view=View(scale=config.scale, camera_distance=config.camera_distance),
+            lights=directions,
+            size=config.size,
+            spp=config.spp,
+            bounces=config.bounces,
+            light_distances=distances,
         )
         for shape in config.shapes
         for material in pool

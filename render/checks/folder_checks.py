@@ -62,7 +62,8 @@ def check_folder(
 def _kind(scene: SceneSpec) -> tuple[Hashable, ...]:
     """Return what makes a scene a sample of its own; nothing says that imported scenes of one name show one view."""
     imported = scene.id if family(scene.shape) == IMPORTED else ""
-    return scene.shape, scene.material, scene.view, scene.lights, scene.size, imported
+    lights = (scene.lights, scene.light_distances)
+    return scene.shape, scene.material, scene.view, lights, scene.size, imported
 
 
 def _is_temporary(name: str) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.stats import rankdata
 
 from render.checks.shard_checks import Complaints, Limits
+from render.records import view_geometry
 from render.records.shards import Shard
 
 PIXELS = 600  # per scene; more do not change the mean correlation
@@ -46,11 +47,10 @@ def measure_agreement(shard: Shard) -> Agreement:
     Ranks make this independent of the reflectance as long as brighter goes with larger n.l; highlights of mirror-like
     materials and cast shadows weaken it but keep its sign, since what is turned from the light is dark for all.
     """
-    normals, intensity = _object_pixels(shard)
+    normals, intensity, lights = _object_pixels(shard)
     if not len(normals):
         return Agreement(float("nan"), dict.fromkeys(FLIPS, float("nan")))
     ranks = _centred_ranks(intensity)
-    lights = shard.light_directions.astype(np.float64)
     upright = _correlation(ranks, normals, lights)
     margins = {}
     for name, direction in FLIPS.items():
@@ -60,7 +60,7 @@ def measure_agreement(shard: Shard) -> Agreement:
             margins[name] = float("nan")
             continue
         reflected = normals[tilted] - 2 * tilt[tilted, None] * direction
-        margins[name] = float(np.mean(upright[tilted] - _correlation(ranks[:, tilted], reflected, lights)))
+        margins[name] = float(np.mean(upright[tilted] - _correlation(ranks[:, tilted], reflected, lights[:, tilted])))
     return Agreement(float(np.mean(upright)), margins)
 
 
@@ -97,7 +97,8 @@ def unresolved(shard: Shard, limits: Limits) -> Complaints:
 
 def black_images(shard: Shard, limits: Limits) -> Complaints:
     """No image is black on the object though its light faces a good part of it (n.l > 0.3 on 30 % of the mask)."""
-    facing = np.mean(shard.normals[shard.mask] @ shard.light_directions.T > 0.3, axis=0) > 0.3  # (L,)
+    normals, _, lights = _object_pixels(shard)
+    facing = np.mean(_cosines(lights, normals) > 0.3, axis=1) > 0.3 if len(normals) else np.zeros(len(lights), bool)
     black = ~np.any(shard.images[:, shard.mask] > 0, axis=(1, 2))
     if black.all():
         yield "every image is black on the object", 2.0
@@ -113,8 +114,8 @@ def attached_shadows(shard: Shard, limits: Limits) -> Complaints:
 
     The median over all such pairs of pixel and light, relative to the mean of pairs with n.l > 0.15.
     """
-    normals, intensity = _object_pixels(shard)
-    cosines = shard.light_directions.astype(np.float64) @ normals.T  # (L, P)
+    normals, intensity, lights = _object_pixels(shard)
+    cosines = _cosines(lights, normals)
     turned, facing = intensity[cosines < -SHADED], intensity[cosines > SHADED]
     if len(turned) < FEWEST or len(facing) < FEWEST or facing.mean() <= 0:
         return
@@ -132,13 +133,24 @@ def exposure(shard: Shard, limits: Limits) -> Complaints:
         yield f"95 % of the object is darker than {level:.2g} (limit {limits.dim:g})", limits.dim - level
 
 
-def _object_pixels(shard: Shard) -> tuple[np.ndarray, np.ndarray]:  # (P, 3), (L, P)
-    """Return normals and grey intensities of up to `PIXELS` pixels, evenly spread over the mask."""
+def _object_pixels(shard: Shard) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # (P, 3), (L, P), (L, P, 3)
+    """Return normals, grey intensities and light directions of up to `PIXELS` pixels, evenly spread over the mask.
+
+    The intensities are those under irradiance pi at the pixel, which near lights have at the object's centre only.
+    """
     places = np.flatnonzero(shard.mask)
     places = places[:: max(1, len(places) // PIXELS)]
     normals = shard.normals.reshape(-1, 3)[places].astype(np.float64)
     flat = shard.images.reshape(len(shard.images), -1, 3)
-    return normals, flat[:, places].astype(np.float64).mean(axis=-1)
+    intensity = flat[:, places].astype(np.float64).mean(axis=-1)
+    points = view_geometry.points(shard.depth.astype(np.float64), shard.camera_distance).reshape(-1, 3)[places]
+    lights, irradiance = view_geometry.incident(points, shard.light_directions, shard.light_positions, shard.centre)
+    return normals, intensity / irradiance, lights
+
+
+def _cosines(lights: np.ndarray, normals: np.ndarray) -> np.ndarray:  # (L, P)
+    """Return n.l of lights (L, P, 3) and normals (P, 3)."""
+    return np.einsum("lpc,pc->lp", lights, normals)
 
 
 def _centred_ranks(values: np.ndarray) -> np.ndarray:
@@ -148,7 +160,7 @@ def _centred_ranks(values: np.ndarray) -> np.ndarray:
 
 
 def _correlation(ranks: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:  # (P,)
-    """Correlate centred ranks (L, P) with those of max(n.l, 0); 0 where either is constant."""
-    expected = _centred_ranks(np.maximum(lights @ normals.T, 0.0))
+    """Correlate centred ranks (L, P) with those of max(n.l, 0), lights (L, P, 3); 0 where either is constant."""
+    expected = _centred_ranks(np.maximum(_cosines(lights, normals), 0.0))
     norm = np.sqrt((ranks**2).sum(axis=0) * (expected**2).sum(axis=0))
     return (ranks * expected).sum(axis=0) / np.where(norm > 0, norm, 1.0)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from render.records import view_geometry
 from render.records.shards import HALF_LIMIT, Shard
 from render.shared.config import check_fields
 from render.shared.errors import InputError
@@ -102,9 +103,9 @@ def unit_normals(shard: Shard, limits: Limits) -> Complaints:
 
 
 def facing_normals(shard: Shard, limits: Limits) -> Complaints:
-    """Visible normals face the camera (z > 0), but for interpolated ones at the rim: some pixels, a little behind."""
-    z = shard.normals[shard.mask][:, 2]
-    share = float((z < limits.facing).mean())
+    """Visible normals face the camera (n.v > 0), but for interpolated ones at the rim: some pixels, a little behind."""
+    towards = view_geometry.view_directions(shard.mask.shape, shard.camera_distance)[shard.mask]
+    share = float(((shard.normals[shard.mask] * towards).sum(-1) < limits.facing).mean())
     if share > limits.away:
         yield f"{share:.1%} of the normals face away from the camera (limit {limits.away:.0%})", share
 
@@ -133,7 +134,9 @@ def has_depth(shard: Shard) -> bool:
 def depth_slopes(shard: Shard) -> tuple[np.ndarray, np.ndarray]:  # (N,), (N,)
     """Pair the slopes of the depth with those the normals predict, along x and y together.
 
-    A surface z(x, y) has the normal (-dz/dx, -dz/dy, 1) up to scale, so the prediction is -n.x/n.z and -n.y/n.z.
+    A surface z(x, y) has the normal (-dz/dx, -dz/dy, 1) up to scale, so the prediction is -n.x/n.z and -n.y/n.z. Under
+    perspective (`render.records.view_geometry`), x and y shrink by s = 1 - z/D, and it is -n.x s / (n.z - (x n.x +
+    y n.y)/D) with the image point (x, y).
     Neighbours are 2/W half image widths apart. Left out are pixels beside the silhouette or nearly edge-on, and steps:
     where one part hides another, the slopes to both sides differ widely.
 
@@ -141,18 +144,22 @@ def depth_slopes(shard: Shard) -> tuple[np.ndarray, np.ndarray]:  # (N,), (N,)
         Measured and predicted slopes where the prediction exceeds `SLOPE`.
     """
     step = 2.0 / shard.mask.shape[1]
-    inside = shard.mask & (shard.normals[..., 2] > STEEP)
+    along, shrunk = shard.normals[..., 2].astype(np.float64), np.ones(shard.mask.shape)
+    if shard.camera_distance is not None:
+        image = view_geometry.image_points(shard.mask.shape)
+        along = along - (image * shard.normals[..., :2]).sum(-1) / shard.camera_distance
+        shrunk = 1 - shard.depth / shard.camera_distance
+    inside = shard.mask & (along > STEEP)
     z = np.where(shard.mask, shard.depth, np.nan).astype(np.float64)
     measured, predicted = [], []
     for axis, sign, component in ((1, 1.0, 0), (0, -1.0, 1)):  # rows run down, y runs up
         ahead = sign * np.diff(z, axis=axis, append=np.nan) / step
         behind = sign * np.diff(z, axis=axis, prepend=np.nan) / step
         low, high = np.minimum(abs(ahead), abs(behind)), np.maximum(abs(ahead), abs(behind))
-        normal = np.where(inside, shard.normals[..., 2], 1.0)
-        slope = -shard.normals[..., component] / normal
+        slope = -shard.normals[..., component] * shrunk / np.where(inside, along, 1.0)
         kept = inside & (ahead * behind > 0) & (low > SMOOTH * high) & (abs(slope) > SLOPE)
         measured.append((ahead + behind)[kept] / 2)
-        predicted.append(slope[kept].astype(np.float64))
+        predicted.append(slope[kept])
     return np.concatenate(measured), np.concatenate(predicted)
 
 
@@ -182,12 +189,17 @@ def depth(shard: Shard, limits: Limits) -> Complaints:
 
 
 def lights(shard: Shard, limits: Limits) -> Complaints:
-    """Light directions are unit vectors above the horizon (z > 0)."""
+    """Light directions are unit vectors above the horizon (z > 0), and positions of near lights lie along them."""
     directions = shard.light_directions.astype(np.float64)
     error = float(np.abs(np.linalg.norm(directions, axis=1) - 1).max())
     if error > limits.unit_error:
         yield f"a light direction has length off by {error:.3g} (limit {limits.unit_error:g})", error
     below = np.flatnonzero(directions[:, 2] <= 0)
+    if shard.light_positions is not None:
+        towards = shard.light_positions - shard.centre
+        error = float(np.abs(towards / np.linalg.norm(towards, axis=1, keepdims=True) - directions).max())
+        if error > limits.unit_error:
+            yield f"a light's position lies off its direction by {error:.3g} (limit {limits.unit_error:g})", error
     if len(below):
         yield f"{len(below)} lights are below the horizon (the first is number {below[0]})", float(len(below))
 

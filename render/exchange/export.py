@@ -138,6 +138,10 @@ def _write_scene(folder: Path, root: Path, scene: SceneSpec, place: Place, optio
     sample, facts = prepare(read_shard(source, scene), scene, options)
     marker = {"id": scene.id, "shape": scene.shape, "material": scene.material, "split": scene.split} | facts
     marker |= {"bits": options.settings()["bits"], "sha256": file_hash(source), "spec": scene.digest()}
+    if scene.light_distances:
+        marker["light_positions"] = np.asarray(scene.light_positions(), np.float64).round(6).tolist()
+    if scene.view.camera_distance is not None:
+        marker["camera_distance"] = scene.view.camera_distance
     if options.layout == "unips":
         marker |= {
             "light_directions": sample.directions.tolist(),

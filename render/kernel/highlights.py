@@ -1,10 +1,11 @@
 """Narrow highlights, sampled from the lights' side: points whose normal is near the half vector.
 
 The highlight of a mirror-like metal covers a few tenths of a degree of normals, a pixel of a curved object several
-degrees, so that thousands of samples per pixel would be needed to meet it. Lights and view are directional, so for
-each light the half vector h is the same everywhere. Normals drawn around h are mapped back to the surface: on a
-triangle with corner normals N = [n0 n1 n2] the normal m is found at the barycentric coordinates N^-1 m, normalised to
-sum 1.
+degrees, so that thousands of samples per pixel would be needed to meet it. Under distant lights and an orthographic
+camera each light has one half vector h. Normals drawn around h are mapped back to the surface: on a triangle with
+corner normals N = [n0 n1 n2] the normal m is found at the barycentric coordinates N^-1 m, normalised to sum 1. Near
+lights and perspective have another h everywhere; that of a triangle's centroid then stands for the triangle. Where the
+triangle is small, as seen from light and camera, h hardly turns on it; the larger it is, the less the noise shrinks.
 
 Both strategies, samples over the pixel's area and normals around h, are combined by the balance heuristic (Veach 1997,
 eq. 9.8): with p the density of the second over image area, every sample of either counts f V / (spp + A p), A the area
@@ -42,7 +43,52 @@ class Glints(NamedTuple):
     target: np.ndarray  # (G,) int64, light * pixels + pixel
     factor: Any  # Float (G), weight in units of a camera sample
     weights: tuple  # as `Vertices.weights`
-    wi: Any  # Vector3f (1), to the camera
+    wi: Any  # Vector3f (G, or 1), to the camera
+    wo: Any  # Vector3f (G), to the light
+    strength: Any  # Float (G, or 1), irradiance / pi
+
+
+class SharedHalves(NamedTuple):
+    """The half vectors of distant lights and an orthographic camera."""
+
+    halves: Any  # Vector3f (L)
+
+    def of(self, light: Any, _centre: Any) -> Any:
+        """Return the half vectors of lights on triangles with the given centroids."""
+        return dr.gather(mi.Vector3f, self.halves, light)
+
+
+class LocalHalves(NamedTuple):
+    """The half vectors of near lights, or of a perspective camera."""
+
+    camera: Any
+    emitters: Any
+
+    def of(self, light: Any, centre: Any) -> Any:
+        """Return the half vectors of lights on triangles with the given centroids."""
+        return dr.normalize(self.camera.towards(centre) + self.emitters.towards(light, centre)[0])
+
+
+def half_vectors(camera: Any, emitters: Any, parallel: bool) -> SharedHalves | LocalHalves:
+    """Return the half vectors that normals are drawn around.
+
+    Args:
+        camera: A `render.kernel.camera.Camera`.
+        emitters: The lights (`render.kernel.emitters`).
+        parallel: Whether both are distant.
+    """
+    if not parallel:
+        return LocalHalves(camera, emitters)
+    towards = camera.to_object(0, 0, 1)
+    halves = dr.normalize(emitters.directions + towards)
+    dr.eval(halves)
+    return SharedHalves(halves)
+
+
+def centroid(corners: Any) -> Any:
+    """Return the centroids of `render.kernel.scene.Triangles`."""
+    p0, p1, p2 = corners.positions
+    return mi.Point3f((p0 + p1 + p2) * (1 / 3))
 
 
 def normals(spp: int) -> int:
@@ -75,8 +121,10 @@ def one_minus_cos(normal: Any, half: Any) -> Any:
     return sin2 / (1 + dr.maximum(dr.dot(normal, half), 0))
 
 
-def normal_spread(scene: Any, camera: Any, prim: Any, uv: Any) -> Any:
-    """Return d(solid angle of the shading normal) / d(image area) at hits (N), zero where triangles are flat.
+def normal_spread(scene: Any, camera: Any, prim: Any, uv: Any) -> tuple:
+    """Return the centroids of the triangles that were hit, and d(solid angle of the shading normal) / d(image area).
+
+    The latter is zero where triangles are flat.
 
     Args:
         scene: A `render.kernel.scene.Scene`.
@@ -84,18 +132,23 @@ def normal_spread(scene: Any, camera: Any, prim: Any, uv: Any) -> Any:
         prim: (N) triangle numbers.
         uv: (N) barycentric coordinates of corners 1 and 2.
     """
-    spread = _spread(scene.triangles(prim), uv.x, uv.y, camera)
-    dr.eval(spread)
-    return spread
+    corners = scene.triangles(prim)
+    centre, spread = centroid(corners), _spread(corners, uv.x, uv.y, camera)
+    dr.eval(centre, spread)
+    return centre, spread
 
 
-def find(scene: Any, camera: Any, directions: Any, surfaces: Any, spp: int, seed: int, first: int) -> Glints | None:
+def find(
+    scene: Any, camera: Any, emitters: Any, halves: Any, lights: int, surfaces: Any, spp: int, seed: int, first: int
+) -> Glints | None:
     """Find the points on the visible, lit surface whose normals were drawn around the half vectors.
 
     Args:
         scene: A `render.kernel.scene.Scene`.
         camera: A `render.kernel.paths.Camera`.
-        directions: (L) Vector3f to the lights, object frame.
+        emitters: The lights (`render.kernel.emitters`).
+        halves: Of `half_vectors`.
+        lights: Number of lights, L.
         surfaces: The surfaces, whose patterns are evaluated at the points.
         spp: Camera samples per pixel of the pass.
         seed, first: Seed and first sample of the pass.
@@ -103,16 +156,13 @@ def find(scene: Any, camera: Any, directions: Any, surfaces: Any, spp: int, seed
     Returns:
         The points, or None when no light is mirrored anywhere.
     """
-    towards = camera.to_object(0, 0, 1)
-    halves = dr.normalize(directions + towards)
-    dr.eval(towards, halves)
-    candidates = _candidates(scene, towards, halves, normals(spp))
+    candidates = _candidates(scene, camera, halves, lights, normals(spp))
     if candidates is None:
         return None
     found = []
     for chosen in _chunks(candidates):
         drawn = _drawn(scene, camera, halves, candidates, chosen, normals(spp), stream(seed, 77 + first))
-        seen = drawn and _unhidden(scene, camera, directions, towards, drawn, spp)
+        seen = drawn and _unhidden(scene, camera, emitters, drawn, spp)
         if seen:
             found.append(seen)
     if not found:
@@ -127,10 +177,12 @@ def find(scene: Any, camera: Any, directions: Any, surfaces: Any, spp: int, seed
     prim, light = upload(mi.UInt32, joined[3]), upload(mi.UInt32, light)
     floats = [upload(mi.Float, values) for values in joined[4:]]
     point, normal, factor = mi.Point3f(*floats[:3]), mi.Vector3f(*floats[3:6]), floats[6]
-    return Glints(normal, light, target, factor, surfaces.weights(point, prim), towards)
+    towards, (wo, strength) = camera.towards(point), emitters.towards(light, point)
+    dr.eval(towards, wo, strength)
+    return Glints(normal, light, target, factor, surfaces.weights(point, prim), towards, wo, strength)
 
 
-def _unhidden(scene: Any, camera: Any, directions: Any, towards: Any, drawn: tuple, spp: int) -> list | None:
+def _unhidden(scene: Any, camera: Any, emitters: Any, drawn: tuple, spp: int) -> list | None:
     """Keep the points inside the frame that the camera and their light see.
 
     Returns:
@@ -139,11 +191,11 @@ def _unhidden(scene: Any, camera: Any, directions: Any, towards: Any, drawn: tup
     point, normal, facet, prim, light, spread, s = drawn
     start = dr.zeros(mi.SurfaceInteraction3f, dr.width(prim))
     start.p, start.n = point, mi.Normal3f(facet)
-    direction = dr.gather(mi.Vector3f, directions, light)
+    direction, ray = emitters.shadow_ray(start, light)
     x, y = camera.project(point)
     seen = (dr.abs(x) < 1) & (dr.abs(y) < 1) & (dr.dot(normal, direction) > 0) & (spread > 0)
-    seen &= ~scene.ray_test(start.spawn_ray(towards), False, seen)
-    seen &= ~scene.ray_test(start.spawn_ray(direction), False, seen)
+    seen &= ~scene.ray_test(start.spawn_ray(camera.towards(point)), False, seen)
+    seen &= ~scene.ray_test(ray, False, seen)
     factor = partition(spread, s, camera.size, spp)
     dr.eval(seen, x, y, factor)
     kept = dr.compress(seen)
@@ -165,7 +217,7 @@ class _Candidates(NamedTuple):
     end: np.ndarray  # (C,) one past the last
 
 
-def _candidates(scene: Any, towards: Any, halves: Any, count: int) -> _Candidates | None:
+def _candidates(scene: Any, camera: Any, halves: Any, lights: int, count: int) -> _Candidates | None:
     """Find, by the bounding cone of each triangle's normals, which of a light's drawn normals it may have.
 
     The normals of a light are numbered by their distance from the half vector, so these are a run.
@@ -176,26 +228,28 @@ def _candidates(scene: Any, towards: Any, halves: Any, count: int) -> _Candidate
     cosine = dr.clip(dr.minimum(dr.minimum(cosines[0], cosines[1]), cosines[2]), 0, 1)
     cone = dr.acos(cosine) + 1e-4  # radians; slack for the rounding of acos
     facing = mi.Bool(False)  # elsewhere the shading normal turns away from the camera, and the surface is black
-    for normal in corners.normals:
-        facing |= dr.dot(normal, towards) > 0
-    dr.eval(axis, cone, facing)
+    for position, normal in zip(corners.positions, corners.normals, strict=True):
+        facing |= dr.dot(normal, camera.towards(position)) > 0
+    centre = centroid(corners)
+    dr.eval(axis, cone, facing, centre)
     shown = dr.compress(facing)
     if len(shown) == 0:
         return None
     axis, cone = dr.gather(mi.Vector3f, axis, shown), dr.gather(mi.Float, cone, shown)
+    centre = dr.gather(mi.Point3f, centre, shown)
     reach = dr.cos(dr.minimum(cone + math.acos(1 - _RIM), math.pi))
     dr.eval(axis, cone, reach)
     width = opaque(mi.UInt32(len(shown)))
-    lane = dr.arange(mi.UInt32, len(shown) * dr.width(halves))
+    lane = dr.arange(mi.UInt32, len(shown) * lights)
     light = lane // width
     local = lane - light * width
-    near = dr.dot(dr.gather(mi.Vector3f, axis, local), dr.gather(mi.Vector3f, halves, light))
+    near = dr.dot(dr.gather(mi.Vector3f, axis, local), halves.of(light, dr.gather(mi.Point3f, centre, local)))
     kept = dr.compress(near > dr.gather(mi.Float, reach, local))
     if len(kept) == 0:
         return None
     light = kept // width
     local = kept - light * width
-    half, axis = dr.gather(mi.Vector3f, halves, light), dr.gather(mi.Vector3f, axis, local)
+    half, axis = halves.of(light, dr.gather(mi.Point3f, centre, local)), dr.gather(mi.Vector3f, axis, local)
     away = 2 * dr.asin(dr.minimum(dr.norm(axis - half) * 0.5, 1))  # exact for small angles, unlike acos
     cone = dr.gather(mi.Float, cone, local)
     ends = [_share(1 - dr.cos(angle)) for angle in (dr.maximum(away - cone, 0), dr.minimum(away + cone, math.pi))]
@@ -240,7 +294,7 @@ def _drawn(
     """
     pair, number = chosen
     prim, light = dr.gather(mi.UInt32, candidates.triangle, pair), dr.gather(mi.UInt32, candidates.light, pair)
-    half = dr.gather(mi.Vector3f, halves, light)
+    half = halves.of(light, centroid(scene.triangles(prim)))
     turn = scrambled(prim * mi.UInt32(0x9E3779B1) + light, seed)
     u = (mi.Float(number) + uniform(turn[0])) * opaque(mi.Float(1 / count))
     s = _CORE * (dr.rcp(dr.square(1 - u * _TAIL)) - 1)
@@ -284,7 +338,7 @@ def _spread(corners: Any, b1: Any, b2: Any, camera: Any) -> Any:
     n0, e1, e2 = _edges(corners.normals)
     p0, p1, p2 = corners.positions
     determinant = dr.abs(dr.dot(n0, dr.cross(e1, e2)))
-    area = dr.abs(dr.dot(dr.cross(p1 - p0, p2 - p0), camera.to_object(0, 0, 1))) * dr.square(camera.scale)
+    area = camera.image_area(dr.cross(p1 - p0, p2 - p0), p0 + b1 * (p1 - p0) + b2 * (p2 - p0))
     length2 = dr.squared_norm(n0 + b1 * e1 + b2 * e2)
     longest2 = dr.maximum(dr.squared_norm(e1), dr.squared_norm(e2))
     usable = (determinant > _FLAT) & (determinant > _SLIVER * longest2) & (area > 1e-12) & (length2 > 1e-6)

@@ -49,6 +49,7 @@ def render(
     spp: int,
     bounces: int,
     seed: int,
+    distances: np.ndarray | None = None,
     only: Sequence[int] | None = None,
     probe: bool = True,
 ) -> tuple[GroundTruth, Iterator[tuple[int, np.ndarray]]]:
@@ -58,23 +59,25 @@ def render(
         scene: One object in the unit sphere (see `render.kernel.scene.build`).
         view: Pose.
         surfaces: K surfaces; each in turn covers the object.
-        lights: (L, 3) unit vectors to the lights, camera frame.
+        lights: (L, 3) unit vectors to the lights, camera frame; to near lights, from the object's centre.
         size: Image side in pixels.
         spp: Camera samples per pixel.
         bounces: Interreflection bounces after the first hit.
         seed: Sampler seed (32 bits).
+        distances: (L,) of near lights from the object's centre, in half image widths; None for distant lights.
         only: Surface numbers to shade, in any order; all by default. The bytes do not depend on it.
         probe: Let the samples of a pixel share what its first samples agree on of a light (`render.kernel.visibility`).
 
     Returns:
         The ground truth, and an iterator over (surface number, images), numbers rising, with images
-        (L, size, size, 3) float32, linear radiance under irradiance pi. Passes over many samples are averaged.
+        (L, size, size, 3) float32, linear radiance under irradiance pi (of near lights, at the object's centre).
+        Passes over many samples are averaged.
     """
     wanted = range(len(surfaces)) if only is None else only
     per_pass = 1 << max(0, (SAMPLES_PER_PASS // size**2).bit_length() - 1)  # so that every pass is stratified
     passes = (
         trace(scene, view, surfaces, lights, size=size, spp=min(per_pass, spp - first), bounces=bounces,
-              seed=seed, first=first, probe=probe)
+              seed=seed, distances=distances, first=first, probe=probe)
         for first in range(0, spp, per_pass)
     )  # fmt: skip
     if per_pass >= spp:  # shaded one by one as they are asked for, so that a hundred materials need no more memory

@@ -8,9 +8,11 @@ import drjit as dr
 import numpy as np
 
 from render.backend import variant
-from render.backend.arrays import opaque, upload
+from render.backend.arrays import opaque
 from render.backend.sampling import bounce_variates, pixel_position, random_variates, stream
 from render.kernel import highlights
+from render.kernel.camera import Camera
+from render.kernel.emitters import DistantLights, NearLights, place
 from render.kernel.visibility import probe_count, probed_visibility, visibility
 from render.materials.kernels.packed import PackedSurfaces
 from render.records.manifest import View
@@ -28,11 +30,12 @@ class Vertices:
     count: int
     position: Any  # Point3f (N)
     normal: Any  # Vector3f (N), shading normal
-    wi: Any  # Vector3f (N, or 1 at the camera hits), to the previous vertex
+    wi: Any  # Vector3f (N, or 1 at an orthographic camera's hits), to the previous vertex
     sample: Any  # UInt32 (N), number of the camera sample
     bitmask: Any  # UInt32 (ceil(L / 32) * N)
     throughput: tuple  # K Color3f (N, or 1 at the camera hits): f cos / density along the path so far
     weights: tuple  # K tuples of Float (N), weights of each surface's materials; None for a single material
+    centre: Any  # Point3f (N), centroid of the triangle, or None where no highlight needs it
     spread: Any  # Float (N), d(solid angle of normals) / d(image area), or None where no highlight needs it
     pixels: Any  # UInt32 (Q), pixels with at least one vertex
     start: Any  # UInt32 (Q), first vertex of the pixel
@@ -46,7 +49,9 @@ class Paths:
     Attributes:
         depths: Vertices per depth, camera hits first.
         glints: Points found from the lights' mirror directions, or None.
-        directions: Light directions in the object frame (Dr.Jit, L).
+        emitters: The lights in the object frame.
+        parallel: Whether camera and lights are distant, so that the camera's hits share the directions to both.
+        halves: Half vectors of `render.kernel.highlights`, or None where no highlight is narrow.
         lights, size, spp: Counts.
         hits: (P,) uint32, samples per pixel that hit the object.
         normal_sum: (P, 3) float64, sum of shading normals of the hits, camera frame.
@@ -56,7 +61,9 @@ class Paths:
 
     depths: tuple[Vertices, ...]
     glints: Any
-    directions: Any
+    emitters: DistantLights | NearLights
+    parallel: bool
+    halves: Any
     lights: int
     size: int
     spp: int
@@ -65,49 +72,24 @@ class Paths:
     depth_sum: np.ndarray
     weight_sums: tuple
 
-
-@dataclass(frozen=True)
-class Camera:
-    """The orthographic camera in the object frame; the camera moves, so that the mesh's BVH serves every view."""
-
-    rotation: Any  # Matrix3f, object to camera
-    scale: Any  # Float
-    offset: Any  # Point2f
-    size: int
-
-    @classmethod
-    def of(cls, view: View, size: int) -> "Camera":
-        """Return the camera of a view."""
-        return cls(
-            opaque(mi.Matrix3f(view.matrix())), opaque(mi.Float(view.scale)), opaque(mi.Point2f(*view.offset)), size
-        )
-
-    def to_object(self, x: Any, y: Any, z: Any) -> "mi.Vector3f":
-        """Turn a camera-frame direction into the object frame."""
-        return mi.Vector3f(self.rotation.T @ mi.Vector3f(x, y, z))
-
-    def ray(self, x: Any, y: Any) -> "mi.Ray3f":
-        """Return the ray through image point (x, y) in [-1, 1]^2, x right, y up."""
-        origin = self.to_object((x - self.offset.x) / self.scale, (y - self.offset.y) / self.scale, 4)
-        return mi.Ray3f(mi.Point3f(origin), self.to_object(0, 0, -1))
-
-    def project(self, position: Any) -> tuple:
-        """Return the image coordinates (x, y) of points."""
-        moved = self.rotation @ mi.Vector3f(position)
-        return dr.fma(moved.x, self.scale, self.offset.x), dr.fma(moved.y, self.scale, self.offset.y)
+    @property
+    def directions(self) -> Any:
+        """Directions to distant lights in the object frame (Dr.Jit, L)."""
+        assert isinstance(self.emitters, DistantLights)
+        return self.emitters.directions
 
 
 def trace(
     scene: Any, view: View, surfaces: PackedSurfaces, lights: np.ndarray, *, size: int, spp: int, bounces: int,
-    seed: int, first: int = 0, probe: bool = True,
+    seed: int, distances: np.ndarray | None = None, first: int = 0, probe: bool = True,
 ) -> Paths:  # fmt: skip
     """Follow the camera paths of samples `first` to `first + spp - 1` of every pixel; see `many_lights.render`."""
     camera = Camera.of(view, size)
-    # Row by row, since a conversion of the whole would have the number of lights in its code.
-    rows = np.asarray(lights, np.float32).T
-    directions = opaque(camera.to_object(*(upload(mi.Float, row) for row in rows)))
+    emitters = place(camera, lights, distances)
     ray, sample = _camera_rays(camera, spp, seed, first)
-    glossy, pixel_count = any(surfaces.glossy), size * size
+    parallel = camera.parallel and isinstance(emitters, DistantLights)
+    pixel_count = size * size
+    halves = highlights.half_vectors(camera, emitters, parallel) if any(surfaces.glossy) else None
     depths: list[Vertices] = []
     throughput = (mi.Color3f(1),) * len(surfaces)
     for depth in range(bounces + 1):
@@ -131,20 +113,24 @@ def trace(
         sample, prim, uv = take(mi.UInt32, sample, kept), take(mi.UInt32, prim, kept), take(mi.Point2f, uv, kept)
         dr.eval(position, normal, facet, wi, sample, prim, uv, throughput)
         segments = _segments(sample, spp, pixel_count)
-        rays = (scene, position, normal, facet, directions, len(lights))
+        rays = (scene, position, normal, facet, emitters, len(lights))
         if depth == 0 and probe:
             probes = sample % opaque(mi.UInt32(spp)) < opaque(mi.UInt32(probe_count(spp)))
             seen = probed_visibility(*rays, probes, segments[1:])
         else:
             seen = visibility(*rays, coherent=depth == 0)
-        spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and glossy else None
+        centre, spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and halves else (None, None)
         weights = surfaces.weights(position, prim)
-        depths.append(Vertices(len(kept), position, normal, wi, sample, seen, throughput, weights, spread, *segments))
+        depths.append(
+            Vertices(len(kept), position, normal, wi, sample, seen, throughput, weights, centre, spread, *segments)
+        )
         if depth < bounces:
             ray, factors = _bounce(depths[-1], facet, surfaces, seed, depth + 1, first, spp)
             throughput = tuple(value * factor for value, factor in zip(throughput, factors, strict=True))
-    glints = highlights.find(scene, camera, directions, surfaces, spp, seed, first) if glossy and depths else None
-    return Paths(tuple(depths), glints, directions, len(lights), size, spp, *_sums(depths, camera))
+    glints = None
+    if halves and depths:
+        glints = highlights.find(scene, camera, emitters, halves, len(lights), surfaces, spp, seed, first)
+    return Paths(tuple(depths), glints, emitters, parallel, halves, len(lights), size, spp, *_sums(depths, camera))
 
 
 def take(kind: type, source: Any, index: Any) -> Any:
@@ -154,7 +140,7 @@ def take(kind: type, source: Any, index: Any) -> Any:
 
 
 def _camera_rays(camera: Camera, spp: int, seed: int, first: int) -> tuple["mi.Ray3f", "mi.UInt32"]:
-    """Cast orthographic rays through the samples of every pixel; return them and the samples' numbers."""
+    """Cast rays through the samples of every pixel; return them and the samples' numbers."""
     side, per_pixel = opaque(mi.UInt32(camera.size)), opaque(mi.UInt32(spp))
     index = dr.arange(mi.UInt32, camera.size**2 * spp)
     pixel = index // per_pixel

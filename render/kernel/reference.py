@@ -16,15 +16,25 @@ from render.shapes.geometry.mesh import TriangleMesh
 
 mi = variant.load()
 
+_DIRECTIONAL = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": np.pi}}
+_POINT = {"type": "point", "position": [0, 0, 9], "intensity": {"type": "rgb", "value": 1.0}}
+
 
 def scene_dict(
-    mesh: TriangleMesh, view: View, material: str, size: int, spp: int, bounces: int, shape: str | None = None
+    mesh: TriangleMesh,
+    view: View,
+    material: str,
+    size: int,
+    spp: int,
+    bounces: int,
+    shape: str | None = None,
+    near: bool = False,
 ) -> dict[str, Any]:
-    """Describe the scene for `mi.load_dict`: orthographic camera, box filter, one directional emitter.
+    """Describe the scene for `mi.load_dict`: the view's camera, box filter, one emitter, directional or a point.
 
     The camera stands at +z and looks along -z, which makes image-right +x (see the frame tests).
     """
-    depth = 4.0 * view.scale
+    depth = view.camera_distance or 4.0 * view.scale
     to_camera = np.eye(4)
     to_camera[:3, :3], to_camera[:2, 3] = view.matrix() * view.scale, view.offset
     bsdf = {"type": "ps_surface", "material": material, "to_object": mi.ScalarTransform4f(np.linalg.inv(to_camera))}
@@ -34,7 +44,7 @@ def scene_dict(
         "type": "scene",
         "integrator": {"type": "path", "max_depth": bounces + 2, "rr_depth": 1000},
         "sensor": {
-            "type": "orthographic",
+            **_sensor(view),
             "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, depth], target=[0, 0, 0], up=[0, 1, 0]),
             "near_clip": 1e-3,
             "far_clip": 2 * depth,
@@ -49,13 +59,20 @@ def scene_dict(
             "sampler": {"type": "independent", "sample_count": spp},
         },
         "object": build_mesh(mesh.posed(view), bsdf),
-        "light": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": np.pi}},
+        "light": _POINT if near else _DIRECTIONAL,
     }
+
+
+def _sensor(view: View) -> dict[str, Any]:
+    """Return the type of the camera, and the field of view of a perspective one."""
+    if view.camera_distance is None:
+        return {"type": "orthographic"}
+    return {"type": "perspective", "fov": float(np.degrees(2 * np.arctan(1 / view.camera_distance)))}
 
 
 def render_each_light(
     mesh: TriangleMesh, view: View, material: str, lights: np.ndarray, *, size: int, spp: int, bounces: int,
-    seed: int, shape: str | None = None,
+    seed: int, shape: str | None = None, distances: np.ndarray | None = None,
 ) -> Iterator[np.ndarray]:  # fmt: skip
     """Yield one image (size, size, 3) float32 per light, updating the emitter of a scene loaded once.
 
@@ -69,14 +86,19 @@ def render_each_light(
         bounces: Interreflection bounces; Mitsuba's `max_depth` is this plus two.
         seed: Seed of the first light's image; the next ones follow.
         shape: Name of the shape, which patterns that follow a mesh's pieces need.
+        distances: (L,) of near lights from the object's centre, in half image widths; None for distant lights.
     """
     surface_bsdf.register()
-    scene = mi.load_dict(scene_dict(mesh, view, material, size, spp, bounces, shape))
+    scene = mi.load_dict(scene_dict(mesh, view, material, size, spp, bounces, shape, distances is not None))
     parameters = mi.traverse(scene)
-    key = next(name for name in parameters.keys() if name.endswith("light.to_world"))  # noqa: SIM118
     for number, light in enumerate(np.asarray(lights, np.float64)):
-        up = [0.0, 1.0, 0.0] if abs(light[1]) < 0.9 else [1.0, 0.0, 0.0]
-        # An emitter shines along its local +z: from the light towards the surface, so minus the light vector.
-        parameters[key] = mi.Transform4f().look_at(origin=[0, 0, 0], target=(-light).tolist(), up=up)
+        if distances is not None:
+            position = np.array([*view.offset, 0.0]) + distances[number] * light / np.linalg.norm(light)
+            parameters["light.position"] = mi.Point3f(*position.tolist())
+            parameters["light.intensity.value"] = mi.Color3f(float(np.pi * distances[number] ** 2))
+        else:
+            up = [0.0, 1.0, 0.0] if abs(light[1]) < 0.9 else [1.0, 0.0, 0.0]
+            # An emitter shines along its local +z: from the light towards the surface, so minus the light vector.
+            parameters["light.to_world"] = mi.Transform4f().look_at([0, 0, 0], (-light).tolist(), up)
         parameters.update()
         yield np.array(mi.render(scene, seed=seed + number))

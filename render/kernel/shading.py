@@ -49,7 +49,8 @@ def _shade_together(paths: Paths, surfaces: PackedSurfaces, numbers: list[int]) 
         for number in numbers
     ]
     for depth, vertices in enumerate(paths.depths):
-        fast = [k for k in range(len(numbers)) if depth == 0 and fitted[k]]
+        shared = depth == 0 and paths.parallel
+        fast = [k for k in range(len(numbers)) if shared and fitted[k]]
         if fast:
             chosen = [numbers[k] for k in fast]
             _add_camera_hits([images[k] for k in fast], paths, vertices, surfaces, chosen)
@@ -70,7 +71,6 @@ class _Lanes(NamedTuple):
     light: Any
     start: Any
     length: Any
-    direction: Any
     entry: Any  # first of the light's in the visibility bitmask
     bit: Any
     target: Any  # of the red channel
@@ -85,7 +85,6 @@ def _lanes(paths: Paths, vertices: Vertices) -> _Lanes:
         light=light,
         start=dr.gather(mi.UInt32, vertices.start, pixel),
         length=dr.gather(mi.UInt32, vertices.length, pixel),
-        direction=dr.gather(mi.Vector3f, paths.directions, light),
         entry=(light // WORD) * count,
         bit=light % WORD,
         target=3 * (light * opaque(mi.UInt32(paths.size**2)) + dr.gather(mi.UInt32, vertices.pixels, pixel)),
@@ -115,14 +114,16 @@ def _add_vertices(image: Any, paths: Paths, vertices: Vertices, surfaces: Packed
     """Add the light reflected at one depth, by any kind of material."""
     lanes, throughput, weights = _lanes(paths, vertices), vertices.throughput[number], vertices.weights[number]
     weigh = _partition(paths, vertices, lanes, surfaces, number)
+    reach = paths.emitters.reach(lanes.light, vertices.position)
 
     def reflect(at: Any) -> Any:
+        direction, strength = reach(at)
         normal = dr.gather(mi.Vector3f, vertices.normal, at)
         frame = mi.Frame3f(normal)
         wi = frame.to_local(take(mi.Vector3f, vertices.wi, at))
         here = None if weights is None else tuple(take(mi.Float, weight, at) for weight in weights)
-        value = surfaces.eval(number, wi, frame.to_local(lanes.direction), here)
-        return (take(mi.Color3f, throughput, at) * value * weigh(at, normal),)
+        value = surfaces.eval(number, wi, frame.to_local(direction), here)
+        return (take(mi.Color3f, throughput, at) * value * weigh(at, normal) * strength,)
 
     _accumulate([image], vertices, lanes, reflect)
 
@@ -132,18 +133,20 @@ def _add_camera_hits(
 ) -> None:
     """Add the light that surfaces of fitted materials reflect straight to the camera.
 
-    All hits share the direction to the camera, so per light the half vector and theta_d are constant: the tables
-    shrink to a row over theta_h per light (`PackedMaterials.rows`), and the factor of theta_i to one per hit.
+    Camera and lights are distant (`Paths.parallel`): all hits share the direction to the camera, so per light the half
+    vector and theta_d are constant: the tables shrink to a row over theta_h per light (`PackedMaterials.rows`), and the
+    factor of theta_i to one per hit.
     """
     lanes, wi = _lanes(paths, vertices), mi.Vector3f(vertices.wi)
-    half = dr.normalize(wi + lanes.direction)
+    direction = dr.gather(mi.Vector3f, paths.directions, lanes.light)
+    half = dr.normalize(wi + direction)
     cos_d = dr.minimum(dr.dot(wi, half), 1)
     weighs = [_partition(paths, vertices, lanes, surfaces, number) for number in numbers]
     materials = [_camera_rows(paths, vertices, surfaces, number, wi) for number in numbers]
 
     def reflect(at: Any) -> Any:
         normal = dr.gather(mi.Vector3f, vertices.normal, at)
-        cos_i, cos_o = dr.dot(normal, wi), dr.dot(normal, lanes.direction)
+        cos_i, cos_o = dr.dot(normal, wi), dr.dot(normal, direction)
         sin2_h = dr.squared_norm(dr.cross(normal, half))
         entry = bsdf.half_cell(sin2_h, dr.dot(normal, half))
         azimuth = bsdf.azimuth(cos_i, cos_o, sin2_h, cos_d)
@@ -178,9 +181,11 @@ def _partition(paths: Paths, vertices: Vertices, lanes: _Lanes, surfaces: Packed
     """Return the function that weighs a camera hit against the normals drawn around the half vector."""
     if vertices.spread is None or not surfaces.glossy[number]:
         return lambda at, normal: mi.Float(1)
-    half = dr.normalize(mi.Vector3f(vertices.wi) + lanes.direction)
+    if paths.parallel:
+        shared = dr.normalize(mi.Vector3f(vertices.wi) + dr.gather(mi.Vector3f, paths.directions, lanes.light))
 
     def weigh(at: Any, normal: Any) -> Any:
+        half = shared if paths.parallel else paths.halves.of(lanes.light, dr.gather(mi.Point3f, vertices.centre, at))
         spread = dr.gather(mi.Float, vertices.spread, at)
         return highlights.partition(spread, highlights.one_minus_cos(normal, half), paths.size, paths.spp)
 
@@ -191,8 +196,8 @@ def _add_glints(stack: np.ndarray, paths: Paths, surfaces: PackedSurfaces, numbe
     """Add the points found from the lights' mirror directions, in their order."""
     glints = paths.glints
     frame = mi.Frame3f(glints.normal)
-    wo = frame.to_local(dr.gather(mi.Vector3f, paths.directions, glints.light))
-    value = surfaces.eval(number, frame.to_local(glints.wi), wo, glints.weights[number]) * glints.factor * math.pi
+    wi, wo, factor = frame.to_local(glints.wi), frame.to_local(glints.wo), glints.factor * glints.strength
+    value = surfaces.eval(number, wi, wo, glints.weights[number]) * factor * math.pi
     dr.eval(value)
     pixels = stack.reshape(-1, 3)
     for channel in range(3):

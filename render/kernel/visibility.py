@@ -27,7 +27,7 @@ def probe_count(spp: int) -> int:
     return 1 << (wanted - 1).bit_length()  # a power of two, so that the probes are stratified
 
 
-def visibility(scene: Any, position: Any, normal: Any, facet: Any, directions: Any, lights: int, coherent: bool) -> Any:
+def visibility(scene: Any, position: Any, normal: Any, facet: Any, emitters: Any, lights: int, coherent: bool) -> Any:
     """Cast one shadow ray per vertex and light it faces.
 
     Args:
@@ -35,7 +35,7 @@ def visibility(scene: Any, position: Any, normal: Any, facet: Any, directions: A
         position: (N) Point3f.
         normal: (N) shading normals; a light below their horizon needs no ray.
         facet: (N) geometric normals, along which rays start off the surface.
-        directions: (L) Vector3f to the lights.
+        emitters: The lights (`render.kernel.emitters`).
         lights: L.
         coherent: Whether neighbouring vertices are close to each other.
 
@@ -43,25 +43,25 @@ def visibility(scene: Any, position: Any, normal: Any, facet: Any, directions: A
         The visibility bitmask, UInt32 (ceil(L / 32) * N): bit b of entry `w * N + i` tells whether vertex i sees light
         32 w + b.
     """
-    return _cast(scene, position, normal, facet, directions, lights, coherent)[0]
+    return _cast(scene, position, normal, facet, emitters, lights, coherent)[0]
 
 
 def probed_visibility(
-    scene: Any, position: Any, normal: Any, facet: Any, directions: Any, lights: int, probes: Any, segments: tuple
+    scene: Any, position: Any, normal: Any, facet: Any, emitters: Any, lights: int, probes: Any, segments: tuple
 ) -> Any:
     """Do the same at the camera's hits, sorted by pixel, asking every light only where the probes disagree.
 
     Args:
-        scene, position, normal, facet, directions, lights: As in `visibility`.
+        scene, position, normal, facet, emitters, lights: As in `visibility`.
         probes: (N) Bool, the samples that probe.
         segments: (start, length) UInt32 (Q) of the pixels' runs of vertices.
     """
     count = dr.width(position)
     tested = dr.compress(probes)
     if len(tested) == 0 or len(tested) == count:
-        return visibility(scene, position, normal, facet, directions, lights, True)
+        return visibility(scene, position, normal, facet, emitters, lights, True)
     at = tuple(dr.gather(type(value), value, tested) for value in (position, normal, facet))
-    lit, facing = _cast(scene, at[0], at[1], at[2], directions, lights, True)
+    lit, facing = _cast(scene, at[0], at[1], at[2], emitters, lights, True)
     groups, total = -(-lights // WORD), opaque(mi.UInt32(count))
     bitmask = dr.zeros(mi.UInt32, count * groups)
     lane = dr.arange(mi.UInt32, len(tested) * groups)
@@ -73,10 +73,10 @@ def probed_visibility(
     dr.scatter(known, facing, target)
     dr.eval(bitmask, known)
     agreed = _agreement(bitmask, known, segments, total, groups)
-    return _complete(scene, (position, normal, facet), directions, bitmask, probes, agreed, segments, lights)
+    return _complete(scene, (position, normal, facet), emitters, bitmask, probes, agreed, segments, lights)
 
 
-def _cast(scene: Any, position: Any, normal: Any, facet: Any, directions: Any, lights: int, coherent: bool) -> tuple:
+def _cast(scene: Any, position: Any, normal: Any, facet: Any, emitters: Any, lights: int, coherent: bool) -> tuple:
     """Return the bitmasks of lights seen, and of lights faced."""
     count, groups = dr.width(position), -(-lights // WORD)
     width, total = opaque(mi.UInt32(count)), opaque(mi.UInt32(lights))
@@ -85,9 +85,9 @@ def _cast(scene: Any, position: Any, normal: Any, facet: Any, directions: Any, l
     start, shading = _start(position, normal, facet, lane - first // WORD * width)
 
     def per_light(b: Any, seen: Any, faced: Any) -> tuple:
-        direction = dr.gather(mi.Vector3f, directions, first + b)
+        direction, ray = emitters.shadow_ray(start, first + b)
         facing = dr.dot(shading, direction) > 0
-        lit = facing & ~scene.ray_test(start.spawn_ray(direction), coherent, facing)
+        lit = facing & ~scene.ray_test(ray, coherent, facing)
         return b + 1, seen | (mi.UInt32(lit) << b), faced | (mi.UInt32(facing) << b)
 
     state = (mi.UInt32(0), mi.UInt32(0), mi.UInt32(0))
@@ -118,7 +118,7 @@ def _agreement(bitmask: Any, faced: Any, segments: tuple, count: Any, groups: in
 
 
 def _complete(
-    scene: Any, at: tuple, directions: Any, bitmask: Any, probes: Any, agreed: tuple, segments: tuple, lights: int
+    scene: Any, at: tuple, emitters: Any, bitmask: Any, probes: Any, agreed: tuple, segments: tuple, lights: int
 ) -> Any:
     """Fill in the bitmask of the other vertices: what their pixel agrees on, and rays for the rest."""
     count, groups = dr.width(probes), -(-lights // WORD)
@@ -145,9 +145,9 @@ def _complete(
 
     def per_bit(left: Any, bits: Any) -> tuple:
         b = dr.tzcnt(left)
-        direction = dr.gather(mi.Vector3f, directions, first + b)
+        direction, ray = emitters.shadow_ray(start, first + b)
         facing = dr.dot(shading, direction) > 0
-        lit = facing & ~scene.ray_test(start.spawn_ray(direction), True, facing)
+        lit = facing & ~scene.ray_test(ray, True, facing)
         return left & (left - 1), bits | (mi.UInt32(lit) << b)
 
     _, bits = dr.while_loop((asked, dr.gather(mi.UInt32, bitmask, target)), lambda left, _: left != 0, per_bit)

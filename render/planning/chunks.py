@@ -44,7 +44,8 @@ def view_groups(scenes: Sequence[SceneSpec]) -> Iterator[list[SceneSpec]]:
 
 
 def _ray_key(scene: SceneSpec) -> tuple[Hashable, ...]:
-    return scene.shape, scene.view, scene.seed, scene.lights, scene.size, scene.spp, scene.bounces
+    lights = (scene.lights, scene.light_distances)
+    return scene.shape, scene.view, scene.seed, lights, scene.size, scene.spp, scene.bounces
 
 
 def share(scenes: Sequence[SceneSpec], part: int = 1, parts: int = 1) -> list[SceneSpec]:

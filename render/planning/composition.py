@@ -28,6 +28,7 @@ class Composition:
         materials: {plain material: scenes it appears in}; a spatially-varying scene counts for each of its materials.
         categories: {category: scenes it appears in}.
         varying: Scenes with more than one material.
+        near, perspective: Scenes with near lights; with a perspective camera.
         per_family: {family: (scenes, shapes, views)}.
         sizes: {width x height: scenes}.
         light_counts, spp, bounces: {value: scenes}.
@@ -42,6 +43,8 @@ class Composition:
     materials: dict[str, int]
     categories: dict[str, int]
     varying: int
+    near: int
+    perspective: int
     per_family: dict[str, tuple[int, int, int]]
     light_counts: dict[int, int]
     sizes: dict[str, int]
@@ -90,6 +93,8 @@ def compose(scenes: Sequence[SceneSpec]) -> Composition:
         splits=_counted(scene.split for scene in scenes),
         materials=dict(names.most_common()),
         categories=_counted(kind for names in parts for kind in {kinds[name] for name in names}),
+        near=sum(bool(scene.light_distances) for scene in scenes),
+        perspective=sum(scene.view.camera_distance is not None for scene in scenes),
         varying=sum(len(names) > 1 for names in parts),
         per_family={name: (count, len(shapes), len(views)) for name, (count, shapes, views) in per_family.items()},
         light_counts=_counted(len(scene.lights) for scene in scenes),
@@ -106,7 +111,7 @@ def light_directions(scenes: Sequence[SceneSpec]) -> np.ndarray:  # (N, 3) float
 
 
 def _view_key(scene: SceneSpec) -> tuple[Hashable, ...]:
-    return scene.shape, scene.view, scene.lights
+    return scene.shape, scene.view, scene.lights, scene.light_distances
 
 
 def _counted(items: Iterable[Any]) -> dict[Any, int]:

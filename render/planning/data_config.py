@@ -9,6 +9,8 @@ from render.shared.errors import InputError, unknown
 
 UPRIGHT = ("sculpture", "bunny")  # families that stand; others have no up
 LARGEST_SCALE = 10.0  # of a view
+PERSPECTIVE = "perspective"
+CAMERAS = ("orthographic", PERSPECTIVE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +35,13 @@ class DataConfig:
             Raising a count moves no shape from one split to the other.
         lights: Distribution of the light directions, drawn anew for each view.
         light_count: Lights per view.
+        near_lights: Share of the views, in [0, 1], whose lights are near: points at distances drawn from
+            `near_light_distance`, in the directions that `lights` gives from the object's centre, where their
+            irradiance is pi.
+        near_light_distance: Range of these distances, in half image widths, drawn uniformly in 1 / distance.
+        camera: `orthographic`, or `perspective` for all views.
+        camera_distance: Range of the distance of a perspective camera from the plane of the object's centre, in half
+            image widths, drawn as that of lights. The field of view is 2 atan(1 / distance): 28 to 11 degrees.
         size: Image side in pixels, a multiple of 4.
         spp: Camera samples per pixel.
         bounces: Interreflection bounces.
@@ -59,6 +68,10 @@ class DataConfig:
     validation: float = 0.05
     lights: str = "azimuth-elevation"
     light_count: int = 64
+    near_lights: float = 0.0
+    near_light_distance: tuple[float, float] = (2.5, 6.0)
+    camera: str = "orthographic"
+    camera_distance: tuple[float, float] = (4.0, 10.0)
     size: int = 128
     spp: int = 128
     bounces: int = 2
@@ -88,6 +101,7 @@ class DataConfig:
             raise InputError("families must name at least one shape family with a count of 0 or more")
         self._check_surfaces()
         self._check_framing()
+        self._check_distances()
 
     def _check_surfaces(self) -> None:
         if not 0 <= self.spatially_varying <= 1:
@@ -115,6 +129,26 @@ class DataConfig:
                     raise unknown(f"family in {name}:", family, self.families)
                 if not 0 <= value <= limit:
                     raise InputError(f"{name}.{family} must be in [0, {limit:g}], got {value}")
+
+    def _check_distances(self) -> None:
+        if not 0 <= self.near_lights <= 1:
+            raise InputError(f"near_lights must be in [0, 1], got {self.near_lights}")
+        if self.camera not in CAMERAS:
+            raise unknown("value for camera:", self.camera, CAMERAS)
+        if self.camera == PERSPECTIVE and self.tiles > 1:
+            raise InputError("tiles: parts of an image need camera: orthographic; set tiles to 1")
+        sizes = {family: (self.upright_scale if family in UPRIGHT else self.scale)[1] for family in self.families}
+        largest = max(size * self.tiles_of(family) for family, size in sizes.items())
+        used = {"near_light_distance": self.near_lights > 0, "camera_distance": self.camera == PERSPECTIVE}
+        for name, is_used in used.items():
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise InputError(f"{name} must be two rising positive numbers, got {low}, {high}")
+            if is_used and low <= largest:
+                raise InputError(
+                    f"{name} must be above the radius of the largest object ({largest:g} by scale and upright_scale), "
+                    f"got {low}"
+                )
 
     def tiles_of(self, family: str) -> int:
         """Return the tiles along each side of the image of a family."""

@@ -3,7 +3,7 @@
 The mesh is rasterised at low resolution with numpy, one sample at the centre of every cell, nearest surface first.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,6 +50,9 @@ def measure(mesh: TriangleMesh, view: View, tiles: int = 1) -> Framing:
 def rasterise(mesh: TriangleMesh, view: View, cells: int) -> np.ndarray:  # (cells, cells) int64
     """Return the nearest face at the centre of every cell of the image, -1 where there is none; row 0 is at the top."""
     turned = mesh.vertices @ (view.matrix().T * view.scale)
+    if view.camera_distance is not None:  # move the points to where a pinhole sees them
+        seen = (turned[:, :2] + view.offset) / (1 - turned[:, 2:] / view.camera_distance) - view.offset
+        turned = np.concatenate([seen, turned[:, 2:]], axis=1)
     # Cell coordinates: the centre of column i is at x = i, that of row j at y = j.
     x = (turned[:, 0] + view.offset[0] + 1) * (cells / 2) - 0.5
     y = (1 - turned[:, 1] - view.offset[1]) * (cells / 2) - 0.5
@@ -101,4 +104,4 @@ def tile_view(view: View, row: int, column: int, tiles: int) -> View:
     """Return the view whose frame is tile (row, column), row 0 at the top, of an image of tiles x tiles frames."""
     centre = ((2 * column + 1) / tiles - 1, 1 - (2 * row + 1) / tiles)
     x, y = (round((view.offset[axis] - centre[axis]) * tiles, 6) for axis in range(2))
-    return View(rotation=view.rotation, scale=round(view.scale * tiles, 6), offset=(x, y))
+    return replace(view, scale=round(view.scale * tiles, 6), offset=(x, y))

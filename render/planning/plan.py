@@ -4,6 +4,7 @@ import multiprocessing
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from render.materials import library, surfaces
 from render.planning import light_sets
-from render.planning.data_config import UPRIGHT, DataConfig
+from render.planning.data_config import PERSPECTIVE, UPRIGHT, DataConfig
 from render.records.manifest import SceneSpec, View
 from render.shared.errors import InputError, unknown
 from render.shared.progress import progress_bar
@@ -170,7 +171,7 @@ def _views(config: DataConfig, family: str, number: int, shape: str) -> list[Vie
     """Draw the poses of a shape, or None when one of them cannot be framed as asked."""
     if not config.is_framed(family):
         return [
-            random_view(config, family, generator(config.seed, family, number, view, "view"))
+            _seen(config, (family, number, view), generator(config.seed, family, number, view, "view"))
             for view in range(config.views)
         ]
     from render.shapes import load
@@ -184,6 +185,29 @@ def _views(config: DataConfig, family: str, number: int, shape: str) -> list[Vie
     return views
 
 
+def _seen(config: DataConfig, keys: tuple[Any, ...], rng: np.random.Generator) -> View:
+    """Draw a pose, and the camera's distance where it is perspective."""
+    pose = random_view(config, keys[0], rng)
+    if config.camera != PERSPECTIVE:
+        return pose
+    (distance,) = _distances(config.camera_distance, 1, generator(config.seed, *keys, "camera"))
+    return replace(pose, camera_distance=distance)
+
+
+def _distances(limits: tuple[float, float], count: int, rng: np.random.Generator) -> tuple[float, ...]:
+    """Draw distances uniformly in 1 / distance, which what they change in an image follows."""
+    low, high = limits
+    return tuple(round(1 / float(value), 6) for value in rng.uniform(1 / high, 1 / low, count))
+
+
+def _near(config: DataConfig, keys: tuple[Any, ...]) -> tuple[float, ...]:
+    """Draw the distances of a view's lights; none where they are distant."""
+    rng = generator(config.seed, *keys, "near")
+    if rng.random() >= config.near_lights:
+        return ()
+    return _distances(config.near_light_distance, config.light_count, rng)
+
+
 def _framed_view(config: DataConfig, family: str, keys: tuple[Any, ...], mesh: Any) -> View | None:
     """Draw poses until one, or one of its tiles, shows enough of the shape."""
     from render.planning.framing import measure, tile_view
@@ -192,7 +216,7 @@ def _framed_view(config: DataConfig, family: str, keys: tuple[Any, ...], mesh: A
     least = max(config.min_foreground.get(family, 0.0), EMPTY)
     for attempt in range(POSES_TRIED):
         again = (attempt,) if attempt else ()
-        pose = random_view(config, family, generator(config.seed, *keys, "view", *again))
+        pose = _seen(config, keys, generator(config.seed, *keys, "view", *again))
         framing = measure(mesh, pose, tiles)
         fits = (framing.foreground >= least) & (framing.spread >= config.min_normal_spread.get(family, 0.0))
         if fits.any():
@@ -222,6 +246,7 @@ def _plan_view(
         "size": config.size,
         "spp": config.spp,
         "bounces": config.bounces,
+        "light_distances": _near(config, keys),
     }
     name = f"{family}-{number:05d}-v{view}"
     return [SceneSpec(id=f"{name}-m{slot}", material=material, **common) for slot, material in enumerate(surface)]

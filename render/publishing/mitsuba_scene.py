@@ -19,6 +19,7 @@ from render import shapes
 from render.materials import merl, model, rgl, surfaces
 from render.publishing import pattern_mesh
 from render.records.manifest import SceneSpec
+from render.records.view_geometry import field_of_view
 from render.shapes.geometry.mesh import TriangleMesh
 from render.shared.errors import InputError
 from render.shared.files import atomic_folder
@@ -37,32 +38,53 @@ picture   {size}x{size} pixels, {spp} samples each, {bounces} interreflections, 
 
 scene.xml     the scene under one light, by default the first of lights.txt
 object.ply    the posed object with its normals, in the camera frame
-lights.txt    one light a line, x y z: unit vector from the surface to the light
+lights.txt    one light a line, x y z: {light}
 {tables}
-Frame: x right, y up, z to the camera, lengths in half image widths; image row 0 is the top. Radiance is linear; under
-the default irradiance, pi, a white Lambertian surface that faces the light has radiance 1.
+Frame: x right, y up, z to the camera, lengths in half image widths; image row 0 is the top. Radiance is linear;
+{unit}
 
-One light from the command line (any RGB variant; parameters: lx ly lz irradiance size spp seed):
+One light from the command line (any RGB variant; parameters: lx ly lz {strength} size spp seed):
 
-    mitsuba -m scalar_rgb -Dlx={x:.6g} -Dly={y:.6g} -Dlz={z:.6g} -Dspp=256 -o light000.exr scene.xml
+    mitsuba -m scalar_rgb -Dlx={x:.6g} -Dly={y:.6g} -Dlz={z:.6g}{own} -Dspp=256 -o light000.exr scene.xml
 
 Light k from Python:
 
     import mitsuba as mi
     mi.set_variant("scalar_rgb")  # or llvm_ad_rgb, cuda_ad_rgb
-    x, y, z = map(float, open("lights.txt").readlines()[k].split())
-    scene = mi.load_file("scene.xml", lx=x, ly=y, lz=z)
+    {target} = map(float, open("lights.txt").readlines()[k].split())
+    scene = mi.load_file("scene.xml", lx=x, ly=y, lz=z{intensity})
     mi.Bitmap(mi.render(scene, spp=256)).write(f"light{{k:03d}}.exr")
 """
 
 
+_DISTANT = {
+    "light": "unit vector from the surface to the light",
+    "unit": "under\nthe default irradiance, pi, a white Lambertian surface that faces the light has radiance 1.",
+    "strength": "irradiance",
+    "target": "x, y, z",
+    "intensity": "",
+}
+_NEAR = {
+    "light": "position of the light; then its radiant intensity, the same to all sides",
+    "unit": "a white\nLambertian surface at the object's centre, (offset, 0), that faces a light has radiance 1.",
+    "strength": "intensity",
+    "target": "x, y, z, intensity",
+    "intensity": ", intensity=intensity",
+}
 # Lights have z > 0, so their `up` is never parallel to one. An emitter shines along its local +z.
+_DIRECTIONAL = """<emitter type="directional" id="light">
+  <transform name="to_world"><lookat origin="$lx, $ly, $lz" target="0, 0, 0" up="0, 1, 0"/></transform>
+  <rgb name="irradiance" value="$irradiance"/>
+</emitter>"""
+_POINT = """<emitter type="point" id="light">
+  <point name="position" x="$lx" y="$ly" z="$lz"/><rgb name="intensity" value="$intensity"/>
+</emitter>"""
 _SCENE = """<scene version="3.0.0">
 <default name="lx" value="{x}"/><default name="ly" value="{y}"/><default name="lz" value="{z}"/>
-<default name="irradiance" value="{irradiance}"/><default name="size" value="{size}"/>
+<default name="{strength}" value="{value}"/><default name="size" value="{size}"/>
 <default name="spp" value="{spp}"/><default name="seed" value="0"/>
 <integrator type="path"><integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="1000"/></integrator>
-<sensor type="orthographic">
+<sensor type="{camera}">{fov}
   <transform name="to_world"><lookat origin="0, 0, {distance}" target="0, 0, 0" up="0, 1, 0"/></transform>
   <float name="near_clip" value="0.001"/><float name="far_clip" value="{far}"/>
   <film type="hdrfilm">
@@ -73,10 +95,7 @@ _SCENE = """<scene version="3.0.0">
     <integer name="sample_count" value="$spp"/><integer name="seed" value="$seed"/>
   </sampler>
 </sensor>
-<emitter type="directional" id="light">
-  <transform name="to_world"><lookat origin="$lx, $ly, $lz" target="0, 0, 0" up="0, 1, 0"/></transform>
-  <rgb name="irradiance" value="$irradiance"/>
-</emitter>
+{emitter}
 <shape type="ply" id="object"><string name="filename" value="{mesh}"/></shape>
 </scene>
 """
@@ -114,7 +133,7 @@ def save(folder: str | Path, spec: SceneSpec, mesh: TriangleMesh | None = None) 
         tree = ET.ElementTree(_scene(spec, _blend(bsdfs)))
         ET.indent(tree, space="    ")
         tree.write(temporary / SCENE, encoding="utf-8", xml_declaration=True)
-        lights = np.asarray(spec.lights, np.float64).reshape(-1, 3)
+        lights = _light_rows(spec)
         rows = "".join(" ".join(f"{value:.9g}" for value in light) + "\n" for light in lights)
         (temporary / LIGHTS).write_text(rows, encoding="utf-8")
         (temporary / README).write_text(_readme(spec, surface.components), encoding="utf-8")
@@ -192,13 +211,28 @@ def _write_mesh(path: Path, mesh: TriangleMesh, shares: np.ndarray) -> None:
     path.write_bytes(data)
 
 
+def _light_rows(spec: SceneSpec) -> np.ndarray:  # (L, 3 or 4)
+    """Return the directions to distant lights, or positions of near ones and the intensity that gives irradiance pi."""
+    positions = spec.light_positions()
+    if positions is None:
+        return np.asarray(spec.lights, np.float64).reshape(-1, 3)
+    intensity = np.pi * np.square(spec.light_distances)[:, None]
+    return np.concatenate([positions.astype(np.float64), intensity], axis=1)
+
+
 def _scene(spec: SceneSpec, bsdf: ET.Element) -> ET.Element:
     """Return the scene of `render.kernel.reference.scene_dict` as XML, with parameters."""
-    x, y, z = (f"{value:.9g}" for value in spec.lights[0])
-    distance = 4 * spec.view.scale
+    x, y, z, *intensity = (f"{value:.9g}" for value in _light_rows(spec)[0])
+    distance = spec.view.camera_distance or 4 * spec.view.scale
+    camera, fov = "orthographic", ""
+    if spec.view.camera_distance is not None:
+        camera, angle = "perspective", field_of_view(spec.view.camera_distance)
+        fov = f'<float name="fov" value="{angle:.9g}"/><string name="fov_axis" value="x"/>'
     scene = ET.fromstring(
         _SCENE.format(
-            x=x, y=y, z=z, irradiance=f"{np.pi:.9g}", size=spec.size, spp=spec.spp, depth=spec.bounces + 2,
+            x=x, y=y, z=z, strength="intensity" if intensity else "irradiance", camera=camera, fov=fov,
+            value=intensity[0] if intensity else f"{np.pi:.9g}", emitter=_POINT if intensity else _DIRECTIONAL,
+            size=spec.size, spp=spec.spp, depth=spec.bounces + 2,
             distance=f"{distance:.9g}", far=f"{2 * distance:.9g}", mesh=MESH,
         )
     )  # fmt: skip
@@ -214,8 +248,11 @@ def _readme(spec: SceneSpec, materials: Sequence[Any]) -> str:
         for number, material in enumerate(materials)
         if material.category != "lambertian"
     )
-    x, y, z = spec.lights[0]
+    x, y, z, *intensity = _light_rows(spec)[0]
+    words = _NEAR if intensity else _DISTANT
     return _README.format(
+        **words,
+        own=f" -Dintensity={intensity[0]:.6g}" if intensity else "",
         **{name: getattr(spec, name) for name in ("id", "shape", "material", "size", "spp", "bounces")},
         rotation=" ".join(f"{value:g}" for value in spec.view.rotation),
         scale=spec.view.scale,

@@ -16,21 +16,26 @@ from render.shared.files import read_jsonl, read_whole_lines, write_jsonl
 
 MANIFEST = "manifest.jsonl"
 FAILED = "failed.jsonl"
+_LATER = ("light_distances",)
 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Pose of the object before the fixed orthographic camera.
+    """Pose of the object before the fixed camera, which is orthographic or, with `camera_distance`, perspective.
 
     Attributes:
         rotation: Row-major 3x3 rotation, object to camera frame (x right, y up, z to the camera).
         scale: Radius of the object's unit sphere, in half image widths (1 touches the frame).
         offset: Image-plane translation (x right, y up), in half image widths.
+        camera_distance: Distance of a perspective camera, a pinhole on the z axis, from the plane z = 0 through the
+            object's centre, in half image widths: in that plane the frame spans [-1, 1], as in an orthographic view.
+            The field of view is 2 atan(1 / distance). None: orthographic.
     """
 
     rotation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     scale: float = 0.9
     offset: tuple[float, float] = (0.0, 0.0)
+    camera_distance: float | None = None
 
     def __post_init__(self) -> None:
         matrix = self.matrix()
@@ -38,6 +43,11 @@ class View:
             raise InputError("view.rotation must be the nine numbers of a rotation matrix")
         if not 0.0 < self.scale <= 10.0:
             raise InputError(f"view.scale must be in (0, 10], got {self.scale}")
+        if self.camera_distance is not None and not self.scale < self.camera_distance < np.inf:
+            raise InputError(
+                f"view.camera_distance is {self.camera_distance:g}, but the object reaches {self.scale:g} towards the "
+                "camera (view.scale); give a larger distance"
+            )
 
     def matrix(self) -> np.ndarray:  # (3, 3)
         """Return the rotation as a float64 matrix."""
@@ -56,10 +66,13 @@ class SceneSpec:
         shape: A name `render.shapes.load` understands.
         material: A name `render.materials.library.load` understands.
         view: Pose.
-        lights: Unit directions (x, y, z) from the surface to each light, camera frame, z > 0.
+        lights: Unit directions (x, y, z) from the surface to each light, camera frame, z > 0; of near lights, from the
+            object's centre, (offset, 0) in the camera frame.
         size: Image side in pixels; (height, width) where they differ, which only imported scenes may.
         spp: Camera samples per pixel.
         bounces: Interreflection bounces (0 = direct light only).
+        light_distances: Distance of each light, a point, from the object's centre, in half image widths; its irradiance
+            there is pi and falls with the inverse square of the distance. Empty: distant lights.
     """
 
     id: str
@@ -72,6 +85,19 @@ class SceneSpec:
     size: int | tuple[int, int]
     spp: int
     bounces: int
+    light_distances: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.light_distances:
+            return
+        if len(self.lights) not in (0, len(self.light_distances)):  # a reader adds the lights last
+            raise InputError(f"light_distances: {len(self.light_distances)} of {len(self.lights)} lights")
+        for number, distance in enumerate(self.light_distances):
+            if not self.view.scale < distance < np.inf:
+                raise InputError(
+                    f"light_distances: light {number} is {distance:g} from the object's centre, inside the sphere of "
+                    f"radius {self.view.scale:g} that holds the object (view.scale); move it out"
+                )
 
     @property
     def file(self) -> str:
@@ -85,18 +111,32 @@ class SceneSpec:
 
     def digest(self) -> str:
         """Return the SHA-256 of the whole line, which its shard carries."""
+        return hashlib.sha256(json.dumps(self.row(), sort_keys=True).encode()).hexdigest()
+
+    def row(self) -> dict[str, Any]:
+        """Return the manifest line; what was added later stands in it only where it is used, so that bytes stay."""
+        view = {key: value for key, value in to_plain(self.view).items() if value is not None}
         # Not `to_plain` as a whole: it would copy every light, and JSON writes tuples as lists anyway.
-        row = {field.name: getattr(self, field.name) for field in fields(self)} | {"view": to_plain(self.view)}
-        return hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()
+        row = {field.name: getattr(self, field.name) for field in fields(self)} | {"view": view}
+        return {key: value for key, value in row.items() if value != () or key not in _LATER}
 
     def light_directions(self) -> np.ndarray:  # (L, 3) float32
         """Return the light directions as an array."""
         return np.asarray(self.lights, dtype=np.float32).reshape(-1, 3)
 
+    def light_positions(self) -> np.ndarray | None:  # (L, 3) float32
+        """Return the positions of near lights in the camera frame, in half image widths; None for distant lights."""
+        if not self.light_distances:
+            return None
+        lights = np.asarray(self.lights, np.float64).reshape(-1, 3)
+        unit = lights / np.linalg.norm(lights, axis=1, keepdims=True)
+        centre = np.array([*self.view.offset, 0.0])
+        return (centre + unit * np.asarray(self.light_distances)[:, None]).astype(np.float32)
+
 
 def write_manifest(folder: str | Path, scenes: Sequence[SceneSpec]) -> None:
     """Write `manifest.jsonl` in `folder`, atomically."""
-    write_jsonl(Path(folder) / MANIFEST, [to_plain(scene) for scene in scenes])
+    write_jsonl(Path(folder) / MANIFEST, [scene.row() for scene in scenes])
 
 
 def claim(folder: str | Path, scenes: Sequence[SceneSpec]) -> None:

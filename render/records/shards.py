@@ -4,7 +4,7 @@ A shard is one multi-part OpenEXR file (ZIP, lossless) per scene. Part `gt` (flo
 `normal.X/Y/Z` (camera frame, zero outside the mask), `Z` (depth), `mask` (0 or 1) and `coverage`
 (share of a pixel's samples that hit the object); a part `materials` (float32) of spatially-varying scenes holds the
 weights `w0`, `w1`, ... of the materials its header names; parts `L000`, `L001`, ... (float16) hold the linear
-RGB radiance under one light of irradiance pi, with its direction in the part's header.
+RGB radiance under one light of irradiance pi, with its direction, and the position of a near one, in the part's header.
 
 OpenEXR's binding silently corrupts non-contiguous arrays (openexr #1929) and arrays of unusual channel
 counts, and opens damaged files with fewer parts; hence one checked writer, a digest of the whole file, and
@@ -45,10 +45,12 @@ class Shard:
         depth: (H, W) float32, z of the surface in half image widths (towards the camera), zero outside.
         mask: (H, W) bool, pixels of which at least half the samples hit the object.
         coverage: (H, W) float32 in [0, 1], share of samples that hit the object.
-        light_directions: (L, 3) float32, unit, from the surface to the light.
+        light_directions: (L, 3) float32, unit, from the surface to the light; to near lights, from the object's centre.
         weights: (M, H, W) float32 in [0, 1], mean weight of each material in a pixel of the mask (they sum to 1), zero
             outside; None for a scene of one material.
         materials: Names of the M materials; empty for a scene of one material.
+        light_positions: (L, 3) float32, camera frame, half image widths, of near lights: points with irradiance pi at
+            the object's centre, falling with the inverse square of the distance. None: distant lights.
         provenance: File-level header attributes (schema, seed, versions, names), all text or numbers.
     """
 
@@ -61,6 +63,7 @@ class Shard:
     light_directions: np.ndarray
     weights: np.ndarray | None = None
     materials: tuple[str, ...] = ()
+    light_positions: np.ndarray | None = None
     provenance: dict[str, str | int | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -75,6 +78,8 @@ class Shard:
         }
         if self.weights is not None or self.materials:
             expected["weights"] = ((len(self.materials), height, width), np.float32)
+        if self.light_positions is not None:
+            expected["light_positions"] = ((count, 3), np.float32)
         for name, (shape, dtype) in expected.items():
             array = np.asarray(getattr(self, name))
             if array.shape != shape or array.dtype != dtype:
@@ -82,6 +87,17 @@ class Shard:
                     f"shard {self.scene_id}: {name} must be {np.dtype(dtype)} of shape {shape}, "
                     f"got {array.dtype} of shape {array.shape}"
                 )
+
+    @property
+    def camera_distance(self) -> float | None:
+        """Distance of a perspective camera from the plane z = 0, in half image widths; None: orthographic."""
+        distance = self.provenance.get("camera_distance")
+        return None if distance is None else float(distance)
+
+    @property
+    def centre(self) -> np.ndarray:  # (3,)
+        """The object's centre in the camera frame, where near lights have irradiance pi."""
+        return np.array([float(value) for value in str(self.provenance.get("light_reference", "0 0 0")).split()])
 
 
 def write_exr(path: str | Path, parts: list[tuple[str, dict[str, Any], dict[str, np.ndarray]]]) -> None:
@@ -141,6 +157,8 @@ def write_shard(path: str | Path, shard: Shard) -> None:
         parts.append((_MATERIALS, {"ps:materials": "+".join(shard.materials)}, channels))
     for index, (image, direction) in enumerate(zip(shard.images, shard.light_directions, strict=True)):
         header = {"ps:light_dir": direction.astype(np.float32)}
+        if shard.light_positions is not None:
+            header["ps:light_pos"] = shard.light_positions[index].astype(np.float32)
         parts.append((f"L{index:03d}", header, {"RGB": image}))
     write_exr(path, parts)
 
@@ -197,6 +215,11 @@ def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
             light_directions=np.stack([np.asarray(part.header["ps:light_dir"], np.float32) for part in lit]),
             weights=mixture and np.stack([mixture.channels[f"w{k}"].pixels for k in range(len(mixture.channels))]),
             materials=tuple(str(mixture.header["ps:materials"]).split("+")) if mixture else (),
+            light_positions=(
+                np.stack([np.asarray(part.header["ps:light_pos"], np.float32) for part in lit])
+                if any("ps:light_pos" in part.header for part in lit)
+                else None
+            ),
             provenance={
                 key[3:]: value for key, value in header.items() if key.startswith("ps:") and key not in _OWN_ATTRIBUTES
             },
@@ -252,6 +275,10 @@ def _compare(path: str | Path, shard: Shard, scene: SceneSpec) -> None:
         raise InputError(f"{path}: {len(shard.images)} lights, the manifest says {len(directions)}; render it again")
     if not np.allclose(shard.light_directions, directions, atol=1e-5):
         raise InputError(f"{path}: light directions differ from the manifest; render it again")
+    pair = (scene.light_positions(), shard.light_positions)
+    planned, found = (np.zeros((0, 3)) if places is None else places for places in pair)
+    if planned.shape != found.shape or not np.allclose(found, planned, rtol=1e-5, atol=1e-5):
+        raise InputError(f"{path}: light positions differ from the manifest; render it again")
     if shard.images.shape[1:3] != scene.resolution:
         raise InputError(f"{path}: images are {shard.images.shape[1:3]}, the manifest says {scene.size}; render again")
     if shard.provenance.get("spec", scene.digest()) != scene.digest():

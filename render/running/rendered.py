@@ -10,6 +10,7 @@ import numpy as np
 from render.backend import variant
 from render.materials import surfaces as surface_names
 from render.planning import provenance
+from render.records import view_geometry
 from render.records.manifest import SceneSpec
 from render.records.shards import Shard, to_half
 from render.shared.errors import InputError
@@ -43,8 +44,23 @@ class RenderedView:
 
     @property
     def light_directions(self) -> np.ndarray:
-        """Unit vectors (L, 3) float32 from the surface to each light."""
+        """Unit vectors (L, 3) float32 from the surface to each light; to near lights, from the object's centre."""
         return self.scene.light_directions()
+
+    @property
+    def light_positions(self) -> np.ndarray | None:
+        """Positions (L, 3) float32 of near lights, camera frame, half image widths; None for distant lights."""
+        return self.scene.light_positions()
+
+    @property
+    def points(self) -> np.ndarray:
+        """Points (H, W, 3) float64 of the surface, camera frame, half image widths; they hold inside the mask."""
+        return view_geometry.points(self.depth, self.scene.view.camera_distance)
+
+    @property
+    def view_directions(self) -> np.ndarray:
+        """Unit vectors (H, W, 3) float64 from the surface to the camera."""
+        return view_geometry.view_directions(self.depth.shape, self.scene.view.camera_distance)
 
     def shard(self, name: str | None = None) -> Shard:
         """Return what `write_shard` writes: the same arrays, radiance rounded to half precision.
@@ -57,6 +73,7 @@ class RenderedView:
             scene_id=scene.id, images=to_half(self.images), normals=self.normals, depth=self.depth, mask=self.mask,
             coverage=self.coverage, light_directions=self.light_directions, weights=self.weights,
             materials=surface_names.split(scene.material)[1] if self.weights is not None else (),
+            light_positions=self.light_positions,
             provenance=_describe(scene),
         )  # fmt: skip
 
@@ -83,7 +100,7 @@ def rendered_views(
         raise InputError(f"scene {first.id}: size is {height}x{width}; only square images can be rendered")
     truth, images = many_lights.render(
         built, first.view, surfaces, first.light_directions(), size=height, spp=first.spp, bounces=first.bounces,
-        seed=first.seed, only=only,
+        seed=first.seed, distances=np.asarray(first.light_distances) if first.light_distances else None, only=only,
     )  # fmt: skip
     if not truth.mask.any():
         raise InputError(f"scene {first.id}: {first.shape} is outside the frame; check view.scale and view.offset")
@@ -104,11 +121,29 @@ def _describe(scene: SceneSpec) -> dict[str, str | int | float]:
         "material": scene.material,
         "spp": scene.spp,
         "bounces": scene.bounces,
-        "irradiance": "pi",
+        "irradiance": "pi at the object's centre" if scene.light_distances else "pi",
         "frame": "x right, y up, z to the camera",
         "variant": variant.load().variant(),
+        **_camera_and_lights(scene),
         **_software(),
     }
+
+
+def _camera_and_lights(scene: SceneSpec) -> dict[str, str | float]:
+    """Describe a perspective camera, and where near lights have irradiance pi; nothing for plain scenes."""
+    found: dict[str, str | float] = {}
+    distance = scene.view.camera_distance
+    if distance is not None:
+        matrix = view_geometry.camera_matrix(scene.resolution[1], distance)
+        found = {
+            "camera": "perspective",
+            "camera_distance": distance,
+            "camera_matrix": " ".join(f"{value:.9g}" for value in matrix.ravel()),
+            "field_of_view": view_geometry.field_of_view(distance),
+        }
+    if scene.light_distances:
+        found["light_reference"] = "{:.9g} {:.9g} 0".format(*scene.view.offset)
+    return found
 
 
 @cache

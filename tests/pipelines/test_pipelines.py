@@ -175,6 +175,19 @@ def test_regenerate_writes_scenes_and_reuses_them(capsys, tmp_path):
     assert "holds another plan" in fails(capsys, *argv, "--set", "test.seed=1")
 
 
+def test_regenerate_takes_a_perspective_camera_and_near_lights(capsys, tmp_path):
+    argv = ["regenerate", "--shapes", "sphere", "--materials", "lambertian:0.5", "--lights", "near-uniform:3", *TINY]
+    out = ["--out", str(tmp_path / "scenes")]
+    assert main([*argv, *out, "--camera-distance", "3", "--light-distance", "2.5"]) == 0
+    (scene,) = read_manifest(tmp_path / "scenes")
+    assert scene.view.camera_distance == 3 and scene.light_distances == (2.5,) * 3
+    shard = read_shard(tmp_path / "scenes" / scene.file, scene)
+    np.testing.assert_allclose(np.linalg.norm(shard.light_positions, axis=1), 2.5, rtol=1e-5)
+    capsys.readouterr()
+    assert "move it out" in fails(capsys, *argv, *out, "--light-distance", "0.5")
+    assert "give a larger distance" in fails(capsys, *argv, *out, "--camera-distance", "0.5")
+
+
 def test_regenerate_saves_scenes_for_stock_mitsuba(capsys, tmp_path):
     argv = ["regenerate", "--shapes", "sphere", "--materials", "stripes:3:lambertian:0.9+chrome,lambertian:0.5",
             "--lights", "near-uniform:2", "--out", str(tmp_path), *TINY]  # fmt: skip

@@ -9,7 +9,8 @@ from scipy import stats
 from render import shapes
 from render.backend import variant
 from render.kernel import highlights, many_lights, scene
-from render.kernel.paths import Camera
+from render.kernel.camera import Camera
+from render.kernel.emitters import DistantLights
 from render.materials import library, model
 from render.records.manifest import View
 
@@ -32,7 +33,9 @@ def found(mesh, lights=LIGHTS, view: View = VIEW, seed: int = 0) -> tuple:
     camera, points = Camera.of(view, SIZE), Recorder()
     directions = camera.to_object(*(mi.Float(np.ascontiguousarray(row)) for row in lights.T))
     dr.eval(directions)
-    return highlights.find(scene.build(mesh), camera, directions, points, SPP, seed, 0), points
+    emitters = DistantLights(directions)
+    halves = highlights.half_vectors(camera, emitters, parallel=True)
+    return highlights.find(scene.build(mesh), camera, emitters, halves, len(lights), points, SPP, seed, 0), points
 
 
 def halves(lights=LIGHTS, view: View = VIEW) -> np.ndarray:

@@ -6,7 +6,7 @@ level over all scenes; with any one part of the light transport taken away it mu
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import drjit as dr
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from render import shapes
 from render.backend import variant
-from render.kernel import highlights, many_lights, reference, scene
+from render.kernel import emitters, highlights, many_lights, reference, scene
 from render.materials import merl
 from render.materials.kernels.packed import pack
 from render.planning import light_sets
@@ -46,12 +46,20 @@ class Case:
     bounces: int
     size: int = 12
     spp: int = 144
+    camera: float | None = None  # distance
+    near: tuple[float, ...] = ()  # distances of the lights
+    slow: bool = False
 
     @property
     def seed(self) -> int:
         return CASES.index(self)
 
+    def __str__(self) -> str:
+        words = f"{self.shape} {self.material} {self.bounces} bounces"
+        return words + " near lights" * bool(self.near) + " perspective" * bool(self.camera)
 
+
+NEAR = (2.2, 2.6, 3.4)
 CASES = [
     Case("bowl", "lambertian:0.9", 2),
     Case("bowl", "gold-metallic-paint", 2),
@@ -77,6 +85,14 @@ CASES = [
     Case("sculpture:4", "gradient:1:lambertian:0.9+specular-blue-phenolic", 3),
     Case("sculpture:6", "parts:0:yellow-paint+two-layer-silver", 2),
     Case("bowl", "merl:silver-metallic-paint", 2),
+    Case("bowl", "lambertian:0.9", 2, near=NEAR),
+    Case("bowl", "gold-metallic-paint", 2, camera=3.5),
+    Case("bowl", "lambertian:0.9", 2, camera=3.0, near=NEAR),
+    Case("sculpture:5", "patches:2:gold-paint+lambertian:0.7+black-fabric", 2, camera=2.5, near=NEAR),
+    Case("sphere", "steel", 1, 8, 2048, camera=2.5, near=NEAR),
+    Case("sphere", "chrome", 0, 8, 2048, camera=2.5, slow=True),
+    Case("bowl", "chrome", 1, 8, 2048, near=NEAR, slow=True),
+    Case("blobby:8", "nickel", 2, 8, 1024, camera=2.5, near=NEAR, slow=True),
 ]
 
 
@@ -103,19 +119,23 @@ def parts(case: Case) -> tuple:
         rotation, mesh = Rotation.from_euler("yx", rng.uniform(-35, 35, 2), degrees=True), support.bowl()
     else:
         rotation, mesh = Rotation.from_euler("yx", rng.uniform(-60, 60, 2), degrees=True), shapes.load(case.shape)
-    view = View(rotation=tuple(rotation.as_matrix().ravel()), scale=float(rng.uniform(0.9, 1.3)))
+    scale = float(rng.uniform(0.9, 1.3))
+    view = View(rotation=tuple(rotation.as_matrix().ravel()), scale=scale, camera_distance=case.camera)
     return mesh, view, light_sets.draw("near-uniform", 3, rng).astype(np.float32)
 
 
-def ours(case: Case, name: str, change=None, index: int = 0, extra: tuple = (), **settings) -> np.ndarray:
+def ours(
+    case: Case, name: str, change=None, index: int = 0, extra: tuple = (), scene_parts: tuple = (), **settings
+) -> np.ndarray:
     """Return (REPEATS, L, H, W) mean radiance of the channels, one repeat per seed."""
-    mesh, view, directions = parts(case)
+    mesh, view, directions = scene_parts or parts(case)
     built, surfaces = scene.build(mesh), pack([name, *extra], mesh)
     if change:
         built, surfaces = change(built, surfaces)
     images = []
     for seed in range(REPEATS):
         options = {"size": case.size, "spp": case.spp, "bounces": case.bounces, "seed": seed, "only": [index]}
+        options["distances"] = np.array(case.near) if case.near else None
         _, stacks = many_lights.render(built, view, surfaces, directions, **options | settings)
         images.append(next(stacks)[1].mean(-1))
     return np.stack(images)
@@ -128,6 +148,7 @@ def expected(case: Case, name: str) -> np.ndarray:
     repeated = np.tile(directions, (REPEATS, 1))
     shape = None if case.shape == "bowl" else case.shape
     options = {"size": case.size, "spp": case.spp, "bounces": case.bounces, "seed": 1000, "shape": shape}
+    options["distances"] = np.tile(case.near, REPEATS) if case.near else None
     stack = np.stack(list(reference.render_each_light(mesh, view, name, repeated, **options)))
     return stack.mean(-1).reshape(REPEATS, len(directions), *stack.shape[1:3])
 
@@ -142,7 +163,7 @@ def p_value(first: np.ndarray, second: np.ndarray) -> float:
     return worst
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.shape} {case.material} {case.bounces} bounces")
+@pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.slow] * case.slow) for case in CASES], ids=str)
 def test_agrees_with_path(case, material):
     name = material(case.material)
     level = -np.expm1(np.log1p(-FAMILY_SIGNIFICANCE) / len(CASES))  # Sidak once more, over the scenes
@@ -211,14 +232,62 @@ def test_notices_what_is_missing(mutation):
     assert p_value(ours(case, case.material, **MUTATIONS[mutation]), expected(case, case.material)) < 1e-4
 
 
+class NoFalloff(emitters.NearLights):
+    """Near lights whose irradiance is pi everywhere."""
+
+    def reach(self, light, position):
+        reach = super().reach(light, position)
+        return lambda at: (reach(at)[0], mi.Float(1))
+
+
+class FromTheCentre(emitters.NearLights):
+    """Near lights seen everywhere in the direction that the object's centre sees them in."""
+
+    def reach(self, light, position):
+        reach, direction = super().reach(light, position), dr.gather(mi.Vector3f, mi.Vector3f(self.positions), light)
+        return lambda at: (dr.normalize(direction), reach(at)[1])
+
+
+class ShadowsFromTheCentre(emitters.NearLights):
+    """Near lights that cast the shadows of distant ones."""
+
+    def shadow_ray(self, start, number):
+        return super().shadow_ray(start, number)[0], start.spawn_ray(
+            dr.normalize(dr.gather(mi.Vector3f, mi.Vector3f(self.positions), number))
+        )
+
+
+NEAR_CASE = CASES[26]
+NEAR_MUTATIONS = {
+    "direct light only": {"bounces": 0},
+    "no cosine": {"change": with_family(NoCosine)},
+    "distant lights": {"distances": None},
+    "no falloff": {"lights": NoFalloff},
+    "directions of the centre": {"lights": FromTheCentre},
+    "shadows of distant lights": {"lights": ShadowsFromTheCentre},
+    "orthographic rays": {"camera": None},
+}
+
+
+@pytest.mark.parametrize("mutation", NEAR_MUTATIONS)
+def test_notices_what_is_wrong_with_near_lights_and_perspective(mutation, monkeypatch):
+    case, wrong = NEAR_CASE, dict(NEAR_MUTATIONS[mutation])
+    if kind := wrong.pop("lights", None):
+        monkeypatch.setattr(emitters, "NearLights", kind)
+    mesh, view, directions = parts(case)
+    seen = replace(view, camera_distance=wrong.pop("camera", view.camera_distance))
+    assert p_value(ours(case, case.material, scene_parts=(mesh, seen, directions), **wrong),
+                   expected(case, case.material)) < 1e-4  # fmt: skip
+
+
 def test_an_unchanged_family_passes_without_the_fast_path():
     """The general kernel, which tables and bounces take, gives what the one for fitted materials gives."""
     case = CASES[1]
     assert p_value(ours(case, case.material, change=with_family(Changed)), expected(case, case.material)) > 0.01
 
 
-def test_notices_highlights_counted_twice(monkeypatch):
-    case = CASES[4]
+@pytest.mark.parametrize("case", [CASES[4], CASES[28]], ids=str)
+def test_notices_highlights_counted_twice(case, monkeypatch):
     monkeypatch.setattr(highlights, "partition", lambda spread, s, size, spp: dr.full(mi.Float, 0.6, 1))
     assert p_value(ours(case, case.material), expected(case, case.material)) < 1e-4
 

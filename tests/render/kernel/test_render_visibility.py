@@ -8,6 +8,7 @@ import render_support as support
 from render import shapes
 from render.backend import variant
 from render.kernel import many_lights, paths, scene
+from render.kernel.emitters import DistantLights
 from render.kernel.visibility import WORD, probe_count, probed_visibility, visibility
 from render.records.manifest import View
 
@@ -145,18 +146,18 @@ def test_probes_that_do_not_face_a_light_decide_nothing():
     sideways, up = [0, 1, 0], [0.6, 0, 0.8]
     normals = np.array([sideways] * 4 + [up] * 4 + [up] * 8)
     at = vertices(normals, 0.5)
-    directions = mi.Vector3f([0.0, 0.8], [0.0, 0.0], [1.0, -0.6])  # up: seen; down into the plane: hidden
+    lights = DistantLights(mi.Vector3f([0.0, 0.8], [0.0, 0.0], [1.0, -0.6]))  # up: seen; down into the plane: hidden
     probes = mi.Bool([True, True, True, True, False, False, False, False] * 2)
     segments = (mi.UInt32([0, 8]), mi.UInt32([8, 8]))
-    expected = bits(visibility(built, *at, directions, 2, True), 16, 2)
-    found = bits(probed_visibility(built, *at, directions, 2, probes, segments), 16, 2)
+    expected = bits(visibility(built, *at, lights, 2, True), 16, 2)
+    found = bits(probed_visibility(built, *at, lights, 2, probes, segments), 16, 2)
     np.testing.assert_array_equal(found[0], [False] * 4 + [True] * 12)
     assert not found[1].any()
     np.testing.assert_array_equal(found, expected)
-    none = probed_visibility(built, *at, directions, 2, mi.Bool([False] * 16), segments)  # nobody probes: all ask
+    none = probed_visibility(built, *at, lights, 2, mi.Bool([False] * 16), segments)  # nobody probes: all ask
     np.testing.assert_array_equal(bits(none, 16, 2), expected)
     # A pixel none of whose samples probes, beside one that does.
-    mixed = probed_visibility(built, *at, directions, 2, mi.Bool([False] * 8 + [True] * 4 + [False] * 4), segments)
+    mixed = probed_visibility(built, *at, lights, 2, mi.Bool([False] * 8 + [True] * 4 + [False] * 4), segments)
     np.testing.assert_array_equal(bits(mixed, 16, 2), expected)
 
 

@@ -51,8 +51,9 @@ seeds = int(sys.argv[2])
 for folder in sys.argv[3:]:
     images = []
     for line in open(folder + "/lights.txt"):
-        x, y, z = map(float, line.split())
-        scene = mi.load_file(folder + "/scene.xml", lx=x, ly=y, lz=z)
+        x, y, z, *intensity = map(float, line.split())
+        own = {"intensity": intensity[0]} if intensity else {}
+        scene = mi.load_file(folder + "/scene.xml", lx=x, ly=y, lz=z, **own)
         images.append([np.array(mi.render(scene, seed=seed)) for seed in range(seeds)])
     np.save(folder + "/images.npy", np.array(images))
 assert not any(name.split(".")[0] in ("render", "sdps", "pipelines") for name in sys.modules)
@@ -72,6 +73,7 @@ def stock(folders: list[Path], kind: str = "scalar_rgb", seeds: int = REPEATS) -
 def ours(spec: SceneSpec, mesh, seeds: int = REPEATS) -> np.ndarray:
     """Return (lights, seeds, H, W, 3) of the many-light renderer."""
     settings = {"size": spec.size, "spp": spec.spp, "bounces": spec.bounces}
+    settings["distances"] = np.array(spec.light_distances) if spec.light_distances else None
     built, surface, stacks = scene.build(mesh), pack([spec.material], mesh), []
     for seed in range(seeds):
         _, images = many_lights.render(built, spec.view, surface, LIGHTS, seed=1000 + seed, **settings)
@@ -108,6 +110,9 @@ def compare(got: np.ndarray, expected: np.ndarray, name: str, margin: float) -> 
     assert (np.abs(ratio - 1) < tolerance).all(), ratio
 
 
+NEAR = replace(
+    PLAIN, material="lambertian:0.9", view=replace(VIEW, camera_distance=2.5), light_distances=(2.0, 2.5, 3.5)
+)
 TABLE = 0.02  # what interpolation of a table, or of a pattern's edges, may change in a pixel
 SCENES = {
     "lambertian": ("lambertian:0.9/0.5/0.1", support.bowl, 0.0),
@@ -124,6 +129,8 @@ def saved(tmp_path_factory) -> dict[str, tuple]:
     for name, (material, build, _) in SCENES.items():
         mesh, spec = build(), replace(PLAIN, material=material)
         found[name] = (mesh, spec, mitsuba_scene.save(folder / name, spec, mesh).parent)
+    mesh = support.bowl()
+    found["near lights, perspective"] = (mesh, NEAR, mitsuba_scene.save(folder / "near", NEAR, mesh).parent)
     images = stock([item[2] for item in found.values()])
     return {name: (*item, image) for (name, item), image in zip(found.items(), images, strict=True)}
 
@@ -132,6 +139,17 @@ def saved(tmp_path_factory) -> dict[str, tuple]:
 def test_stock_mitsuba_renders_the_same_picture(saved, name):
     mesh, spec, _, images = saved[name]
     compare(images, ours(spec, mesh), name, SCENES[name][2])
+
+
+def test_near_lights_and_perspective(saved):
+    """Both as a point emitter and a perspective sensor; the parameters' defaults are the first light's."""
+    mesh, spec, folder, images = saved["near lights, perspective"]
+    compare(images, ours(spec, mesh), "near lights, perspective", 0.0)
+    assert p_value(images, ours(replace(spec, light_distances=(4.0, 5.0, 7.0)), mesh)) < 1e-4
+    assert p_value(images, ours(replace(spec, view=replace(spec.view, camera_distance=4.0)), mesh)) < 1e-4
+    xml, words = (folder / "scene.xml").read_text(), (folder / "README.txt").read_text()
+    assert 'type="point"' in xml and 'type="perspective"' in xml and "directional" not in xml
+    assert "x, y, z, intensity = map(float" in words and "irradiance" not in words
 
 
 def test_the_comparison_notices_what_is_missing(saved):

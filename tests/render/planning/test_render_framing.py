@@ -1,5 +1,7 @@
 """Framing measured on the mesh agrees with what the renderer sees."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,12 +15,15 @@ from render.shapes.geometry.mesh import TriangleMesh
 from render.shared.seeds import generator
 
 
-@pytest.mark.parametrize(("shape", "tiles"), [("blobby:2", 1), ("sculpture:1", 4)])
-def test_estimate_equals_a_real_render(shape, tiles, tmp_path):
+@pytest.mark.parametrize(
+    ("shape", "tiles", "camera"), [("blobby:2", 1, None), ("sculpture:1", 4, None), ("blobby:2", 1, 1.8)]
+)
+def test_estimate_equals_a_real_render(shape, tiles, camera, tmp_path):
     config = DataConfig(upright_scale=(0.8, 1.0))
     mesh, scenes, expected = load(shape), [], []
     for number in range(3):
         view = random_view(config, shape.split(":")[0], generator(number, "framing"))
+        view = replace(view, camera_distance=camera)
         framing = measure(mesh, view, tiles)
         row, column = (
             np.unravel_index(np.argsort(framing.foreground.ravel())[-1 - number], (tiles, tiles))

@@ -42,6 +42,39 @@ def test_adding_scenes_leaves_the_others_alone(change):
         assert after[name] == replace(scene, **changed)
 
 
+def test_near_lights_and_perspective_leave_all_else_alone():
+    before = by_id(plan(SMALL))
+    config = replace(SMALL, near_lights=0.5, near_light_distance=(2.0, 5.0), camera="perspective")
+    after = by_id(plan(config))
+    for name, scene in before.items():
+        plain = replace(after[name], light_distances=(), view=replace(after[name].view, camera_distance=None))
+        assert plain == scene
+        assert 4 <= after[name].view.camera_distance <= 10
+        distances = after[name].light_distances
+        assert len(distances) in (0, SMALL.light_count) and all(2 <= distance <= 5 for distance in distances)
+    near = {scene.shape + str(scene.view): bool(scene.light_distances) for scene in after.values()}
+    assert len(near) == 8 and 0 < sum(near.values()) < 8  # by view
+    assert all(scene.light_distances for scene in plan(replace(config, near_lights=1.0)))
+    framed = plan(replace(config, min_foreground={"blobby": 0.05}))
+    assert [scene.view.camera_distance for scene in framed] == [scene.view.camera_distance for scene in plan(config)]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"near_lights": 1.5}, "near_lights must be in"),
+        ({"near_lights": 0.5, "near_light_distance": (1.1, 3.0)}, "near_light_distance must be above the radius"),
+        ({"near_light_distance": (3.0, 2.0)}, "near_light_distance must be two rising"),
+        ({"camera": "perspektive"}, "perspective"),
+        ({"camera": "perspective", "camera_distance": (1.0, 3.0)}, "camera_distance must be above the radius"),
+        ({"camera": "perspective", "tiles": 2, "upright_scale": (1.0, 1.5)}, "camera: orthographic"),
+    ],
+)
+def test_impossible_distances_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(SMALL, **change)
+
+
 def test_another_material_per_view_keeps_the_first_ones():
     before, after = by_id(plan(SMALL)), by_id(plan(replace(SMALL, materials_per_view=4)))
     assert all(after[name] == scene for name, scene in before.items())

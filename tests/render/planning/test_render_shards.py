@@ -54,6 +54,22 @@ def files(folder: Path) -> list[str]:
     return sorted(item.name for item in folder.iterdir())
 
 
+def test_positions_of_near_lights_and_the_camera_come_back(shard, scene, tmp_path):
+    near = replace(scene, light_distances=(2.0, 3.0, 2.5), view=View(offset=(0.1, 0.2), camera_distance=4.0))
+    about = {"spec": near.digest(), "camera_distance": 4.0, "light_reference": "0.1 0.2 0"}
+    written = replace(shard, light_positions=near.light_positions(), provenance=about)
+    write_shard(tmp_path / "a.exr", written)
+    read = read_shard(tmp_path / "a.exr", near)
+    np.testing.assert_array_equal(read.light_positions, near.light_positions())
+    assert read.camera_distance == 4.0 and read.centre.tolist() == [0.1, 0.2, 0.0]
+    part = OpenEXR.File(str(tmp_path / "a.exr")).parts[2]
+    np.testing.assert_array_equal(np.asarray(part.header["ps:light_pos"], np.float32), near.light_positions()[1])
+    for other in (scene, replace(near, light_distances=(2.0, 3.0, 2.6))):
+        with pytest.raises(InputError, match="light positions differ from the manifest"):
+            read_shard(tmp_path / "a.exr", other)
+    assert shard.light_positions is None and shard.camera_distance is None
+
+
 def test_round_trip_is_exact(path, shard, scene):
     read = read_shard(path, scene)
     for name in ("images", "normals", "depth", "mask", "coverage", "light_directions"):
