@@ -117,6 +117,7 @@ def _check_lights(folder: Path, scenes: Sequence[SceneSpec], options: ExportOpti
         )
     if options.mixed is not None:
         mixing.require_enough(min(counts), str(folder))
+        options.mixed.load()
     if options.layout == "psfcn" and min(counts) < 2:
         raise InputError(f"{folder}: a scene has one light, but PS-FCN's loaders need at least two")
 

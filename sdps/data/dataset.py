@@ -129,11 +129,12 @@ def require_lights(where: str | Path, scenes: Sequence[SceneSpec], options: Samp
     """Refuse scenes whose lights samples cannot be made of.
 
     Raises:
-        InputError: too few for equally many images, or for light that is mixed; with the number that is needed.
+        InputError: too few for equally many images, or for light that is mixed; or an environment that is no map.
     """
     require_equal_counts(where, scenes, options.images)
     if options.augmentation.mixed is not None:
         require_enough(min(len(scene.lights) for scene in scenes), str(where))
+        options.augmentation.mixed.load()
 
 
 def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, rng: np.random.Generator) -> Batch:

@@ -19,7 +19,7 @@ from render.shared.files import read_bytes
 from render.shared.seeds import generator
 
 HEIGHT = 64  # rows of built-in maps
-LARGEST = 512  # rows that maps of files are shrunk to
+LARGEST = 256  # rows that maps of files are shrunk to
 SUFFIXES = (".hdr", ".exr")
 _SKY, _GROUND = np.array([0.45, 0.65, 1.0]), np.array([0.30, 0.26, 0.20])
 
@@ -54,15 +54,30 @@ def load(name: str) -> np.ndarray:  # (H, 2H, 3) float32
     Raises:
         InputError: an unknown name, or a file that is no map: not twice as wide as high, negative, infinite or NaN.
     """
-    if Path(name).suffix.lower() in SUFFIXES:
+    require_name(name)
+    if is_file(name):
         return _checked(_read(Path(name)), name)
-    kind, colon, seed = name.partition(":")
-    if kind not in BUILT_IN or (colon and not (seed.isascii() and seed.isdecimal())):
-        raise unknown("environment", name, BUILT_IN, "or give an .hdr or .exr file; a seed follows a colon: sky-sun:7")
+    kind, _, seed = name.partition(":")
     vectors = directions(HEIGHT)
     radiance = BUILT_IN[kind](vectors, generator(int(seed or 0), "environment", kind))
     facing = np.maximum(vectors[..., 2], 0.0) * solid_angles(HEIGHT) / np.pi
     return (radiance / (radiance.mean(-1) * facing).sum()).astype(np.float32)
+
+
+def is_file(name: str) -> bool:
+    """Tell whether a name is that of an .hdr or .exr file."""
+    return Path(name).suffix.lower() in SUFFIXES
+
+
+def require_name(name: str) -> None:
+    """Refuse what is neither a built-in map's name nor a file's; the file is not looked at.
+
+    Raises:
+        InputError: with the nearest name.
+    """
+    kind, colon, seed = name.partition(":")
+    if not is_file(name) and (kind not in BUILT_IN or (colon and not (seed.isascii() and seed.isdecimal()))):
+        raise unknown("environment", name, BUILT_IN, "or give an .hdr or .exr file; a seed follows a colon: sky-sun:7")
 
 
 def constant(vectors: np.ndarray, _: np.random.Generator) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Images under environments, areas and several lights at once, mixed from images under single lights.
 
 Light adds up: the image of an object under a radiance E from all directions is the integral of E times its image under
-one light of unit irradiance per solid angle (Debevec et al., SIGGRAPH 2000, section 3.1). A dense set of lights turns
+one light of unit irradiance per solid angle (Debevec et al., SIGGRAPH 2000). A dense set of lights turns
 the integral into a sum over the lights' cells of the hemisphere, a cell being the directions nearest to a light. Our
 images I_i have irradiance pi, so
 
@@ -63,6 +63,15 @@ class LightMix:
         if self.environment and not self.environments:
             raise InputError("environments must name a map, or environment be 0")
         for name in self.environments:
+            environments.require_name(name)
+
+    def load(self) -> None:
+        """Read the maps, so that a file that is none is refused before the work starts.
+
+        Raises:
+            InputError: a file that is missing or no map.
+        """
+        for name in self.environments:
             _map(name)
 
     def draw(
@@ -95,11 +104,10 @@ class LightMix:
         if kind == "environment":
             name = self.environments[int(rng.integers(len(self.environments)))]
             seed, degrees = int(rng.integers(1000)), float(rng.uniform(-self.turn, self.turn))
-            if name in environments.BUILT_IN:
-                return stage.under(_map(f"{name}:{seed}")), {"map": f"{name}:{seed}"}
-            if name.partition(":")[0] in environments.BUILT_IN:
-                return stage.under(_map(name)), {"map": name}
-            return stage.under(environments.turned(_map(name), degrees)), {"map": name, "turn": round(degrees, 2)}
+            if environments.is_file(name):
+                return stage.under(environments.turned(_map(name), degrees)), {"map": name, "turn": round(degrees, 2)}
+            name = name if ":" in name else f"{name}:{seed}"
+            return stage.under(_map(name)), {"map": name}
         direction = np.array([*rng.normal(size=2), abs(rng.normal())])  # uniform over the hemisphere
         direction /= max(float(np.linalg.norm(direction)), 1e-9)
         radius = {"directional": 0.0, "lamp": float(rng.uniform(2, 10)), "area": float(rng.uniform(10, 40))}[kind]
@@ -195,7 +203,7 @@ def share_behind(radiance: np.ndarray) -> float:
     return float(power[environments.directions(len(radiance))[..., 2] <= 0].sum() / power.sum())
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)
 def _map(name: str) -> np.ndarray:
     return environments.load(name)
 

@@ -1,6 +1,6 @@
 """A camera: from exposed radiance to what a file holds, each step in physical units.
 
-The chain is the linear camera model of EMVA Standard 1288 (release 3.1, sections 2 and 3: photon noise, dark noise,
+The chain is the linear camera model of EMVA Standard 1288 (release 3.1, section 2: photon noise, dark noise,
 gain, quantisation) with the lens in front of it and the file behind it:
 
 1. *Lens.* The image is blurred by a Gaussian, stray light is added everywhere, and corners darken by cos^4 of the field

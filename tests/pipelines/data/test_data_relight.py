@@ -71,6 +71,7 @@ def test_mistakes_end_in_one_line(capsys, folder, tmp_path):
     bad = np.ones((8, 16, 3), np.float32)
     cv2.imwrite(str(tmp_path / "square.hdr"), bad[:, :8])
     assert "twice as wide as high" in fails(capsys, str(folder), *out, "--environments", str(tmp_path / "square.hdr"))
+    assert "no such environment map" in fails(capsys, str(folder), *out, "--environments", str(tmp_path / "no.exr"))
     assert "did you mean 'studio'" in fails(capsys, str(folder), *out, "--environments", "studo")
     assert "take unips" in fails(capsys, str(folder), *out, "--layout", "diligent")
     assert "images must be at least 1" in fails(capsys, str(folder), *out, "--images", "0")

@@ -23,7 +23,7 @@ def rng(*keys: int | str) -> np.random.Generator:
 
 @pytest.mark.parametrize("level", [0.0005, 0.002, 0.0031, 0.0033, 0.1, 0.6])
 def test_variance_follows_the_mean_by_the_gain(level):
-    """Photon transfer (EMVA 1288, eq. 13): variance in DN^2 = gain^2 read^2 + 1/12 + gain x mean above black."""
+    """Photon transfer (EMVA 1288, noise model): variance in DN^2 = gain^2 read^2 + 1/12 + gain x mean above black."""
     sensor = Sensor(full_well=20000, read_noise=6, bits=14, black_level=512)
     numbers = sensor.expose(flat(level), rng("transfer", int(1e6 * level)))
     mean, variance = numbers.mean() - 512, numbers.var()
