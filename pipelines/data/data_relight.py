@@ -50,6 +50,9 @@ def main(args: argparse.Namespace) -> int:
         f"{done.kept} kept; scene.json tells each image's light\n"
     )
     for name in mixed.environments if mixed.environment else ():
+        name = (
+            name if environments.is_file(name) or ":" in name else f"{name}:0"
+        )  # others of the kind lose about as much
         lost = mixing.share_behind(environments.load(name))
         sys.stdout.write(f"{name}: {lost:.0%} of its light comes from behind the object and is left out\n")
     return report(check_tree(args.out, args.layout, source=args.folder), args.out) if args.check else 0

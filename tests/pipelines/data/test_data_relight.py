@@ -35,7 +35,7 @@ def test_a_constant_environment_makes_the_images_it_must(capsys, folder, tmp_pat
     assert main(argv) == 0
     text = capsys.readouterr().out
     assert "2 scenes of 3 images as unips, 2 written now" in text and "every rule of its loaders holds" in text
-    assert "constant: 50% of its light comes from behind" in text
+    assert "constant:0: 50% of its light comes from behind" in text
     scene = read_manifest(folder)[0]
     shard = read_shard(folder / scene.file, scene)
     place = tmp_path / "tree" / "sphere-0.data"
