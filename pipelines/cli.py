@@ -33,7 +33,7 @@ class Group(NamedTuple):
     commands: Mapping[str, Command]
 
 
-DATA = Group("plan, check, preview, describe, export and import data folders", {
+DATA = Group("plan, check, preview, describe, export, relight and import data folders", {
     "plan": Command("data.data_plan", "write the manifest of a preset and estimate disk and time"),
     "status": Command("data.data_status", "tell what is done, failed and left, and at what rate"),
     "validate": Command("data.data_validate", "check every shard of a folder"),
@@ -41,6 +41,7 @@ DATA = Group("plan, check, preview, describe, export and import data folders", {
                        "write contact sheets and a page with light, material and shape statistics"),
     "card": Command("data.data_card", "write the dataset card and Croissant JSON"),
     "export": Command("data.data_export", "write the scenes in a layout that other loaders read"),
+    "relight": Command("data.data_relight", "mix images under environments and several lights from a light stage"),
     "import": Command("data.data_import", "turn PS-FCN trees and DiLiGenT folders into shards"),
 })  # fmt: skip
 

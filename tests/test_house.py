@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = [
     *(f"render.{name}" for name in (
-        "shared", "records", "backend", "shapes.geometry", "shapes.sculpture", "shapes", "materials",
+        "shared", "shared.imaging", "records", "backend", "shapes.geometry", "shapes.sculpture", "shapes", "materials",
         "materials.kernels", "materials.fit", "planning", "kernel", "running", "checks", "publishing", "exchange",
     )),
     "render",
@@ -32,7 +32,7 @@ FOLDERS = [
 ]  # fmt: skip
 RANK = {folder: place for place, folder in enumerate(FOLDERS)}
 PACKAGES = ("render", "sdps", "pipelines")
-LIGHT = ("render.shared", "render.records")
+LIGHT = ("render.shared", "render.shared.imaging", "render.records")
 """Folders of `render` that `sdps` may use; they load neither mitsuba nor torch."""
 MAY_RECUR = {"__init__.py", "api.py", "registry.py"}
 """A registry is one in every folder that has one, and `api` is what a package offers from its root."""

@@ -2,7 +2,8 @@
 
 The many-light renderer is timed against its rays alone, against Mitsuba's `path` one light at a time, and against
 itself with more materials, lights and pixels; renders that compile kernels or build acceleration structures are left
-out. `pipelines.bench.bench_data` adds what concerns whole runs: steady state, memory, processes, stages.
+out. `pipelines.bench.bench_data` adds what concerns whole runs: steady state, memory, processes, stages, mixed
+light.
 """
 
 import argparse

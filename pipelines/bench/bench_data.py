@@ -1,4 +1,4 @@
-"""The parts of `sdps bench` that concern whole runs: steady state, memory, processes and stages."""
+"""The parts of `sdps bench` that concern whole runs: steady state, memory, processes and stages; `PARTS` lists all."""
 
 import os
 import tempfile
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.bench.bench_relight import relight
 from pipelines.shared import presets
 from pipelines.shared.charts import new_figure, tidy
 from pipelines.shared.memory import resident_bytes
@@ -155,4 +156,5 @@ PARTS: dict[str, Callable[[int, Path | None], tuple[dict[str, Any], str]]] = {
     "steady": steady_state,
     "memory": memory,
     "workers": workers,
+    "relight": relight,
 }

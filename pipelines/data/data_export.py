@@ -37,20 +37,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Export, check, or both."""
     options = ExportOptions(
-        layout=args.layout, bits=args.bits, exposure=_exposure(args.exposure), intensities=args.intensities
+        layout=args.layout, bits=args.bits, exposure=exposure_flag(args.exposure), intensities=args.intensities
     )
     if args.out is None:
         if not args.check:
             raise InputError("--out is missing; give the folder to export to, or --check to check FOLDER itself")
-        return _report(check_tree(args.folder, args.layout, limit=args.limit), args.folder)
+        return report(check_tree(args.folder, args.layout, limit=args.limit), args.folder)
     from render.exchange.export import export, select
 
-    planned = read_manifest(args.folder)
-    if args.skip_missing:
-        planned = [scene for scene in planned if (Path(args.folder) / scene.file).is_file()]
-        if not planned:
-            raise InputError(f"{args.folder}: no shard yet; render some with `sdps render-data`")
-    chosen = select(planned, ids=args.ids, split=args.split, limit=args.limit)
+    scenes = planned(args.folder, skip_missing=args.skip_missing)
+    chosen = select(scenes, ids=args.ids, split=args.split, limit=args.limit)
     done = export(args.folder, args.out, options, chosen)
     sys.stdout.write(
         f"{args.out}: {len(done.scenes)} scenes as {args.layout}, {done.written} written now, {done.kept} kept\n"
@@ -61,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
         sys.stdout.write(f"{words}: {mean:.2%} of the object's values on average, at most {most:.2%} ({worst})\n")
     if args.layout == "psfcn" and not any(scene["split"] == "val" for scene in done.scenes.values()):
         sys.stdout.write(f"{args.out}: val_mtrl.txt is empty; export scenes of split 'val' too before training on it\n")
-    return _report(check_tree(args.out, args.layout, source=args.folder), args.out) if args.check else 0
+    return report(check_tree(args.out, args.layout, source=args.folder), args.out) if args.check else 0
 
 
 def _lost(scenes: Sequence[SceneSpec], layout: str) -> str:
@@ -82,7 +78,21 @@ def _lost(scenes: Sequence[SceneSpec], layout: str) -> str:
     return "".join(lines)
 
 
-def _exposure(text: str | None) -> float | Literal["auto"] | None:
+def planned(folder: str, *, skip_missing: bool) -> list[SceneSpec]:
+    """Return the scenes of a data folder, with `skip_missing` only those that have a shard.
+
+    Raises:
+        InputError: no manifest, or none left.
+    """
+    scenes = read_manifest(folder)
+    if skip_missing:
+        scenes = [scene for scene in scenes if (Path(folder) / scene.file).is_file()]
+        if not scenes:
+            raise InputError(f"{folder}: no shard yet; render some with `sdps render-data`")
+    return scenes
+
+
+def exposure_flag(text: str | None) -> float | Literal["auto"] | None:
     """Read the flag: a number, `auto`, or nothing."""
     try:
         return "auto" if text == "auto" else None if text is None else float(text)
@@ -90,14 +100,14 @@ def _exposure(text: str | None) -> float | Literal["auto"] | None:
         raise InputError(f"--exposure {text}: expected a positive number or 'auto'") from error
 
 
-def _report(report: RuleReport, tree: str) -> int:
+def report(found: RuleReport, tree: str) -> int:
     """Print what a check found; return 0 when nothing."""
-    for line in report.violations[:_SHOWN]:
+    for line in found.violations[:_SHOWN]:
         sys.stdout.write(f"{line}\n")
-    if len(report.violations) > _SHOWN:
-        sys.stdout.write(f"... and {len(report.violations) - _SHOWN} more\n")
-    low, high = report.lights
+    if len(found.violations) > _SHOWN:
+        sys.stdout.write(f"... and {len(found.violations) - _SHOWN} more\n")
+    low, high = found.lights
     lights = f"{low}" if low == high else f"{low} to {high}"
-    verdict = f"{len(report.violations)} violations" if report.violations else "every rule of its loaders holds"
-    sys.stdout.write(f"{tree}: {report.samples} samples of {lights} lights; {verdict}\n")
-    return 1 if report.violations else 0
+    verdict = f"{len(found.violations)} violations" if found.violations else "every rule of its loaders holds"
+    sys.stdout.write(f"{tree}: {found.samples} samples of {lights} lights; {verdict}\n")
+    return 1 if found.violations else 0

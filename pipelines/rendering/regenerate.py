@@ -7,11 +7,13 @@ from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
+from pipelines.rendering import photographs
 from pipelines.rendering.render_data import render_planned
 from pipelines.shared import presets, scenes
 from pipelines.shared.flags import split_list
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
+from render.shared.imaging.sensor import SensorModel
 from render.shared.progress import progress_bar
 
 
@@ -20,13 +22,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shapes", action="append", help="sphere, bunny, blobby:7, a mesh file, ...; commas or repeat")
     parser.add_argument("--materials", action="append", help="names, categories, all, lambertian:0.5, .yaml, .binary "
                         "and .bsdf files, mixtures such as stripes:7:chrome+blue-fabric")  # fmt: skip
-    parser.add_argument("--lights", action="append", help="merltest, diligent, biased:64, or a file of directions")
+    parser.add_argument(
+        "--lights", action="append", help="merltest, diligent, grid:96, hand-held:40, ..., or a file of directions"
+    )
     parser.add_argument("--camera-distance", type=float, default=None, metavar="D", help="perspective camera at D half "
                         "image widths from the object's centre (default: orthographic)")  # fmt: skip
     parser.add_argument("--light-distance", type=float, default=None, metavar="D", help="near lights at D half image "
                         "widths from the object's centre (default: distant lights)")  # fmt: skip
     parser.add_argument("--mitsuba", action="store_true",
                         help="also save each scene for stock Mitsuba, in <out>/mitsuba/<id>")  # fmt: skip
+    parser.add_argument("--photographs", action="store_true", help="also save each scene as the pictures of a camera "
+                        "drawn for it (test.sensor), in <out>/photographs/<id>")  # fmt: skip
     presets.add_common_arguments(parser)
 
 
@@ -53,6 +59,11 @@ def main(args: argparse.Namespace) -> int:
     if args.mitsuba:
         save_for_mitsuba(wanted, folder / "mitsuba")
         sys.stdout.write(f"{folder / 'mitsuba'}: {len(wanted)} scenes for stock Mitsuba; each README.txt tells how\n")
+    if args.photographs:
+        photographs.save_photographs(wanted, folder, folder / "photographs", test.sensor or SensorModel(), test.seed)
+        sys.stdout.write(
+            f"{folder / 'photographs'}: {len(wanted)} scenes as photographs; camera.json tells which camera\n"
+        )
     return 0
 
 

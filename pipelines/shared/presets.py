@@ -14,6 +14,7 @@ from render.planning.plan import DataConfig
 from render.shared.config import build, check_fields, read_yaml, to_yaml
 from render.shared.errors import InputError, unknown
 from render.shared.files import write_text
+from render.shared.imaging.sensor import SensorModel
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.pretrained import ALL
 from sdps.models.registry import MODELS
@@ -40,6 +41,7 @@ class TestConfig(InferenceConfig):
         repeats: Draws of random intensities per scene; scores are averaged over them.
         pictures: Scenes shown in the report, per shape.
         shipped: Shipped ways beside what is trained, such as `sdps` or `lcnet-soft+psfcn`; `all` for every one.
+        sensor: Cameras of `regenerate --photographs`; not given: all of `render.shared.imaging.sensor.SensorModel`.
     """
 
     shapes: tuple[str, ...] = ("sphere", "bunny")
@@ -56,6 +58,7 @@ class TestConfig(InferenceConfig):
     repeats: int = 1
     pictures: int = 5
     shipped: tuple[str, ...] = ALL
+    sensor: SensorModel | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

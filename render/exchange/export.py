@@ -18,6 +18,7 @@ from render.records.manifest import MANIFEST, SceneSpec, read_manifest
 from render.records.shards import file_hash, read_shard
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_folder, write_json
+from render.shared.imaging import mixing
 from render.shared.progress import progress_bar
 
 
@@ -114,6 +115,9 @@ def _check_lights(folder: Path, scenes: Sequence[SceneSpec], options: ExportOpti
             f"{folder}: scenes have from {min(counts)} to {max(counts)} lights, but a DiLiGenT root has one names.txt "
             "for all; export them to folders of their own with --ids"
         )
+    if options.mixed is not None:
+        mixing.require_enough(min(counts), str(folder))
+        options.mixed.load()
     if options.layout == "psfcn" and min(counts) < 2:
         raise InputError(f"{folder}: a scene has one light, but PS-FCN's loaders need at least two")
 
@@ -142,7 +146,7 @@ def _write_scene(folder: Path, root: Path, scene: SceneSpec, place: Place, optio
         marker["light_positions"] = np.asarray(scene.light_positions(), np.float64).round(6).tolist()
     if scene.view.camera_distance is not None:
         marker["camera_distance"] = scene.view.camera_distance
-    if options.layout == "unips":
+    if options.layout == "unips" and options.mixed is None:
         marker |= {
             "light_directions": sample.directions.tolist(),
             "light_intensities": sample.intensities.tolist(),

@@ -22,10 +22,10 @@ def claim(root: Path, record: dict[str, Any]) -> None:
         write_json(path, record | {"scenes": {}})
         return
     before = read_record(path)
-    for field in ("layout", "bits", "exposure", "intensities", "manifest"):
-        if before.get(field) != record[field]:
+    for field in ("layout", "bits", "exposure", "intensities", "manifest", "mixed"):
+        if before.get(field) != record.get(field):
             raise InputError(
-                f"{path}: {field} was {before.get(field)!r}, now it is {record[field]!r}; choose another --out"
+                f"{path}: {field} was {before.get(field)!r}, now it is {record.get(field)!r}; choose another --out"
             )
 
 

@@ -49,6 +49,7 @@ class Layout:
         bits: Depths its loaders read right; the first is the default.
         exposure: Default exposure.
         intensities: Whether images may have other than unit intensity.
+        directions: Whether a file of its own holds the direction of each image's light.
         places: Names the scenes of a manifest.
         folder: Folder of one scene, relative to `base`.
         write: Writes one scene into an empty folder; gets the final folder too, for files beside it.
@@ -60,6 +61,7 @@ class Layout:
     bits: tuple[int, ...]
     exposure: float | str
     intensities: bool
+    directions: bool
     places: Callable[[Sequence[SceneSpec]], dict[str, Place]]
     folder: Callable[[Place], str]
     write: Callable[[Path, Path, Place, Sample], None]
@@ -165,12 +167,12 @@ def write_unips(folder: Path, _final: Path, _place: Place, sample: Sample) -> No
 
 
 LAYOUTS: Mapping[str, Layout] = {
-    "psfcn": Layout("PS-FCN / SDPS-Net training tree", "Images", (8,), 1.0, False, view_places,
+    "psfcn": Layout("PS-FCN / SDPS-Net training tree", "Images", (8,), 1.0, False, True, view_places,
                     lambda place: f"{place.shape}/{place.name}", write_psfcn, list_psfcn),
-    "custom": Layout("SDPS-Net's UPS_Custom_Dataset folder", "", (8, 16), "auto", True, object_places,
+    "custom": Layout("SDPS-Net's UPS_Custom_Dataset folder", "", (8, 16), "auto", True, True, object_places,
                      lambda place: place.name, write_custom, list_custom),
-    "diligent": Layout("DiLiGenT's pmsData folder", "pmsData", (16, 8), "auto", True, object_places,
+    "diligent": Layout("DiLiGenT's pmsData folder", "pmsData", (16, 8), "auto", True, True, object_places,
                        lambda place: f"{place.name}PNG", write_diligent, list_diligent),
-    "unips": Layout("UniPS / SDM-UniPS test folder", "", (16, 8), "auto", True, object_places,
+    "unips": Layout("UniPS / SDM-UniPS test folder", "", (16, 8), "auto", True, False, object_places,
                     lambda place: f"{place.name}.data", write_unips, lambda root, placed: None),
 }  # fmt: skip

@@ -127,8 +127,8 @@ def _unips_pictures(folder: Path, note: Note) -> Pictures:
     if not names:
         raise InputError(f"{folder}: no L*.png; name the images L000.png, L001.png, ...")
     directions, intensities = None, np.ones((len(names), 3))
-    if (folder / MARKER).is_file():
-        marker = read_record(folder / MARKER)
+    marker = read_record(folder / MARKER) if (folder / MARKER).is_file() else {}
+    if "light_directions" in marker:  # mixed light has none
         directions = np.asarray(marker["light_directions"], np.float64)
         intensities = np.repeat(np.asarray(marker["light_intensities"], np.float64)[:, None], 3, 1)
         if names != sorted(names, key=natural_key) or len(directions) != len(names):

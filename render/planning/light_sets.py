@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from render.planning import arrangements
 from render.shared.config import read_yaml
 from render.shared.errors import InputError, unknown
 from render.shared.files import read_text
@@ -62,6 +63,11 @@ DISTRIBUTIONS = {
     "hemisphere": hemisphere,
     "near-uniform": near_uniform,
     "biased": biased,
+    "grid": arrangements.grid,
+    "rings": arrangements.rings,
+    "dome": arrangements.dome,
+    "hand-held": arrangements.hand_held,
+    "stage": arrangements.stage,
 }
 
 

@@ -8,6 +8,10 @@ The paper instead starts from 8-bit images. Two exposure modes bridge that:
 * `mean`: random light intensities first, then the whole set is exposed so that the object's mean is at a
   fixed level, as a photographer would, with a jitter, then the clip and noise. Test images are brought
   to the same level, so that absolute brightness carries no spurious meaning.
+
+With a `sensor` a camera drawn for the sample records the images where the clip stands in this order: saturation, noise
+and rounding come before what scales the images later. In `mean` the camera's images are then exposed once more, as test
+images are.
 """
 
 from dataclasses import dataclass
@@ -17,6 +21,8 @@ import numpy as np
 
 from render.shared.config import check_fields
 from render.shared.errors import InputError
+from render.shared.imaging.mixing import LightMix
+from render.shared.imaging.sensor import SensorModel
 
 PAPER_TEST_FLOOR, PAPER_TEST_GAIN, PAPER_TEST_CLIP = 0.02, 1.5, 2.0
 """How GCNet's loader exposes HDR test sets: object mean at least 0.02, then x1.5, clipped at 2."""
@@ -41,6 +47,11 @@ class Augmentation:
             often so (DiLiGenT's lights all lie within 45 degrees of it); of biased samples next to none are.
         symmetries: Mirror and quarter-turn scenes at random, with their normals and lights (not in the
             paper): eight views for the price of one rendering.
+        sensor: Cameras that record the images (`render.shared.imaging.sensor`); without it they clip and no more. Set
+            `noise` to 0 with it.
+        mixed: Light of the images, mixed anew for every sample from all lights of its scene, which must be a dense
+            light stage (`render.shared.imaging.mixing`); without it each image has one light. For networks that are
+            told no lights; a sample's directions are then where the light comes from on average.
     """
 
     exposure: Literal["mean", "paper"] = "mean"
@@ -53,6 +64,8 @@ class Augmentation:
     biased: float = 0.0
     frontal: float = 0.0
     symmetries: bool = False
+    sensor: SensorModel | None = None
+    mixed: LightMix | None = None
 
     def __post_init__(self) -> None:
         for name in ("exposure_range", "mean_jitter", "intensity_range"):
@@ -65,6 +78,8 @@ class Augmentation:
         for name in ("biased", "frontal"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InputError(f"augmentation.{name} must be in [0, 1], got {getattr(self, name)}")
+        if self.mixed is not None and self.biased + self.frontal:
+            raise InputError("augmentation.mixed takes all lights of a scene; set biased and frontal to 0")
         if self.biased + self.frontal > 1.0:
             raise InputError(f"augmentation.frontal must leave biased its share {self.biased}, got {self.frontal}")
         if not 0.0 <= self.noise < 1.0:
@@ -81,7 +96,8 @@ def augment(
     Args:
         images: (Q, H, W, 3) float32 radiance under lights of equal intensity.
         mask: (H, W) bool, the object; used to measure exposure.
-        rng: Draws exposure, intensities and noise, in this order.
+        rng: Draws exposure, intensities and noise, in this order; camera and its noise come from a child of it, so that
+            they change no other draw.
     """
     bounds = config.exposure_range if config.exposure == "paper" else config.mean_jitter
     factor = np.float32(rng.uniform(*bounds))
@@ -89,10 +105,13 @@ def augment(
     strengths = intensities[:, None, None, None]
     # One copy, then in place: fresh memory for every step would cost more than the arithmetic.
     if config.exposure == "paper":
-        images = np.minimum(images, np.float32(config.clip))
+        images = np.minimum(images, np.float32(config.clip)) if config.sensor is None else _record(images, config, rng)
         images *= factor * strengths
     else:
         images = images * strengths
+        if config.sensor is not None:
+            images *= exposure_scale(images[:, mask], config.mean_level, config.clip)
+            images = _record(images, config, rng)
         images *= factor * exposure_scale(images[:, mask], config.mean_level, config.clip)
         np.minimum(images, np.float32(config.clip), out=images)
     if config.noise:
@@ -101,6 +120,14 @@ def augment(
         noise *= np.float32(config.noise)
         images += noise
     return images, intensities
+
+
+def _record(images: np.ndarray, config: Augmentation, rng: np.random.Generator) -> np.ndarray:
+    """Return images (Q, H, W, 3), float32, as a camera that saturates at `clip` records them."""
+    assert config.sensor is not None
+    own = rng.spawn(1)[0]
+    clip = np.float32(config.clip)
+    return config.sensor.draw(own).record(images / clip, own) * clip
 
 
 def exposure_scale(values: np.ndarray, level: float, clip: float) -> np.float32:

@@ -17,10 +17,11 @@ from torch.utils.data import Dataset
 
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
+from render.shared.imaging.mixing import LightStage, mix, require_enough
 from render.shared.seeds import generator
 from sdps.core.symmetry import Symmetry
 from sdps.data.augment import Augmentation, augment
-from sdps.data.scene_store import SceneStore, StoredScene, finished_scenes, require_equal_counts
+from sdps.data.scene_store import PackedImages, SceneStore, StoredScene, finished_scenes, require_equal_counts
 
 _CROP_DRAWS = 8
 
@@ -101,7 +102,7 @@ class SceneDataset(Dataset[Any]):
         self.options = options
         self.store = SceneStore(Path(folder), cache=cache)
         self.scenes = finished_scenes(Path(folder), split, skip_missing=skip_missing)
-        require_equal_counts(folder, self.scenes, options.images)
+        require_lights(folder, self.scenes, options)
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -122,6 +123,18 @@ class SceneDataset(Dataset[Any]):
         rng = generator(self.options.seed, "sample", self.split, key.epoch, key.position)
         scene = self.scenes[key.scene]
         return make_sample(scene, self.store.load(scene), self.options, rng)
+
+
+def require_lights(where: str | Path, scenes: Sequence[SceneSpec], options: SampleOptions) -> None:
+    """Refuse scenes whose lights samples cannot be made of.
+
+    Raises:
+        InputError: too few for equally many images, or for light that is mixed; or an environment that is no map.
+    """
+    require_equal_counts(where, scenes, options.images)
+    if options.augmentation.mixed is not None:
+        require_enough(min(len(scene.lights) for scene in scenes), str(where))
+        options.augmentation.mixed.load()
 
 
 def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, rng: np.random.Generator) -> Batch:
@@ -147,10 +160,12 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     directions = scene.light_directions()
     if len(stored.images) != len(directions):
         raise InputError(f"scene {scene.id}: {len(stored.images)} images for {len(directions)} lights; render it again")
-    chosen = choose_images(directions, options, rng)
-    images = stored.images[chosen].astype(np.float32)  # (Q, H, W, 3)
+    if options.augmentation.mixed is None:
+        chosen = choose_images(directions, options, rng)
+        images, directions = stored.images[chosen].astype(np.float32), directions[chosen]  # (Q, H, W, 3)
+    else:
+        images, directions = _mixed(scene, stored.images, options, rng)
     normals, mask = stored.normals, stored.mask
-    directions = directions[chosen]
     if options.augmentation.symmetries:
         symmetry = Symmetry(int(rng.integers(4)), bool(rng.integers(2)))
         images, normals, mask = symmetry.images(images, 1), symmetry.images(normals, 0), symmetry.images(mask, 0)
@@ -169,6 +184,18 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
         corner=torch.tensor(corner),
         seed=torch.tensor(seed),
     )
+
+
+def _mixed(
+    scene: SceneSpec, images: np.ndarray | PackedImages, options: SampleOptions, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return images (Q, H, W, 3) float32 under mixed light, and the directions (Q, 3) it comes from on average."""
+    assert options.augmentation.mixed is not None
+    stage = LightStage(scene.light_directions(), f"scene {scene.id}")
+    weights, _ = options.augmentation.mixed.draw(stage, options.images, rng)
+    packed = PackedImages.of(images)
+    mixed = PackedImages(mix(packed.values, weights), packed.kept)
+    return mixed[:], stage.mean_directions(weights)
 
 
 def choose_images(directions: np.ndarray, options: SampleOptions, rng: np.random.Generator) -> np.ndarray:  # (Q,)

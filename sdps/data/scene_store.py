@@ -22,18 +22,26 @@ class PackedImages:
     """Images whose pixels off the object, black under every light, take no space; indexed as (L, H, W, 3) would be.
 
     Args:
-        values: (L, P, 3) float16, the pixels kept; may be a memory map.
+        values: (L, P, 3), the pixels kept, float16 in the cache; may be a memory map.
         kept: (H, W) bool, P of them true.
     """
 
     def __init__(self, values: np.ndarray, kept: np.ndarray) -> None:
         self.values, self.kept = values, kept
 
+    @classmethod
+    def of(cls, images: "np.ndarray | PackedImages") -> "PackedImages":
+        """Return images (L, H, W, 3) packed, unless they are."""
+        if isinstance(images, PackedImages):
+            return images
+        kept = np.any(images, axis=(0, 3))
+        return cls(images[:, kept], kept)
+
     def __len__(self) -> int:
         return len(self.values)
 
     def __getitem__(self, chosen: np.ndarray | slice) -> np.ndarray:
-        """Return (Q, H, W, 3) float16 of the images chosen by a slice or indices (Q,); only these are read."""
+        """Return (Q, H, W, 3), typed as the values: images chosen by slice or indices (Q,); only these are read."""
         values = self.values[chosen]
         images = np.zeros((len(values), *self.kept.shape, 3), values.dtype)
         images[:, self.kept] = values
@@ -77,12 +85,11 @@ class SceneStore:
         images, truth = (self.folder / CACHE_FOLDER / f"{entry}.{kind}.npy" for kind in ("images", "truth"))
         if not images.is_file():
             stored = _decode(path, scene)
-            decoded = np.asarray(stored.images)
+            packed = PackedImages.of(stored.images)
             # The images come last: where they are, the ground truth is.
-            kept = np.any(decoded, axis=(0, 3))
-            layers = [stored.normals, stored.mask[..., None], kept[..., None]]
+            layers = [stored.normals, stored.mask[..., None], packed.kept[..., None]]
             _save(truth, np.concatenate(layers, axis=-1, dtype=np.float32))
-            _save(images, decoded[:, kept])
+            _save(images, packed.values)
             return stored
         try:
             ground = np.load(truth)  # (H, W, 5)

@@ -19,8 +19,8 @@ from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
-from sdps.data.dataset import Batch, SampleOptions, collate, make_sample
-from sdps.data.scene_store import StoredScene, require_equal_counts
+from sdps.data.dataset import Batch, SampleOptions, collate, make_sample, require_lights
+from sdps.data.scene_store import StoredScene
 from sdps.data.sources import share_of_batch
 
 
@@ -82,7 +82,7 @@ class StreamedScenes:
             raise InputError(f"stream.window {window} must be at least batch_scenes {batch}")
         if not 0 < fresh <= window:
             raise InputError(f"stream.fresh must be above 0 and at most stream.window ({window}), got {fresh}")
-        require_equal_counts("stream", scenes, options.images)
+        require_lights("stream", scenes, options)
         self.scenes = len(scenes)
         self.options, self.batch, self.window, self.fresh = options, batch, window, fresh
         self._plan, self._open_stream, self._pin_memory, self._rank = scenes, open_stream, pin_memory, rank

@@ -14,6 +14,7 @@ from render.records.manifest import read_manifest
 from render.records.shards import file_hash, read_shard
 from render.shared.errors import InputError
 from sdps.methods import pretrained
+from sdps.photos import reading
 
 TINY = [word for item in ("size=32", "spp=2", "bounces=0") for word in ("--set", f"test.{item}")]
 
@@ -206,6 +207,27 @@ def test_regenerate_saves_scenes_for_stock_mitsuba(capsys, tmp_path):
     }
     (saved / ids[0] / "scene.xml").unlink()
     assert "holds other files" in fails(capsys, *argv, "--mitsuba")
+
+
+def test_regenerate_saves_photographs_that_infer_reads(capsys, tmp_path):
+    argv = ["regenerate", "--shapes", "sphere", "--materials", "lambertian:0.5", "--lights", "grid:6", "--photographs",
+            "--out", str(tmp_path), *TINY, "--set"]  # fmt: skip
+    calm = "jpeg_quality: [95, 95], black_error: [0, 0], ambient: [0, 0], field_angle: [0, 0], blur: [0, 0]"
+    for jpeg, bits, suffix in ((0, 8, "png"), (0, 12, "png"), (1, 12, "jpg")):
+        assert main([*argv, f"test.sensor={{jpeg: {jpeg}, bits: [{bits}], {calm}}}"]) == 0
+        saved = tmp_path / "photographs" / "sphere-lambertian-0.5"
+        assert len(list(saved.glob(f"0*.{suffix}"))) == len(list(saved.glob("0*"))) == 6
+        photos = reading.load(saved, lights="folder")
+        assert photos.gamma == ("srgb" if jpeg else "linear") and photos.bits == (8 if bits == 8 or jpeg else 16)
+        camera = json.loads((saved / "camera.json").read_text())
+        shard = read_shard(tmp_path / "shards" / "sphere-lambertian-0.5.exr")
+        expected = shard.images[:, shard.mask].astype(float) * camera["exposure"] * 2 ** camera["stops"]
+        found = photos[0:6][:, shard.mask]
+        seen = (expected > 0.1) & (expected < 0.9)
+        assert np.median(found[seen] / expected[seen]) == pytest.approx(1, abs=0.03)
+        assert photos.light_directions == pytest.approx(shard.light_directions, abs=1e-5)
+    assert "2 scenes" not in capsys.readouterr().out
+    assert "sensor.bits" in fails(capsys, *argv, "test.sensor={bits: [9]}")
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 import torch
 from sdps_scenes import hemisphere_lights, shade, sphere_normals, write_data
+from stage_scenes import write_stage
 from torch.utils.data import DataLoader
 
 from render.records.manifest import read_manifest
 from render.records.shards import read_shard
 from render.shared.errors import InputError
+from render.shared.imaging.mixing import LightMix
+from render.shared.imaging.sensor import SensorModel
 from sdps.core.metrics import normal_mae
 from sdps.core.symmetry import Symmetry
 from sdps.data.augment import Augmentation, augment, exposure_scale, measure_exposure
@@ -446,3 +449,65 @@ def test_frontal_samples_have_the_lights_nearest_to_the_camera() -> None:
     mixed = options(augmentation=replace(PLAIN, biased=0.4, frontal=0.3), images=8)
     heights = np.array([directions[choose_images(directions, mixed, rng(seed)), 2].min() for seed in range(400)])
     assert 0.25 < np.mean(heights >= directions[nearest[31], 2]) < 0.4  # the frontal share, and a few biased ones
+
+
+# --- cameras ---
+
+
+@pytest.mark.parametrize("exposure", ["mean", "paper"])
+def test_a_camera_changes_no_other_draw_of_a_sample(folder: Path, exposure: str) -> None:
+    plain = Augmentation(exposure=exposure, noise=0.0, symmetries=True)
+    recorded = replace(plain, sensor=SensorModel())
+    first, second = (
+        SceneDataset(folder, "train", options(augmentation=one, crop=16), cache=False).sample(SampleKey(1, 0, 3))
+        for one in (plain, recorded)
+    )
+    assert not torch.equal(first.images, second.images)
+    for name in ("mask", "normals", "directions", "intensities", "corner", "seed"):
+        assert torch.equal(getattr(first, name), getattr(second, name)), name
+    again = SceneDataset(folder, "train", options(augmentation=recorded, crop=16), cache=False)
+    assert same(second, again.sample(SampleKey(1, 0, 3)))
+
+
+def test_a_perfect_camera_changes_nothing_and_a_bright_exposure_saturates_before_scaling() -> None:
+    images, mask = rng().random((3, 32, 32, 3), dtype=np.float32), np.ones((32, 32), bool)
+    perfect = SensorModel(
+        stops=(0, 0), full_well=(1e12, 1e12), read_noise=(0, 0), bits=(16,), black_level=(0, 0), black_error=(0, 0),
+        ambient=(0, 0), field_angle=(0, 0), blur=(0, 0), jpeg=0.0,
+    )  # fmt: skip
+    for exposure in ("mean", "paper"):
+        plain = Augmentation(exposure=exposure, noise=0.0, clip=1.0)
+        expected, _ = augment(images, mask, plain, rng(1))
+        recorded, _ = augment(images, mask, replace(plain, sensor=perfect), rng(1))
+        np.testing.assert_allclose(recorded, expected, rtol=0.015, atol=2e-4)  # `exposure_scale` to a per cent
+    level = Augmentation(noise=0.0, mean_jitter=(1.0, 1.0), sensor=replace(perfect, stops=(3, 3)))
+    bright, _ = augment(images, mask, level, rng(1))
+    assert bright.mean() == pytest.approx(0.3, rel=0.02)
+    assert (bright > 0.999 * bright.max()).mean() > 0.3 and bright.max() < 0.6  # a plateau below the clip
+
+
+# --- mixed light ---
+
+
+def test_mixed_light_is_drawn_anew_and_the_same_from_shards_and_cache(tmp_path: Path) -> None:
+    write_stage(tmp_path)
+    alone = LightMix(environments=("constant",), environment=1.0, directional=0.0, lamp=0.0, area=0.0)
+    config = options(augmentation=replace(PLAIN, mixed=alone), images=5, size=24)
+    batch = SceneDataset(tmp_path, "train", config, cache=False).sample(SampleKey(1, 0, 0))
+    expected = (1 + batch.normals[2]) / 4  # (1 + n_z) / 2 of the whole hemisphere, whose weights sum to 2
+    inside = batch.mask[0] > 0
+    assert torch.allclose(batch.images[:, :, inside], expected[inside].expand(5, 3, -1), rtol=0.02)
+    assert batch.directions[:, 2].min() > 0.999
+    config = replace(config, augmentation=replace(PLAIN, mixed=LightMix()))
+    plain, cached = (SceneDataset(tmp_path, "train", config, cache=cache) for cache in (False, True))
+    cached.sample(SampleKey(0, 0, 0))
+    assert same(plain.sample(SampleKey(0, 0, 0)), cached.sample(SampleKey(0, 0, 0)))
+    assert not torch.equal(plain.sample(SampleKey(0, 0, 0)).images, plain.sample(SampleKey(0, 1, 0)).images)
+
+
+def test_mixed_light_needs_a_light_stage(folder: Path) -> None:
+    config = options(augmentation=Augmentation(mixed=LightMix()))
+    with pytest.raises(InputError, match="6 lights are too few to mix light from, 128 are needed"):
+        SceneDataset(folder, "train", config, cache=False)
+    with pytest.raises(InputError, match="set biased and frontal to 0"):
+        Augmentation(mixed=LightMix(), biased=0.5)
