@@ -37,6 +37,8 @@ class BenchConfig:
         material: Name of the material.
         second: Material added to the first to see what another one costs.
         mirror: Mirror-like material, whose highlights get samples of their own.
+        textured: Textured material with a relief.
+        layered: Texture with fitted materials in its regions.
         size: Image side in pixels.
         lights: Number of lights.
         spp: Camera samples per pixel.
@@ -51,6 +53,8 @@ class BenchConfig:
     material: str = "blue-acrylic"
     second: str = "gold-metallic-paint"
     mirror: str = "chrome"
+    textured: str = "procedural:tiles:5"
+    layered: str = "procedural:wood:5:blue-acrylic+gold-metallic-paint"
     size: int = 128
     lights: int = 64
     spp: int = 64
@@ -70,6 +74,8 @@ LABELS = {
     "one material": "all lights at once",
     "two materials": "all lights at once, two materials",
     "mirror-like": "all lights at once, a mirror-like material",
+    "textured": "all lights at once, a textured material",
+    "layered": "all lights at once, fitted materials in a texture",
     "twice the lights": "all lights at once, twice as many",
     "twice the size": "all lights at once, twice the image side",
     "path": "Mitsuba `path`, one light after another",
@@ -83,6 +89,8 @@ RATIOS = {
     "128 / 64 lights": ("twice the lights", "one material", 0, "at most 2"),
     "256x256 / 128x128": ("twice the size", "one material", 0, "at most 4.4"),
     "mirror-like / plain material": ("mirror-like", "one material", 0, ""),
+    "textured / plain material": ("textured", "one material", 0, "at most 1.5"),
+    "layered / plain material": ("layered", "one material", 0, "at most 1.5"),
 }
 
 
@@ -129,6 +137,7 @@ def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], 
     view, built = View(scale=config.scale), scene.build(shapes.load(config.shape))
     lights = _lights(config, 2 * config.lights)
     one, two, mirror = pack([config.material]), pack([config.material, config.second]), pack([config.mirror])
+    textured, layered = pack([config.textured]), pack([config.layered])
     settings: dict[str, Any] = {"size": config.size, "spp": config.spp, "bounces": config.bounces, "seed": config.seed}
 
     def all_lights(surfaces: Any = one, count: int = config.lights, **changes: int) -> None:
@@ -147,6 +156,8 @@ def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], 
         "one material": all_lights,
         "two materials": lambda: all_lights(two),
         "mirror-like": lambda: all_lights(mirror),
+        "textured": lambda: all_lights(textured),
+        "layered": lambda: all_lights(layered),
         "twice the lights": lambda: all_lights(count=2 * config.lights),
         "twice the size": lambda: all_lights(size=2 * config.size),
     }
