@@ -240,7 +240,8 @@ def _mixed_frames(vertices: Vertices, surfaces: PackedSurfaces, chosen: Any, lob
         ends += [(number, wi, wo) for number in group]
     density = dr.select(above, density, 0)
     scale = dr.select(density > 0, dr.rcp(density), 0)
-    dr.eval(density, scale)
+    towards = dr.select(density > 0, towards, vertices.normal)  # no ray is cast along what could not be drawn
+    dr.eval(density, scale, towards)
     found = {number: surfaces.eval(number, wi, wo, vertices.weights[number]) * scale for number, wi, wo in ends}
     return towards, density, [found[number] for number in range(len(surfaces))]
 

@@ -22,6 +22,7 @@ PATTERNS = {
     "height": ("_displacement", "_height", "_disp"),
 }
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+_UNREAD = (".exr", ".hdr", ".tga", ".bmp", ".webp")
 _LARGEST = 4096
 _DEPTH = 0.03  # relief of a height map from black to white, in widths of the map
 _STEEPEST = 3.0  # slopes of a normal map are cut here, 72 degrees
@@ -60,19 +61,23 @@ def find(folder: Path) -> dict[str, Path]:
     """Return the picture of each kind of map that the folder has, told by the names.
 
     Raises:
-        InputError: no base colour, or two pictures of one kind.
+        InputError: no base colour, two pictures of one kind, or one in a format that is not read.
     """
     found: dict[str, tuple[int, Path]] = {}
+    unread: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in SUFFIXES:
-            continue
         kind, rank = _kind(path.stem.lower())
-        if not kind:
+        if kind and path.suffix.lower() in _UNREAD:
+            unread[kind] = path
+        if not kind or path.suffix.lower() not in SUFFIXES:
             continue
         if kind in found and found[kind][0] == rank:
             raise InputError(f"{folder}: {kind}: both {found[kind][1].name} and {path.name}; keep one of them")
         if kind not in found or rank < found[kind][0]:
             found[kind] = (rank, path)
+    for kind, path in unread.items():
+        if kind not in found:
+            raise InputError(f"{path}: {kind}: maps must be {', '.join(SUFFIXES)}; download it as PNG or JPG")
     if "colour" not in found:
         raise InputError(
             f"{folder}: no base colour map; expected a picture named like Bricks_Color.jpg or brick_diff_2k.png"

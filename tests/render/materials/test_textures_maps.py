@@ -136,6 +136,10 @@ def test_bad_folders_end_in_a_line_that_names_file_and_remedy(tmp_path):
     with pytest.raises(InputError, match="no base colour map"):
         read(tmp_path)
     support.write_maps(tmp_path)
+    (tmp_path / "Test_Displacement.exr").write_bytes(b"")
+    with pytest.raises(InputError, match=r"Test_Displacement.exr: height: maps must be .png"):
+        read(tmp_path)
+    (tmp_path / "Test_Displacement.exr").unlink()
     support.write(tmp_path / "Test_Roughness.png", np.zeros((16, 32)), 8)
     with pytest.raises(InputError, match=r"Test_Roughness.png: 32x16 pixels, but Test_Color.png has 32x32"):
         read(tmp_path)
