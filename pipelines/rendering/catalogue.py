@@ -19,7 +19,7 @@ from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_path
 
 _LIGHTS = np.array([[-0.45, 0.55, 0.70]])
-_SHOWN = 1  # seed of the procedural materials on the sheet
+_SHOWN = 2  # seed of the procedural materials on the sheet
 _SHAPES = ("sphere", "bunny", *(f"{family}:{seed}" for family in ("blobby", "sculpture") for seed in range(15)))
 _BLOB, _BLOB_VIEW = "blobby:4", View(scale=1.15)
 _TURNED = View(rotation=(0.9063, 0.0, 0.4226, 0.0746, 0.9843, -0.1600, -0.4160, 0.1765, 0.8921), scale=0.98)
@@ -117,7 +117,8 @@ def _material_sheet(names: list[str]) -> pictures.Image.Image:
 
 def _label(name: str) -> str:
     """Name a material in at most 21 letters, a file without its folders."""
-    return "+".join(part.rsplit("/", 1)[-1] for part in name.split("+"))[:21]
+    short = name.removeprefix(f"{textured.PROCEDURAL}:")
+    return "+".join(part.rsplit("/", 1)[-1] for part in short.split("+"))[:21]
 
 
 def _shape_sheet() -> pictures.Image.Image:

@@ -163,7 +163,7 @@ def _noise(rng: np.random.Generator) -> np.ndarray:
 
 def _tiles(rng: np.random.Generator) -> np.ndarray:
     hue, glaze = rng.uniform(), rng.uniform(0.12, 0.5)
-    first = [*_colour(hue, rng.uniform(0.1, 0.65), rng.uniform(0.4, 0.9)), glaze, 0]
+    first = [*_colour(hue, rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)), glaze, 0]
     second = [*_colour(hue + rng.choice([0.05, 0.33, 0.5]), rng.uniform(0, 0.5), rng.uniform(0.3, 0.95)), glaze, 0]
     joint = [*_colour(0.1, 0.1, rng.uniform(0.3, 0.85)), 0.95, 0]
     return np.array([first, second, joint])
@@ -197,7 +197,7 @@ def _rust(rng: np.random.Generator) -> np.ndarray:
     painted = rng.random() < 0.65
     paint = [*_colour(rng.uniform(0.1, 0.95), rng.uniform(0.2, 0.7), rng.uniform(0.4, 0.9)), rng.uniform(0.2, 0.5), 0]
     steel = [*_colour(0.6, 0.05, rng.uniform(0.6, 0.8)), rng.uniform(0.25, 0.45), 1]
-    rust = [*_colour(rng.uniform(0.045, 0.07), rng.uniform(0.7, 0.85), rng.uniform(0.4, 0.55)), 0.95, 0]
+    rust = [*_colour(rng.uniform(0.045, 0.07), rng.uniform(0.7, 0.85), rng.uniform(0.32, 0.48)), 0.95, 0]
     return np.array([paint if painted else steel, rust, [*_colour(0.08, 0.3, 0.55), 0.5, 0.8]])
 
 
