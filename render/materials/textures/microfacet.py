@@ -79,7 +79,7 @@ def distribution(cosine: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return square / (np.pi * (cosine**2 * (square - 1) + 1) ** 2)
 
 
-def smith(ci: np.ndarray, co: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+def smith(ci: np.ndarray, co: np.ndarray, alpha: np.ndarray | float) -> np.ndarray:
     """Return G / (4 ci co), height-correlated (Heitz 2014, eq. 99)."""
     square = alpha**2
     first, second = (np.sqrt(square + (1 - square) * c**2) for c in (ci, co))

@@ -183,8 +183,8 @@ def load_mesh(path: str | Path) -> TriangleMesh:
     bare = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in geometry]
     whole = trimesh.util.concatenate(bare)
     assert isinstance(whole, trimesh.Trimesh), type(whole)
-    known = [_corner_uv(part) for part in geometry]
-    uv = None if any(part is None for part in known) else np.concatenate(known)
+    known = [uv for part in geometry if (uv := _corner_uv(part)) is not None]
+    uv = np.concatenate(known) if len(known) == len(geometry) else None
     return from_trimesh(whole, str(path), uv)
 
 

@@ -54,7 +54,8 @@ class Numbers:
     """Named numbers of a pattern as one array, so that another seed compiles no other kernel."""
 
     def __init__(self, rng: np.random.Generator, values: dict[str, Any]) -> None:
-        self._places, flat = {}, []
+        self._places: dict[str, int] = {}
+        flat: list[float] = []
         for name, value in values.items():
             self._places[name] = len(flat)
             flat += np.ravel(value).tolist()
