@@ -19,6 +19,7 @@ from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_path
 
 _LIGHTS = np.array([[-0.45, 0.55, 0.70]])
+_ROW = 8  # textured materials in a row of the sheet
 _SHOWN = 2  # seed of the procedural materials on the sheet
 _SHAPES = ("sphere", "bunny", *(f"{family}:{seed}" for family in ("blobby", "sculpture") for seed in range(15)))
 _BLOB, _BLOB_VIEW = "blobby:4", View(scale=1.15)
@@ -96,23 +97,20 @@ def shapes_main(args: argparse.Namespace) -> int:
 
 def _material_sheet(names: list[str]) -> pictures.Image.Image:
     """Render a sphere of each material, and a blob of each textured one, exposed alike but for the nearly black."""
-    tiles = []
     rough = [name for name in names if surfaces.load(name).textured]
-    if rough:
-        width, views = min(8, len(rough)), (("sphere", View(scale=0.95)), (_BLOB, _BLOB_VIEW))
-        names = [name for name in names if name not in rough]
-        for start in range(0, len(rough), width):
-            for shape, view in views:
-                part = rough[start : start + width]
-                shown = [next(_rendered(shape, [name], view, size=160, spp=128, bounces=2)) for name in part]
-                tiles += [
-                    (_label(name), pictures.tone_map(image, 1.2)) for name, image in zip(part, shown, strict=True)
-                ]
-    for first in range(0, len(names), 16):
-        part = names[first : first + 16]
+    plain = [name for name in names if name not in rough]
+    tiles = []
+    for first in range(0, len(rough), _ROW):
+        part = rough[first : first + _ROW]
+        for shape, view in (("sphere", View(scale=0.95)), (_BLOB, _BLOB_VIEW)):
+            for name in part:
+                (image,) = _rendered(shape, [name], view, size=160, spp=128, bounces=2)
+                tiles.append((_label(name), pictures.tone_map(image, 1.2)))
+    for first in range(0, len(plain), 16):
+        part = plain[first : first + 16]
         shown = _rendered("sphere", part, View(scale=0.95), size=120, spp=64, bounces=0)
         tiles += [(_label(name), pictures.tone_map(image, 1.2)) for name, image in zip(part, shown, strict=True)]
-    return pictures.contact_sheet(tiles, columns=min(8, len(rough)) if rough else min(10, len(tiles)))
+    return pictures.contact_sheet(tiles, columns=min(_ROW, len(rough)) if rough else min(10, len(tiles)))
 
 
 def _label(name: str) -> str:

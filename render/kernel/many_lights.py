@@ -116,7 +116,7 @@ def _averaged(image: np.ndarray, spp: int) -> np.ndarray:
 def _ground_truth(passes: list[Paths], size: int, spp: int) -> GroundTruth:
     """Average the passes; a pixel belongs to the mask when at least half of its samples hit the object."""
     hits = np.asarray(sum(paths.hits for paths in passes), np.float64)
-    normals = sum(paths.normal_sum for paths in passes)
+    normals = np.asarray(sum(paths.normal_sum for paths in passes))
     depth = sum(paths.depth_sum for paths in passes) / np.maximum(hits, 1)
     mask = (2 * hits >= spp) & (np.linalg.norm(normals, axis=1) > 0)
 

@@ -100,8 +100,8 @@ class Cover:
             found = self._laid(point[u], point[v], side, self._numbers)
             return [*found[:4], found.height.value, found.height.gradient]
 
-        *plain, value, gradient = projections.from_three_sides(place.normal, one)
-        return kinds.Layers(*plain, Jet(value, gradient))
+        second, third, tone, wear, value, gradient = projections.from_three_sides(place.normal, one)
+        return kinds.Layers(second, third, tone, wear, Jet(value, gradient))
 
     def _from_pattern(self, place: Place) -> tuple[Any, Any]:
         layers = self._layers(place)
