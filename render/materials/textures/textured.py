@@ -29,6 +29,7 @@ KINDS = {
 }
 PROCEDURAL, MAPS, UV = "procedural", "maps", "uv"
 REGIONS = 3
+_FILES = (".yaml", ".yml", ".binary", ".bsdf")
 _REPEATS = 2.0  # of a folder of maps, over the radius of the object
 
 
@@ -60,8 +61,10 @@ class Textured:
 def is_textured(name: str) -> bool:
     """Tell whether a name is one of this module's."""
     head = name.partition(":")[0]
-    # A folder of a material's name in the current one must not hide the material.
-    return head in (PROCEDURAL, MAPS, UV) or (os.sep in name and Path(name).is_dir())
+    if head in (PROCEDURAL, MAPS, UV):
+        return True
+    # A folder of a material's name in the current one must not hide the material, nor one named like a material file.
+    return os.sep in name and Path(name).suffix.lower() not in _FILES and Path(name).is_dir()
 
 
 def is_open(name: str) -> bool:
