@@ -67,7 +67,8 @@ def material(source: MaterialLike) -> Surface:
     Args:
         source: A built-in name (`chrome`, `blue-fabric`, ...), `lambertian:0.5` or `lambertian:0.8/0.3/0.1` (linear RGB
             albedo), a file (`.yaml` of `fit_material`, `.binary` of MERL, `.bsdf` of RGL), a spatially varying surface
-            (`stripes:7:chrome+blue-fabric`: pattern, seed, materials, which may be files), or a loaded material.
+            (`stripes:7:chrome+blue-fabric`: pattern, seed, materials, which may be files), a textured one
+            (`procedural:wood:7`, a folder of maps; `render.materials.textures.textured`), or a loaded material.
 
     Raises:
         InputError: an unknown name (with the nearest), a malformed pattern, or a file that is no material.

@@ -38,6 +38,8 @@ class BenchConfig:
         material: Name of the material.
         second: Material added to the first to see what another one costs.
         mirror: Mirror-like material, whose highlights get samples of their own.
+        textured: Textured material with a relief.
+        layered: Texture with fitted materials in its regions.
         size: Image side in pixels.
         lights: Number of lights.
         spp: Camera samples per pixel.
@@ -52,6 +54,8 @@ class BenchConfig:
     material: str = "blue-acrylic"
     second: str = "gold-metallic-paint"
     mirror: str = "chrome"
+    textured: str = "procedural:tiles:5"
+    layered: str = "procedural:wood:5:blue-acrylic+gold-metallic-paint"
     size: int = 128
     lights: int = 64
     spp: int = 64
@@ -76,6 +80,8 @@ LABELS = {
     "near lights": "all lights at once, near ones",
     "perspective": "all lights at once, perspective camera",
     "near lights, perspective": "all lights at once, near ones, perspective camera",
+    "textured": "all lights at once, a textured material",
+    "layered": "all lights at once, fitted materials in a texture",
     "twice the lights": "all lights at once, twice as many",
     "twice the size": "all lights at once, twice the image side",
     "path": "Mitsuba `path`, one light after another",
@@ -92,6 +98,8 @@ RATIOS = {
     "near / distant lights": ("near lights", "one material", 0, "at most 1.3"),
     "perspective / orthographic": ("perspective", "one material", 0, ""),
     "near and perspective / plain": ("near lights, perspective", "one material", 0, ""),
+    "textured / plain material": ("textured", "one material", 0, "at most 1.5"),
+    "layered / plain material": ("layered", "one material", 0, "at most 1.5"),
 }
 
 
@@ -138,6 +146,7 @@ def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], 
     view, built = View(scale=config.scale), scene.build(shapes.load(config.shape))
     lights = _lights(config, 2 * config.lights)
     one, two, mirror = pack([config.material]), pack([config.material, config.second]), pack([config.mirror])
+    textured, layered = pack([config.textured]), pack([config.layered])
     settings: dict[str, Any] = {"size": config.size, "spp": config.spp, "bounces": config.bounces, "seed": config.seed}
 
     pinhole = replace(view, camera_distance=_CAMERA * config.scale)
@@ -162,6 +171,8 @@ def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], 
         "near lights": lambda: all_lights(distances=near),
         "perspective": lambda: all_lights(seen=pinhole),
         "near lights, perspective": lambda: all_lights(seen=pinhole, distances=near),
+        "textured": lambda: all_lights(textured),
+        "layered": lambda: all_lights(layered),
         "twice the lights": lambda: all_lights(count=2 * config.lights),
         "twice the size": lambda: all_lights(size=2 * config.size),
     }

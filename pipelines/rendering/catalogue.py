@@ -11,19 +11,24 @@ from pipelines.shared import pictures
 from pipelines.shared.flags import split_list
 from render.materials import library, surfaces
 from render.materials.model import Material
+from render.materials.textures import textured
+from render.materials.textures.textured import Textured
 from render.planning.plan import material_pool
 from render.records.manifest import View
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_path
 
 _LIGHTS = np.array([[-0.45, 0.55, 0.70]])
+_ROW = 8  # textured materials in a row of the sheet
+_SHOWN = 2  # seed of the procedural materials on the sheet
 _SHAPES = ("sphere", "bunny", *(f"{family}:{seed}" for family in ("blobby", "sculpture") for seed in range(15)))
+_BLOB, _BLOB_VIEW = "blobby:4", View(scale=1.15)
 _TURNED = View(rotation=(0.9063, 0.0, 0.4226, 0.0746, 0.9843, -0.1600, -0.4160, 0.1765, 0.8921), scale=0.98)
 
 
 def add_material_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps materials`."""
-    parser.add_argument("--category", default=None, help="only this category")
+    parser.add_argument("--category", default=None, help="only this category; procedural: one of each kind")
     parser.add_argument("--materials", action="append", help="only these names and files; commas or repeat")
     parser.add_argument("--out", default=None, help="also render a contact sheet of spheres, <out>/materials.png")
 
@@ -39,7 +44,8 @@ def materials_main(args: argparse.Namespace) -> int:
     for name in chosen:
         sys.stdout.write(f"{name:<28} {_about(surfaces.load(name))}\n")
     sys.stdout.write(
-        f"{len(chosen)} materials; also lambertian:<albedo>, lambertian:<r>/<g>/<b>, and files: {library.FILES}\n"
+        f"{len(chosen)} materials; also lambertian:<albedo>, lambertian:<r>/<g>/<b>, procedural:<kind>:<seed>, "
+        f"folders of maps, and files: {library.FILES}\n"
     )
     if args.out:
         _save(_material_sheet(chosen), Path(args.out) / "materials.png")
@@ -51,6 +57,8 @@ def _about(surface: surfaces.Surface) -> str:
     if surface.pattern:
         return f"{surface.pattern.kind:<16} {surface.pattern.count} materials"
     (material,) = surface.components
+    if isinstance(material, Textured):
+        return f"{material.category:<16} {textured.KINDS.get(material.kind, 'maps')}"
     error = f"fit error {100 * material.fit_error:5.1f} %" if isinstance(material, Material) else "table"
     return f"{material.category:<16} {error}"
 
@@ -60,12 +68,19 @@ def _chosen(category: str | None, wanted: list[str] | None) -> list[str]:
     if wanted:
         if category is not None:
             raise InputError("--category and --materials: give one of them; --materials takes categories too")
-        return material_pool(tuple(split_list(wanted)))
+        return _one_of_each(split_list(wanted))
     if category is None:
         return library.names()
+    if category == textured.PROCEDURAL:
+        return _one_of_each([textured.PROCEDURAL])
     if category not in library.categories():
-        raise unknown("category", category, library.categories())
+        raise unknown("category", category, [*library.categories(), textured.PROCEDURAL])
     return list(library.categories()[category])
+
+
+def _one_of_each(wanted: list[str]) -> list[str]:
+    """Expand categories; of a kind of procedural material one is shown."""
+    return [f"{name}:{_SHOWN}" if textured.is_open(name) else name for name in material_pool(tuple(wanted))]
 
 
 def shapes_main(args: argparse.Namespace) -> int:
@@ -81,18 +96,27 @@ def shapes_main(args: argparse.Namespace) -> int:
 
 
 def _material_sheet(names: list[str]) -> pictures.Image.Image:
-    """Render a sphere of each material under one light, exposed alike but for the nearly black."""
+    """Render a sphere of each material, and a blob of each textured one, exposed alike but for the nearly black."""
+    rough = [name for name in names if surfaces.load(name).textured]
+    plain = [name for name in names if name not in rough]
     tiles = []
-    for first in range(0, len(names), 16):
-        part = names[first : first + 16]
+    for first in range(0, len(rough), _ROW):
+        part = rough[first : first + _ROW]
+        for shape, view in (("sphere", View(scale=0.95)), (_BLOB, _BLOB_VIEW)):
+            for name in part:
+                (image,) = _rendered(shape, [name], view, size=160, spp=128, bounces=2)
+                tiles.append((_label(name), pictures.tone_map(image, 1.2)))
+    for first in range(0, len(plain), 16):
+        part = plain[first : first + 16]
         shown = _rendered("sphere", part, View(scale=0.95), size=120, spp=64, bounces=0)
         tiles += [(_label(name), pictures.tone_map(image, 1.2)) for name, image in zip(part, shown, strict=True)]
-    return pictures.contact_sheet(tiles, columns=min(10, len(tiles)))
+    return pictures.contact_sheet(tiles, columns=min(_ROW, len(rough)) if rough else min(10, len(tiles)))
 
 
 def _label(name: str) -> str:
     """Name a material in at most 21 letters, a file without its folders."""
-    return "+".join(part.rsplit("/", 1)[-1] for part in name.split("+"))[:21]
+    short = name.removeprefix(f"{textured.PROCEDURAL}:")
+    return "+".join(part.rsplit("/", 1)[-1] for part in short.split("+"))[:21]
 
 
 def _shape_sheet() -> pictures.Image.Image:

@@ -21,7 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps regenerate`; what they leave open comes from the preset's `test` section."""
     parser.add_argument("--shapes", action="append", help="sphere, bunny, blobby:7, a mesh file, ...; commas or repeat")
     parser.add_argument("--materials", action="append", help="names, categories, all, lambertian:0.5, .yaml, .binary "
-                        "and .bsdf files, mixtures such as stripes:7:chrome+blue-fabric")  # fmt: skip
+                        "and .bsdf files, mixtures such as stripes:7:chrome+blue-fabric, procedural:wood:7, "
+                        "folders of maps")  # fmt: skip
     parser.add_argument(
         "--lights", action="append", help="merltest, diligent, grid:96, hand-held:40, ..., or a file of directions"
     )

@@ -5,12 +5,13 @@ from pathlib import Path
 
 from pipelines.shared.presets import TestConfig
 from render.materials import surfaces
+from render.materials.textures import textured
 from render.planning import light_sets
 from render.planning.plan import material_pool
 from render.records.manifest import SceneSpec, View
 from render.shapes import load as load_shape
 from render.shared.errors import InputError
-from render.shared.seeds import derived_seed
+from render.shared.seeds import derived_seed, generator
 
 _MEASURED = (".binary", ".bsdf")
 
@@ -21,7 +22,8 @@ def test_scenes(config: TestConfig) -> list[SceneSpec]:
     Raises:
         InputError: an unknown shape, material or light set, or two scenes of one name.
     """
-    pool = material_pool(config.materials)
+    open_names = material_pool(config.materials)
+    pool = [textured.drawn(name, generator(config.seed, "test", "texture", name)) for name in open_names]
     for name in pool:
         surfaces.load(name)
     for shape in config.shapes:
@@ -62,6 +64,9 @@ def slug(name: str) -> str:
     pattern, materials = surfaces.split(name)
     if pattern:
         return f"{pattern.kind}-{pattern.seed}-" + "--".join(slug(part) for part in materials)
+    if name.startswith((f"{textured.MAPS}:", f"{textured.UV}:")):
+        head, repeats, folder = name.split(":", 2)
+        name = f"{head}-{repeats}-{Path(folder).name}"
     path = Path(name)
     if path.suffix.lower() in _MEASURED:
         name = path.name

@@ -37,6 +37,11 @@ class GroundTruth:
     mask: np.ndarray  # (H, W) bool
     coverage: np.ndarray  # (H, W) float32
     weights: tuple  # per surface (M, H, W) float32, weights of its materials, or None for a single material
+    turned: tuple  # per surface (H, W, 3) float32, normals with its relief, or None where it has none
+
+    def normals_of(self, number: int) -> np.ndarray:
+        """Return the normals (H, W, 3) float32 that a surface shows."""
+        return self.normals if not self.turned or self.turned[number] is None else self.turned[number]
 
 
 def render(
@@ -114,19 +119,27 @@ def _averaged(image: np.ndarray, spp: int) -> np.ndarray:
 def _ground_truth(passes: list[Paths], size: int, spp: int) -> GroundTruth:
     """Average the passes; a pixel belongs to the mask when at least half of its samples hit the object."""
     hits = np.asarray(sum(paths.hits for paths in passes), np.float64)
-    normals = sum(paths.normal_sum for paths in passes)
+    normals = np.asarray(sum(paths.normal_sum for paths in passes))
     depth = sum(paths.depth_sum for paths in passes) / np.maximum(hits, 1)
-    length = np.linalg.norm(normals, axis=1)
-    mask = (2 * hits >= spp) & (length > 0)
-    unit = np.where(mask[:, None], normals / np.maximum(length, 1e-12)[:, None], 0)
+    mask = (2 * hits >= spp) & (np.linalg.norm(normals, axis=1) > 0)
+
+    def unit(summed: np.ndarray) -> np.ndarray:
+        length = np.linalg.norm(summed, axis=1)
+        whole = np.where(mask[:, None], summed / np.maximum(length, 1e-12)[:, None], 0)
+        return whole.reshape(size, size, 3).astype(np.float32)
+
     weights = tuple(
         None if sums[0] is None else np.where(mask, sum(sums) / np.maximum(hits, 1), 0).astype(np.float32)
         for sums in zip(*(paths.weight_sums for paths in passes), strict=True)
     )
     return GroundTruth(
-        normals=unit.reshape(size, size, 3).astype(np.float32),
+        normals=unit(normals),
         depth=np.where(mask, depth, 0).reshape(size, size).astype(np.float32),
         mask=mask.reshape(size, size),
         coverage=(hits / spp).reshape(size, size).astype(np.float32),
         weights=tuple(weight if weight is None else weight.reshape(-1, size, size) for weight in weights),
+        turned=tuple(
+            None if sums[0] is None else unit(sum(sums))
+            for sums in zip(*(paths.turned_sums for paths in passes), strict=True)
+        ),
     )

@@ -15,6 +15,7 @@ from render.kernel.camera import Camera
 from render.kernel.emitters import DistantLights, NearLights, place
 from render.kernel.visibility import probe_count, probed_visibility, visibility
 from render.materials.kernels.packed import PackedSurfaces
+from render.materials.kernels.textures.cover import Place
 from render.records.manifest import View
 
 mi = variant.load()
@@ -35,11 +36,16 @@ class Vertices:
     bitmask: Any  # UInt32 (ceil(L / 32) * N)
     throughput: tuple  # K Color3f (N, or 1 at the camera hits): f cos / density along the path so far
     weights: tuple  # K tuples of Float (N), weights of each surface's materials; None for a single material
+    turned: tuple  # K Vector3f (N), normals of surfaces with relief, None for others
     centre: Any  # Point3f (N), centroid of the triangle, or None where no highlight needs it
     spread: Any  # Float (N), d(solid angle of normals) / d(image area), or None where no highlight needs it
     pixels: Any  # UInt32 (Q), pixels with at least one vertex
     start: Any  # UInt32 (Q), first vertex of the pixel
     length: Any  # UInt32 (Q), number of vertices of the pixel
+
+    def normal_of(self, number: int) -> Any:
+        """Return the shading normals (N) of a surface."""
+        return self.normal if self.turned[number] is None else self.turned[number]
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,7 @@ class Paths:
         normal_sum: (P, 3) float64, sum of shading normals of the hits, camera frame.
         depth_sum: (P,) float64, sum of z of the hits, in half image widths.
         weight_sums: Per surface (M, P) float64, sum of the weights of its materials over the hits, or None.
+        turned_sums: Per surface (P, 3) float64, as `normal_sum` with its relief, or None.
     """
 
     depths: tuple[Vertices, ...]
@@ -71,6 +78,7 @@ class Paths:
     normal_sum: np.ndarray
     depth_sum: np.ndarray
     weight_sums: tuple
+    turned_sums: tuple
 
     @property
     def directions(self) -> Any:
@@ -120,9 +128,9 @@ def trace(
         else:
             seen = visibility(*rays, coherent=depth == 0)
         centre, spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and halves else (None, None)
-        weights = surfaces.weights(position, prim)
+        covers = surfaces.at(Place(mi.Vector3f(position), normal, prim, uv), wi)  # weights, turned normals
         depths.append(
-            Vertices(len(kept), position, normal, wi, sample, seen, throughput, weights, centre, spread, *segments)
+            Vertices(len(kept), position, normal, wi, sample, seen, throughput, *covers, centre, spread, *segments)
         )
         if depth < bounces:
             ray, factors = _bounce(depths[-1], facet, surfaces, seed, depth + 1, first, spp)
@@ -130,7 +138,8 @@ def trace(
     glints = None
     if halves and depths:
         glints = highlights.find(scene, camera, emitters, halves, len(lights), surfaces, spp, seed, first)
-    return Paths(tuple(depths), glints, emitters, parallel, halves, len(lights), size, spp, *_sums(depths, camera))
+    sums = _sums(depths, camera, surfaces)
+    return Paths(tuple(depths), glints, emitters, parallel, halves, len(lights), size, spp, *sums)
 
 
 def take(kind: type, source: Any, index: Any) -> Any:
@@ -168,19 +177,58 @@ def _bounce(
     else:
         chosen, u, v = random_variates(vertices.sample, stream(seed, (first << 8) + depth))
     lobe, _, _ = random_variates(vertices.sample, stream(seed, (first << 8) + 128 + depth))
-    frame = mi.Frame3f(vertices.normal)
-    wi = frame.to_local(vertices.wi)
-    dr.eval(wi, chosen, u, v, lobe)
-    wo, density = surfaces.sample(vertices.weights, wi, chosen, lobe, mi.Point2f(u, v))
-    scale = dr.select(density > 0, dr.rcp(density), 0)
-    dr.eval(wi, wo, scale)
-    factors = [surfaces.eval(number, wi, wo, vertices.weights[number]) * scale for number in range(len(surfaces))]
+    if any(normal is not None for normal in vertices.turned):
+        towards, density, factors = _mixed_frames(vertices, surfaces, chosen, lobe, mi.Point2f(u, v))
+    else:
+        frame = mi.Frame3f(vertices.normal)
+        wi = frame.to_local(vertices.wi)
+        dr.eval(wi, chosen, u, v, lobe)
+        wo, density = surfaces.sample(vertices.weights, wi, chosen, lobe, mi.Point2f(u, v))
+        scale = dr.select(density > 0, dr.rcp(density), 0)
+        dr.eval(wi, wo, scale)
+        factors = [surfaces.eval(number, wi, wo, vertices.weights[number]) * scale for number in range(len(surfaces))]
+        towards = frame.to_world(wo)
     start = dr.zeros(mi.SurfaceInteraction3f, vertices.count)
     start.p, start.n = vertices.position, facet
-    ray = start.spawn_ray(frame.to_world(wo))
+    ray = start.spawn_ray(towards)
     ray.maxt = dr.select(density > 0, ray.maxt, 0)
     dr.eval(ray, factors)
     return ray, factors
+
+
+def _mixed_frames(vertices: Vertices, surfaces: PackedSurfaces, chosen: Any, lobe: Any, point: Any) -> tuple:
+    """Do the same where some surfaces have a relief: each of these is drawn for alone, the others together.
+
+    Returns:
+        Directions (N), their density (N) in the mixture of all surfaces, and the factors.
+    """
+    plain = [number for number, normal in enumerate(vertices.turned) if normal is None]
+    groups = [[number] for number in range(len(surfaces)) if number not in plain]
+    groups += [plain] if plain else []
+    frames = [mi.Frame3f(vertices.normal_of(group[0])) for group in groups]
+    local = [frame.to_local(vertices.wi) + dr.zeros(mi.Vector3f, vertices.count) for frame in frames]
+    dr.eval(local, chosen, lobe, point)
+    towards, edge = mi.Vector3f(0, 0, 1), 0.0
+    for group, frame, wi in zip(groups, frames, local, strict=True):
+        share = len(group) / len(surfaces)
+        within = (chosen - opaque(mi.Float(edge))) * opaque(mi.Float(1 / share))
+        wo = surfaces.draw(vertices.weights, wi, dr.clip(within, 0, 1 - 2**-24), lobe, point, group)
+        towards = dr.select(within >= 0, frame.to_world(wo), towards)
+        edge += share
+    dr.eval(towards)
+    above = dr.dot(vertices.normal, towards) > 0  # below, the surface hides what its relief would reflect
+    density, ends = mi.Float(0), []
+    for group, frame, wi in zip(groups, frames, local, strict=True):
+        wo = frame.to_local(towards)
+        dr.eval(wo)
+        density += surfaces.density(vertices.weights, wi, wo, group) * opaque(mi.Float(len(group) / len(surfaces)))
+        ends += [(number, wi, wo) for number in group]
+    density = dr.select(above, density, 0)
+    scale = dr.select(density > 0, dr.rcp(density), 0)
+    towards = dr.select(density > 0, towards, vertices.normal)  # no ray is cast along what could not be drawn
+    dr.eval(density, scale, towards)
+    found = {number: surfaces.eval(number, wi, wo, vertices.weights[number]) * scale for number, wi, wo in ends}
+    return towards, density, [found[number] for number in range(len(surfaces))]
 
 
 def _segments(sample: Any, spp: int, pixel_count: int) -> tuple:
@@ -199,11 +247,12 @@ def _segments(sample: Any, spp: int, pixel_count: int) -> tuple:
     return pixels, start, length
 
 
-def _sums(depths: list[Vertices], camera: Camera) -> tuple:
+def _sums(depths: list[Vertices], camera: Camera, surfaces: PackedSurfaces) -> tuple:
     """Sum hits, camera-frame normals, depths and material weights of the first vertices per pixel."""
     pixel_count = camera.size**2
     hits, normals, depth = np.zeros(pixel_count, np.uint32), np.zeros((pixel_count, 3)), np.zeros(pixel_count)
     sums: list = []
+    turned: list = []
     if depths:
         first = depths[0]
         pixels = np.array(first.pixels)
@@ -211,11 +260,16 @@ def _sums(depths: list[Vertices], camera: Camera) -> tuple:
         normal, place = camera.rotation @ first.normal, camera.rotation @ mi.Vector3f(first.position)
         columns = _pixel_sums(first, [normal.x, normal.y, normal.z, place.z * camera.scale])
         normals[pixels], depth[pixels] = np.stack(columns[:3], axis=1), columns[3]
-        for weights in first.weights:
-            sums.append(None if weights is None else np.zeros((len(weights), pixel_count)))
-            if weights is not None:
+        for number, weights in enumerate(first.weights):
+            shares = weights is not None and surfaces.shares(number)
+            sums.append(np.zeros((len(weights), pixel_count)) if shares else None)
+            if shares:
                 sums[-1][:, pixels] = _pixel_sums(first, weights)
-    return hits, normals, depth, tuple(sums)
+        for relief in first.turned:
+            turned.append(None if relief is None else np.zeros((pixel_count, 3)))
+            if relief is not None:
+                turned[-1][pixels] = np.stack(_pixel_sums(first, list(camera.rotation @ relief)), axis=1)
+    return hits, normals, depth, tuple(sums), tuple(turned)
 
 
 def _pixel_sums(vertices: Vertices, values: Sequence) -> list[np.ndarray]:

@@ -45,15 +45,16 @@ def _shade_together(paths: Paths, surfaces: PackedSurfaces, numbers: list[int]) 
     images = [dr.zeros(mi.Float, paths.lights * paths.size**2 * 3) for _ in numbers]
     dr.eval(images)
     fitted = [
-        all(isinstance(surfaces.families[part.family], PackedMaterials) for part in surfaces.parts[number])
+        bool(surfaces.parts[number])
+        and all(isinstance(surfaces.families[part.family], PackedMaterials) for part in surfaces.parts[number])
         for number in numbers
     ]
     for depth, vertices in enumerate(paths.depths):
         shared = depth == 0 and paths.parallel
         fast = [k for k in range(len(numbers)) if shared and fitted[k]]
-        if fast:
-            chosen = [numbers[k] for k in fast]
-            _add_camera_hits([images[k] for k in fast], paths, vertices, surfaces, chosen)
+        for together in _of_one_normal(vertices, numbers, fast):
+            chosen = [numbers[k] for k in together]
+            _add_camera_hits([images[k] for k in together], paths, vertices, surfaces, chosen)
         for k in set(range(len(numbers))) - set(fast):
             _add_vertices(images[k], paths, vertices, surfaces, numbers[k])
     stacks = []
@@ -63,6 +64,12 @@ def _shade_together(paths: Paths, surfaces: PackedSurfaces, numbers: list[int]) 
             _add_glints(stack, paths, surfaces, number)
         stacks.append(stack.reshape(paths.lights, paths.size, paths.size, 3))
     return stacks
+
+
+def _of_one_normal(vertices: Vertices, numbers: list[int], fast: list[int]) -> list[list[int]]:
+    """Group places in `numbers`: those without relief together, every other alone."""
+    plain = [k for k in fast if vertices.turned[numbers[k]] is None]
+    return [group for group in (plain, *([k] for k in fast if k not in plain)) if group]
 
 
 class _Lanes(NamedTuple):
@@ -113,12 +120,12 @@ def _accumulate(images: list, vertices: Vertices, lanes: _Lanes, reflect: Any) -
 def _add_vertices(image: Any, paths: Paths, vertices: Vertices, surfaces: PackedSurfaces, number: int) -> None:
     """Add the light reflected at one depth, by any kind of material."""
     lanes, throughput, weights = _lanes(paths, vertices), vertices.throughput[number], vertices.weights[number]
-    weigh = _partition(paths, vertices, lanes, surfaces, number)
+    weigh, normals = _partition(paths, vertices, lanes, surfaces, number), vertices.normal_of(number)
     reach = paths.emitters.reach(lanes.light, vertices.position)
 
     def reflect(at: Any) -> Any:
         direction, strength = reach(at)
-        normal = dr.gather(mi.Vector3f, vertices.normal, at)
+        normal = dr.gather(mi.Vector3f, normals, at)
         frame = mi.Frame3f(normal)
         wi = frame.to_local(take(mi.Vector3f, vertices.wi, at))
         here = None if weights is None else tuple(take(mi.Float, weight, at) for weight in weights)
@@ -137,7 +144,7 @@ def _add_camera_hits(
     vector and theta_d are constant: the tables shrink to a row over theta_h per light (`PackedMaterials.rows`), and the
     factor of theta_i to one per hit.
     """
-    lanes, wi = _lanes(paths, vertices), mi.Vector3f(vertices.wi)
+    lanes, wi, normals = _lanes(paths, vertices), mi.Vector3f(vertices.wi), vertices.normal_of(numbers[0])
     direction = dr.gather(mi.Vector3f, paths.directions, lanes.light)
     half = dr.normalize(wi + direction)
     cos_d = dr.minimum(dr.dot(wi, half), 1)
@@ -145,7 +152,7 @@ def _add_camera_hits(
     materials = [_camera_rows(paths, vertices, surfaces, number, wi) for number in numbers]
 
     def reflect(at: Any) -> Any:
-        normal = dr.gather(mi.Vector3f, vertices.normal, at)
+        normal = dr.gather(mi.Vector3f, normals, at)
         cos_i, cos_o = dr.dot(normal, wi), dr.dot(normal, direction)
         sin2_h = dr.squared_norm(dr.cross(normal, half))
         entry = bsdf.half_cell(sin2_h, dr.dot(normal, half))
@@ -169,7 +176,7 @@ def _camera_rows(paths: Paths, vertices: Vertices, surfaces: PackedSurfaces, num
     parts, weights = [], vertices.weights[number]
     for k, part in enumerate(surfaces.parts[number]):
         family, index = surfaces.families[part.family], opaque(mi.UInt32(part.member))
-        scale = family.shadow(index, bsdf.shadow_cell(dr.dot(vertices.normal, wi)))
+        scale = family.shadow(index, bsdf.shadow_cell(dr.dot(vertices.normal_of(number), wi)))
         if weights is not None:
             scale *= weights[k]
         dr.eval(scale)

@@ -15,13 +15,14 @@ import yaml
 from render.materials import merl
 from render.materials.merl import MerlTable
 from render.materials.model import Material, directional_albedo, lambertian
+from render.materials.textures import textured
 from render.shared import config
 from render.shared.errors import InputError, unknown
 
 if TYPE_CHECKING:
     from render.materials.rgl import RglMaterial
 
-AnyMaterial: TypeAlias = "Material | MerlTable | RglMaterial"
+AnyMaterial: TypeAlias = "Material | MerlTable | RglMaterial | textured.Textured"
 FILES = ".yaml (fitted), .binary (MERL) or .bsdf (RGL)"
 _ALBEDO_COSINES = np.linspace(0.05, 1, 8)
 
@@ -56,7 +57,8 @@ def load(name_or_path: str | Path) -> AnyMaterial:
     Args:
         name_or_path: A name from `names()`; `lambertian:0.5` or `lambertian:0.8/0.3/0.1` (linear RGB albedo); or the
             path of a file: `.yaml` or `.yml` of the same form as the built-in ones, `.binary` of the MERL database, or
-            `.bsdf` of the RGL database. Measured files are taken as they are, whatever their albedo.
+            `.bsdf` of the RGL database. Measured files are taken as they are, whatever their albedo. A textured
+            material (see `textured.load`): `procedural:wood:7`, or a folder of maps.
 
     Raises:
         InputError: an unknown name (with the nearest), an albedo outside (0, 1], a file of another kind, or one that
@@ -64,12 +66,14 @@ def load(name_or_path: str | Path) -> AnyMaterial:
     """
     text = str(name_or_path)
     suffix = Path(text).suffix.lower()
+    if textured.is_textured(text):
+        return textured.load(text)
     if suffix in (".yaml", ".yml"):
         return _user_material(text)
     if suffix in (merl.SUFFIX, ".bsdf"):
         return _measured(text, _changed(text))
     if text not in _names() and (Path(text).is_file() or (os.sep in text and ":" not in text)):
-        raise InputError(f"{text}: a material file must end in {FILES}")
+        raise InputError(f"{text}: a material file must end in {FILES}; a folder of maps must exist")
     return _builtin(text)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from render.materials import library, surfaces
+from render.materials.textures import textured
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 
@@ -25,7 +26,8 @@ class Composition:
         shapes, views: Different shapes; different (shape, view, lights).
         families: {family or file name: scenes}.
         splits: {split: scenes}.
-        materials: {plain material: scenes it appears in}; a spatially-varying scene counts for each of its materials.
+        materials: {plain material: scenes it appears in}; a spatially-varying scene counts for each of its materials,
+            procedural ones of a kind count together.
         categories: {category: scenes it appears in}.
         varying: Scenes with more than one material.
         near, perspective: Scenes with near lights; with a perspective camera.
@@ -67,6 +69,8 @@ def components(material: str) -> tuple[str, ...]:
 
 def category(material: str) -> str:
     """Return the category of a plain material; `other` for a file that is not on this machine."""
+    if textured.is_open(material):
+        return material.replace(":", "-")
     try:
         return IMPORTED if material.startswith(f"{IMPORTED}:") else library.load(material).category or "other"
     except InputError:
@@ -81,7 +85,7 @@ def compose(scenes: Sequence[SceneSpec]) -> Composition:
         entry[0] += 1
         entry[1].add(scene.shape)
         entry[2].add(_view_key(scene))
-    parts = [components(scene.material) for scene in scenes]
+    parts = [tuple(map(textured.unseeded, components(scene.material))) for scene in scenes]
     names = Counter(name for names in parts for name in set(names))
     kinds = {name: category(name) for name in names}
     return Composition(

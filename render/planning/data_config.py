@@ -22,7 +22,8 @@ class DataConfig:
         families: Seeded shape families and how many shapes of each.
         views: Random views per shape.
         materials_per_view: Different random materials per view (each is a sample of its own; they share rays).
-        materials: Names, categories, or `all`; `lambertian:<albedo>` and material files are allowed.
+        materials: Names, categories, or `all`; `lambertian:<albedo>`, material files and folders of maps are allowed;
+            `procedural` and `procedural:<kind>` are drawn anew for every scene.
         material_weights: How often a material is drawn relative to the others, which count 1, by name or category; of
             a material that both name, the name counts.
         validation_materials: Materials, as in `materials`, that every second validation scene has in place of its own,

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from render.materials import library, surfaces
+from render.materials.textures import textured
 from render.planning import light_sets
 from render.planning.data_config import PERSPECTIVE, UPRIGHT, DataConfig
 from render.records.manifest import SceneSpec, View
@@ -51,7 +52,7 @@ def plan(config: DataConfig, processes: int = 1) -> list[SceneSpec]:
     if weights is not None and np.count_nonzero(weights) < most:
         raise InputError(f"material_weights leave {np.count_nonzero(weights)} materials, {most} are drawn at once")
     unseen = material_pool(config.validation_materials)
-    joined = next((name for name in pool if "+" in name), None)
+    joined = next((name for name in pool if "+" in name and not textured.is_textured(name)), None)
     if config.spatially_varying and joined:
         raise InputError(f"materials: {joined!r} has a '+' and cannot be mixed with others; leave it out or rename it")
     for family in config.families:
@@ -95,13 +96,18 @@ def material_weights(config: DataConfig, pool: list[str]) -> np.ndarray | None: 
     """
     if not config.material_weights:
         return None
-    kinds = [next(iter(surfaces.load(name).components)).category for name in pool]
+    kinds = [_category(name) for name in pool]
     for name in config.material_weights:
         if name not in pool and name not in kinds:
             raise unknown("material or category in material_weights:", name, {*pool, *kinds})
     given = config.material_weights
     weights = np.array([given.get(name, given.get(kind, 1.0)) for name, kind in zip(pool, kinds, strict=True)])
     return weights / max(weights.sum(), 1e-12)
+
+
+def _category(name: str) -> str:
+    """Return the category of a material of a pool; all kinds of procedural ones whose seed is to be drawn are one."""
+    return textured.PROCEDURAL if textured.is_open(name) else surfaces.load(name).components[0].category
 
 
 @contextmanager
@@ -131,6 +137,8 @@ def is_validation(number: int, share: float) -> bool:
 def material_pool(chosen: tuple[str, ...]) -> list[str]:
     """Expand `all`, `held-out` and category names into material names, keeping everything else that can be loaded.
 
+    `procedural` becomes `procedural:<kind>` of each kind, of which every scene draws its own (`textured.drawn`).
+
     Raises:
         InputError: a name that is neither.
     """
@@ -140,10 +148,13 @@ def material_pool(chosen: tuple[str, ...]) -> list[str]:
             pool += library.names()
         elif name == HELD_OUT:
             pool += library.held_out()
+        elif name == textured.PROCEDURAL:
+            pool += [f"{name}:{kind}" for kind in textured.KINDS]
         elif name in categories:
             pool += categories[name]
         else:
-            surfaces.load(name)
+            if not textured.is_open(name):
+                surfaces.load(name)
             pool.append(name)
     return list(dict.fromkeys(pool))
 
@@ -237,6 +248,8 @@ def _plan_view(
     if held_out and materials.unseen:
         drawn = generator(config.seed, *keys, "unseen").permutation(len(materials.unseen))
         surface[1::2] = [materials.unseen[index] for index in np.resize(drawn, len(surface[1::2]))]
+    streams = (generator(config.seed, *keys, "texture", slot) for slot in range(len(surface)))
+    surface = [textured.drawn(name, rng) for name, rng in zip(surface, streams, strict=True)]
     common: dict[str, Any] = {
         "seed": derived_seed(config.seed, *keys, "sampler"),
         "split": "val" if held_out else "train",
@@ -255,11 +268,13 @@ def _plan_view(
 def _surface(config: DataConfig, keys: tuple[Any, ...], materials: _Materials, first: int) -> str:
     """Name the surface of a scene: material `first` alone, or mixed with others by a seeded pattern."""
     rng, pool = generator(config.seed, *keys), materials.pool
-    if rng.random() >= config.spatially_varying:
+    if rng.random() >= config.spatially_varying or textured.is_textured(pool[first]):
         return pool[first]
     count = int(rng.integers(config.mixture[0], config.mixture[1] + 1))
     drawn = rng.permutation(len(pool)) if materials.weights is None else materials.order(rng, count)
-    others = [index for index in drawn if index != first][: count - 1]
+    others = [k for k in drawn if k != first and not textured.is_textured(pool[k])][: count - 1]
+    if not others:
+        return pool[first]
     names = "+".join(pool[index] for index in (first, *others))
     pattern = config.patterns[int(rng.integers(len(config.patterns)))]
     return f"{pattern}:{int(rng.integers(2**31))}:{names}"

@@ -120,6 +120,10 @@ def save(folder: str | Path, spec: SceneSpec, mesh: TriangleMesh | None = None) 
     """
     mesh = shapes.load(spec.shape) if mesh is None else mesh
     surface = surfaces.load(spec.material)
+    if surface.textured:
+        raise InputError(
+            f"scene {spec.id}: {spec.material!r} is textured; stock Mitsuba has no such material, leave it out"
+        )
     shares = np.zeros((len(mesh.vertices), 0), np.float32)
     if surface.pattern:
         quarter_pixel = 0.5 / (spec.resolution[0] * spec.view.scale)

@@ -27,7 +27,7 @@ class RenderedView:
     Attributes:
         scene: What was rendered: names, pose, lights, samples.
         images: (L, H, W, 3) float32, linear radiance; a white Lambertian surface that faces the light has 1.
-        normals: (H, W, 3) float32, unit shading normals, zero outside the mask.
+        normals: (H, W, 3) float32, unit shading normals, with the relief of a texture, zero outside the mask.
         depth: (H, W) float32, z of the surface in half image widths, larger is nearer, zero outside the mask.
         mask: (H, W) bool, pixels of which at least half the samples hit the object.
         coverage: (H, W) float32 in [0, 1], share of samples that hit the object.
@@ -106,7 +106,13 @@ def rendered_views(
         raise InputError(f"scene {first.id}: {first.shape} is outside the frame; check view.scale and view.offset")
     return (
         RenderedView(
-            scenes[number], stack, truth.normals, truth.depth, truth.mask, truth.coverage, truth.weights[number]
+            scenes[number],
+            stack,
+            truth.normals_of(number),
+            truth.depth,
+            truth.mask,
+            truth.coverage,
+            truth.weights[number],
         )
         for number, stack in images
     )

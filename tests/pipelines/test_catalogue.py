@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import textures_support
 
 from pipelines.cli import main
 from pipelines.shared.scenes import slug
 from render.materials import merl
+from render.materials.textures.textured import KINDS
 
 
 @pytest.fixture
@@ -23,11 +25,24 @@ def test_the_list_takes_names_categories_and_files(capsys, table):
     assert lines[-1].startswith("11 materials") and ".binary (MERL)" in lines[-1] and ".bsdf (RGL)" in lines[-1]
 
 
+def test_the_list_has_one_procedural_material_of_each_kind(capsys, tmp_path):
+    textures_support.write_maps(tmp_path)
+    assert main(["materials", "--category", "procedural"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[1] for line in lines[:-1]] == list(KINDS)
+    assert main(["materials", "--materials", f"{tmp_path},procedural:wood:3:chrome+nylon"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split(str(tmp_path))[1].split() == ["texture-maps", "maps"]
+    assert lines[1].split("nylon")[1].split() == ["procedural-wood", "2", "materials"]
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
         (["--materials", "chrom"], "did you mean 'chrome'"),
         (["--materials", "absent.binary"], "no such file"),
+        (["--materials", "procedural:wod:3"], "did you mean 'wood'"),
+        (["--materials", "maps:2:absent"], "no such folder of maps"),
         (["--materials", "chrome", "--category", "metal"], "--materials takes categories too"),
     ],
 )
@@ -47,6 +62,9 @@ def test_file_names_of_materials_are_plain_and_differ():
         "stripes:7:chrome+blue-fabric": "stripes-7-chrome--blue-fabric",
         "noise:0:a/chrome.binary+lambertian:0.5/0.2/0.1+fit.yaml": "noise-0-chrome.binary--lambertian-0.5-0.2-0.1--fit",
         "my_mesh+2.obj": "my-mesh-2.obj",
+        "procedural:wood:7": "procedural-wood-7",
+        "procedural:wood:7:chrome+a/fit.yaml": "procedural-wood-7-chrome--fit",
+        "maps:2.5:/a/b/Bricks_012": "maps-2.5-Bricks-012",
     }
     assert {name: slug(name) for name in names} == names
     varying = [f"{pattern}:{seed}:chrome+{other}" for pattern in ("parts", "noise") for seed in (0, 10)

@@ -15,8 +15,12 @@ from render.backend.arrays import opaque
 from render.materials import surfaces as surface_names
 from render.materials.kernels.bsdf import PackedMaterials
 from render.materials.kernels.patterns import Evaluator
+from render.materials.kernels.textures import cover
+from render.materials.kernels.textures.cover import Cover, Place
+from render.materials.kernels.textures.gloss import Gloss
 from render.materials.model import Material
 from render.materials.surfaces import Surface
+from render.materials.textures.textured import Textured
 from render.shapes.geometry.mesh import TriangleMesh
 from render.shared.errors import InputError
 
@@ -47,26 +51,58 @@ class PackedSurfaces:
         names: Names of the surfaces.
         families: The packed families.
         parts: Per surface, its materials.
-        glossy: Per surface, whether a narrow highlight reflects more than the share `GLOSSY` of some material's light.
+        glossy: Per surface, whether a narrow highlight reflects more than the share `GLOSSY` of some material's light;
+            never with a relief, which spreads it.
+        covers: Per surface, its texture, or None.
     """
 
     def __init__(self, surfaces: Sequence[Surface], mesh: TriangleMesh | None = None) -> None:
         if not surfaces:
             raise InputError("materials: at least one is needed")
         self.names = tuple(surface.name for surface in surfaces)
-        self.families, places = _pack([component for surface in surfaces for component in surface.components])
+        plain = [() if isinstance(surface.components[0], Textured) else surface.components for surface in surfaces]
+        self.families, places = _pack([component for components in plain for component in components])
         numbers = iter(places)
-        self.parts = tuple(tuple(next(numbers) for _ in surface.components) for surface in surfaces)
-        self._patterns = [surface.pattern and Evaluator(surface.pattern, mesh) for surface in surfaces]
+        self.parts = tuple(tuple(next(numbers) for _ in components) for components in plain)
+        self.covers = tuple(cover_of(surface, mesh) for surface in surfaces)
+        self._patterns = [
+            surface.pattern and not surface.textured and Evaluator(surface.pattern, mesh) for surface in surfaces
+        ]
         narrow = [family.highlight for family in self.families]
-        self.glossy = tuple(any(narrow[part.family][part.member] > GLOSSY for part in parts) for parts in self.parts)
+        self.glossy = tuple(
+            not over and any(narrow[part.family][part.member] > GLOSSY for part in parts)
+            for over, parts in zip(self.covers, self.parts, strict=True)
+        )
 
     def __len__(self) -> int:
         return len(self.parts)
 
     def weights(self, position: "mi.Point3f", prim: "mi.UInt32") -> tuple:
-        """Return per surface the Float weights (N) of its materials at points, or None for a single material."""
+        """Return per surface the Float weights (N) of its materials at points, or None for one alone or textured."""
         return tuple(pattern.weights(position, prim) if pattern else None for pattern in self._patterns)
+
+    def at(self, place: Place, wi: Any) -> tuple[tuple, tuple]:
+        """Return what evaluation needs of points of the object.
+
+        Args:
+            place: N points.
+            wi: Vector3f (N or 1), unit vectors to the viewer, object frame.
+
+        Returns:
+            Per surface its `weights`, for a texture of its own the values of `Gloss`; and per surface its normals (N)
+            where a texture turns them, or None.
+        """
+        weights, normals = list(self.weights(place.position, place.prim)), [None] * len(self)
+        for number, over in enumerate(self.covers):
+            if over is not None:
+                values, normals[number] = over.at(place, wi)
+                weights[number] = values if len(values) > 1 else None
+                dr.eval(values, normals[number])
+        return tuple(weights), tuple(normals)
+
+    def shares(self, number: int) -> bool:
+        """Tell whether the weights of a surface are the shares of its materials."""
+        return len(self.parts[number]) > 1
 
     def eval(self, number: int, wi: Any, wo: Any, weights: tuple | None, active: Any = True) -> "mi.Color3f":
         """Evaluate f cos(theta_o) of surface `number`.
@@ -78,6 +114,8 @@ class PackedSurfaces:
             weights: The entry of `weights` for this surface at these lanes.
             active: Lanes to evaluate.
         """
+        if not self.parts[number]:
+            return Gloss(weights).eval(None, wi, wo, active)
         total, prepared = mi.Color3f(0), {}
         for k, part in enumerate(self.parts[number]):
             family = self.families[part.family]
@@ -87,7 +125,9 @@ class PackedSurfaces:
             total += value if weights is None else value * weights[k]
         return total
 
-    def sample(self, weights: tuple, wi: Any, chosen: Any, lobe: Any, point: Any) -> tuple:
+    def sample(
+        self, weights: tuple, wi: Any, chosen: Any, lobe: Any, point: Any, numbers: Sequence[int] | None = None
+    ) -> tuple:
         """Draw directions from the mixture of the lobes of all materials, in equal shares by surface.
 
         The density is that of the whole mixture (one-sample balance heuristic, Veach 1997, eq. 9.15), so that each
@@ -99,12 +139,24 @@ class PackedSurfaces:
             chosen: (N) uniform variates that choose the material.
             lobe: (N) uniform variates that choose its lobe.
             point: (N) Point2f variates that choose the direction.
+            numbers: Surfaces to draw for, all by default.
 
         Returns:
             wo (N) in the local frame and its density per solid angle (N).
         """
+        wo = self.draw(weights, wi, chosen, lobe, point, numbers)
+        dr.eval(wo)
+        return wo, self.density(weights, wi, wo, numbers)
+
+    def draw(
+        self, weights: tuple, wi: Any, chosen: Any, lobe: Any, point: Any, numbers: Sequence[int] | None = None
+    ) -> Any:
+        """Draw the directions of `sample`, unevaluated; surfaces with a normal of their own are drawn for alone."""
+        numbers = range(len(self)) if numbers is None else numbers
+        if not self.parts[numbers[0]]:
+            return Gloss(weights[numbers[0]]).sample_lobe(None, wi, lobe, point)
         lanes = dr.width(chosen)
-        shares = [self._shares(number, weights, lanes) for number in range(len(self.families))]
+        shares = [self._shares(number, weights, lanes, numbers) for number in range(len(self.families))]
         wo, reached = mi.Vector3f(0, 0, 1), mi.Float(0)
 
         def walk(k: Any, weight: Any, edge: Any, index: Any, mine: Any) -> tuple:
@@ -115,7 +167,15 @@ class PackedSurfaces:
             state = (mi.Float(reached), mi.UInt32(0), mi.Bool(False))
             reached, index, mine = _over_materials(len(family), share, lanes, state, walk)
             wo = dr.select(mine, family.sample_lobe(index, wi, lobe, point, mine), wo)
-        dr.eval(wo)
+        return wo
+
+    def density(self, weights: tuple, wi: Any, wo: Any, numbers: Sequence[int] | None = None) -> Any:
+        """Return the density, Float (N) per solid angle, with which `draw` gives evaluated directions."""
+        numbers = range(len(self)) if numbers is None else numbers
+        if not self.parts[numbers[0]]:
+            return Gloss(weights[numbers[0]]).pdf(None, wi, wo)
+        lanes = dr.width(wo)
+        shares = [self._shares(number, weights, lanes, numbers) for number in range(len(self.families))]
         density = mi.Float(0)
         for family, share in zip(self.families, shares, strict=True):
 
@@ -123,15 +183,16 @@ class PackedSurfaces:
                 return (dr.fma(weight, family.pdf(k, wi, wo), total),)
 
             (density,) = _over_materials(len(family), share, lanes, (density,), add)
-        return wo, density
+        return density
 
-    def _shares(self, family: int, weights: tuple, lanes: int) -> tuple:
+    def _shares(self, family: int, weights: tuple, lanes: int, numbers: Sequence[int]) -> tuple:
         """Return the share of each material of a family in the mixture, (K) or, where patterns vary, (K * lanes)."""
-        count, fraction = len(self.families[family]), 1 / len(self.parts)
+        count, fraction = len(self.families[family]), 1 / len(numbers)
         fixed = np.zeros(count)
         varying: dict[int, Any] = {}
-        for parts, weight in zip(self.parts, weights, strict=True):
-            for k, part in enumerate(parts):
+        for number in numbers:
+            weight = weights[number]
+            for k, part in enumerate(self.parts[number]):
                 if part.family != family:
                     continue
                 if weight is None:
@@ -160,6 +221,15 @@ def _over_materials(count: int, share: tuple, lanes: int, state: tuple, step: An
 
     _, *last = dr.while_loop((mi.UInt32(0), *state), lambda k, *_: k < total, body)
     return tuple(last)
+
+
+def cover_of(surface: Surface, mesh: TriangleMesh | None = None) -> Cover | None:
+    """Return the texture of a surface on a mesh."""
+    first = surface.components[0]
+    if isinstance(first, Textured):
+        return cover.of_texture(first, mesh)
+    pattern = surface.pattern
+    return Cover(pattern.texture, pattern.seed, pattern.count) if pattern and pattern.texture else None
 
 
 def pack(names: Sequence[str], mesh: TriangleMesh | None = None) -> PackedSurfaces:

@@ -39,17 +39,23 @@ class FamilyBSDF(mi.BSDF):
         """Return (family, UInt32 index, weight) of each material at N points; the weights sum to 1."""
         return [(self.families[0], mi.UInt32(0), mi.Float(1))]
 
+    def seen(self, si: "mi.SurfaceInteraction3f") -> tuple[list[tuple], "mi.Frame3f | None"]:
+        """Return `parts`, and the frame that a relief turns the shading frame into, in its coordinates, or None."""
+        return self.parts(si), None
+
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple:
         """Choose a material by its weight, then a direction from its lobes; the weight is f cos / pdf of the sum."""
         active &= mi.Frame3f.cos_theta(si.wi) > 0
-        parts = self.parts(si)
+        parts, frame = self.seen(si)
+        wi = _turned(frame, si.wi)
         wo, reached = mi.Vector3f(0, 0, 1), mi.Float(0)
         for family, index, weight in parts:
             mine = (sample1 >= reached) & (weight > 0)
             rest = dr.clip((sample1 - reached) / dr.maximum(weight, 1e-9), 0, 1)
-            wo = dr.select(mine, family.sample_lobe(index, si.wi, rest, sample2, active & mine), wo)
+            wo = dr.select(mine, family.sample_lobe(index, wi, rest, sample2, active & mine), wo)
             reached += weight
-        value, density = _eval(parts, si, wo, active), _pdf(parts, si, wo, active)
+        wo = wo if frame is None else frame.to_world(wo)
+        value, density = _eval(parts, frame, si, wo, active), _pdf(parts, frame, si, wo, active)
         valid = active & (density > 0)
         sample = dr.zeros(mi.BSDFSample3f, dr.width(density))
         sample.wo = wo
@@ -61,16 +67,16 @@ class FamilyBSDF(mi.BSDF):
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         """Return f cos(theta_o)."""
-        return _eval(self.parts(si), si, wo, active)
+        return _eval(*self.seen(si), si, wo, active)
 
     def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         """Return the density of `sample` per solid angle."""
-        return _pdf(self.parts(si), si, wo, active)
+        return _pdf(*self.seen(si), si, wo, active)
 
     def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple:
         """Return both `eval` and `pdf`."""
-        parts = self.parts(si)
-        return _eval(parts, si, wo, active), _pdf(parts, si, wo, active)
+        parts, frame = self.seen(si)
+        return _eval(parts, frame, si, wo, active), _pdf(parts, frame, si, wo, active)
 
     def traverse(self, callback: Any) -> None:
         """Expose the families' arrays."""
@@ -81,15 +87,24 @@ class FamilyBSDF(mi.BSDF):
                     callback.put(prefix + name, value, mi.ParamFlags.NonDifferentiable)
 
 
-def _eval(parts: list[tuple], si: Any, wo: Any, active: Any) -> "mi.Color3f":
+def _turned(frame: Any, direction: Any) -> Any:
+    return direction if frame is None else frame.to_local(direction)
+
+
+def _eval(parts: list[tuple], frame: Any, si: Any, wo: Any, active: Any) -> "mi.Color3f":
     total = mi.Color3f(0)
     for family, index, weight in parts:
-        total += weight * family.eval(index, si.wi, wo, active)
+        total += weight * family.eval(index, _turned(frame, si.wi), _turned(frame, wo), active & _above(frame, si, wo))
     return total
 
 
-def _pdf(parts: list[tuple], si: Any, wo: Any, active: Any) -> "mi.Float":
+def _pdf(parts: list[tuple], frame: Any, si: Any, wo: Any, active: Any) -> "mi.Float":
     total = mi.Float(0)
     for family, index, weight in parts:
-        total += weight * family.pdf(index, si.wi, wo, active)
+        total += weight * family.pdf(index, _turned(frame, si.wi), _turned(frame, wo), active & _above(frame, si, wo))
     return total
+
+
+def _above(frame: Any, si: Any, wo: Any) -> Any:
+    """Where there is a relief, both directions must be above the surface that carries it too."""
+    return mi.Bool(True) if frame is None else (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)

@@ -4,15 +4,18 @@ The slow counterpart of `PackedSurfaces`, for `render.kernel.reference`; propert
 `to_object` (world to the object's unit sphere) and, for patterns that follow a mesh's pieces, `shape` (its name).
 """
 
+import drjit as dr
 import numpy as np
 
 from render import shapes
 from render.backend import variant
 from render.materials import surfaces
 from render.materials.kernels import plugin
-from render.materials.kernels.packed import PackedSurfaces
+from render.materials.kernels.packed import PackedSurfaces, cover_of
 from render.materials.kernels.patterns import Evaluator
 from render.materials.kernels.plugin import FamilyBSDF
+from render.materials.kernels.textures.cover import Place
+from render.materials.kernels.textures.gloss import Gloss
 
 mi = variant.load()
 
@@ -27,9 +30,10 @@ class SurfaceBSDF(FamilyBSDF):
 
     def __init__(self, props: "mi.Properties") -> None:
         surface = surfaces.load(props["material"])
-        self.packed = PackedSurfaces([surfaces.Surface(surface.name, surface.components)])
         mesh = shapes.load(props["shape"]) if "shape" in props else None
-        self.pattern = surface.pattern and Evaluator(surface.pattern, mesh)
+        self.packed = PackedSurfaces([surfaces.Surface(surface.name, surface.components)], mesh)
+        self.cover = cover_of(surface, mesh)
+        self.pattern = None if self.cover else surface.pattern and Evaluator(surface.pattern, mesh)
         to_object = props.get("to_object", mi.ScalarTransform4f())
         self.to_object = mi.Transform4f(mi.Matrix4f(np.array(to_object.matrix, np.float32)))
         super().__init__(props, self.packed.families)
@@ -37,6 +41,24 @@ class SurfaceBSDF(FamilyBSDF):
     def parts(self, si: "mi.SurfaceInteraction3f") -> list[tuple]:
         """Return (family, index, weight) of each material where the pattern is evaluated."""
         weights = self.pattern.at(self.to_object @ si.p, si.prim_index) if self.pattern else [mi.Float(1)]
+        return self._weighted(weights)
+
+    def seen(self, si: "mi.SurfaceInteraction3f") -> tuple[list[tuple], "mi.Frame3f | None"]:
+        """Return `parts` and the frame of the relief."""
+        if self.cover is None:
+            return self.parts(si), None
+        normal = dr.normalize(mi.Vector3f(self.to_object @ mi.Vector3f(si.sh_frame.n)))
+        towards = dr.normalize(mi.Vector3f(self.to_object @ si.to_world(si.wi)))
+        # `build_mesh` gives Mitsuba no texture coordinates, for which it takes the barycentric ones.
+        place = Place(mi.Vector3f(self.to_object @ si.p), normal, si.prim_index, mi.Point2f(si.uv))
+        values, moved = self.cover.at(place, towards)
+        world = dr.normalize(mi.Vector3f(self.to_object.inverse() @ moved))
+        frame = mi.Frame3f(dr.normalize(si.to_local(world)))
+        if not self.packed.parts[0]:
+            return [(Gloss(values), mi.UInt32(0), mi.Float(1))], frame
+        return self._weighted(values), frame
+
+    def _weighted(self, weights: list) -> list[tuple]:
         places = self.packed.parts[0]
         return [(self.families[p.family], mi.UInt32(p.member), w) for p, w in zip(places, weights, strict=True)]
 

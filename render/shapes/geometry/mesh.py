@@ -18,6 +18,7 @@ class TriangleMesh:
         vertices: Positions, (V, 3) float32.
         faces: Vertex indices, counter-clockwise seen from outside, (F, 3) uint32.
         normals: Unit outward normals, (V, 3) float32.
+        uv: Texture coordinates of the corners of each face, (F, 3, 2) float32, v up; None for a mesh without.
 
     Raises:
         InputError: at construction: wrong shapes, no faces, non-finite values, an index out of range,
@@ -27,6 +28,7 @@ class TriangleMesh:
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
+    uv: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name, dtype in (("vertices", np.float32), ("normals", np.float32)):
@@ -51,6 +53,11 @@ class TriangleMesh:
             raise InputError(f"mesh normals: {len(self.normals)} for {len(self.vertices)} vertices")
         if np.abs(np.linalg.norm(self.normals, axis=1) - 1).max() > 1e-3:
             raise InputError("mesh normals: not of unit length")
+        if self.uv is not None:
+            uv = np.ascontiguousarray(self.uv, dtype=np.float32)
+            if uv.shape != (len(faces), 3, 2) or not np.isfinite(uv).all():
+                raise InputError(f"mesh uv: expected finite values of shape ({len(faces)}, 3, 2), got {uv.shape}")
+            object.__setattr__(self, "uv", uv)
 
     def normalised(self) -> "TriangleMesh":
         """Centre the mesh on its bounding sphere and scale it so that the farthest vertex is at radius 1."""
@@ -138,9 +145,12 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def without_degenerate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Drop triangles without area and vertices that no triangle uses; returns (vertices, faces)."""
+    return without_unused(vertices, faces[_with_area(vertices, faces)])
+
+
+def _with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:  # (F,) bool
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    area = np.linalg.norm(face_normals(vertices.astype(np.float64), faces), axis=1)
-    return without_unused(vertices, faces[distinct & (area > 0)])
+    return distinct & (np.linalg.norm(face_normals(vertices.astype(np.float64), faces), axis=1) > 0)
 
 
 def without_unused(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -173,33 +183,50 @@ def load_mesh(path: str | Path) -> TriangleMesh:
     bare = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in geometry]
     whole = trimesh.util.concatenate(bare)
     assert isinstance(whole, trimesh.Trimesh), type(whole)
-    return from_trimesh(whole, str(path))
+    known = [uv for part in geometry if (uv := _corner_uv(part)) is not None]
+    uv = np.concatenate(known) if len(known) == len(geometry) else None
+    return from_trimesh(whole, str(path), uv)
 
 
-def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh") -> TriangleMesh:
+def _corner_uv(mesh: trimesh.Trimesh) -> np.ndarray | None:
+    """Return the texture coordinates of the corners (F, 3, 2) of a mesh that has them."""
+    uv = getattr(mesh.visual, "uv", None)
+    if uv is None or len(uv) != len(mesh.vertices) or not np.isfinite(uv).all():
+        return None
+    return np.asarray(uv, np.float64)[:, :2][np.asarray(mesh.faces)]
+
+
+def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh", uv: np.ndarray | None = None) -> TriangleMesh:
     """Return the triangles of a mesh as placed, smoothly shaded.
 
     Equal positions are merged, so that texture seams and the flat facets of STL do not show; normals are
     area-weighted. A watertight surface is turned outside out.
 
     Args:
-        mesh: Stays as it is; of its attributes only vertices and faces are used.
+        mesh: Stays as it is; of its attributes only vertices, faces and texture coordinates are used.
         name: What messages call it.
+        uv: (F, 3, 2) texture coordinates of the corners; the mesh's own when omitted.
 
     Raises:
         InputError: no triangles, or non-finite positions.
     """
+    uv = _corner_uv(mesh) if uv is None else uv
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     if not len(mesh.faces):
         raise InputError(f"{name}: contains no triangles; give a surface mesh")
     if not np.isfinite(mesh.vertices).all():
         raise InputError(f"{name}: contains vertices that are not finite; repair the file")
     mesh.merge_vertices()
-    vertices, faces = without_degenerate(np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64))
+    merged = np.asarray(mesh.faces, dtype=np.int64)
+    kept = _with_area(np.asarray(mesh.vertices), merged)
+    vertices, faces = without_unused(np.asarray(mesh.vertices), merged[kept])
     if not len(faces):
         raise InputError(f"{name}: all of its triangles are degenerate")
-    faces = _outward(vertices, faces)
-    return TriangleMesh(vertices=vertices, faces=faces, normals=vertex_normals(vertices, faces))
+    wound = _outward(vertices, faces)
+    if uv is not None:  # winding a face the other way moves its corners
+        moved = (wound[:, :, None] == faces[:, None, :]).argmax(2)
+        uv = np.take_along_axis(uv[kept], moved[:, :, None], axis=1)
+    return TriangleMesh(vertices=vertices, faces=wound, normals=vertex_normals(vertices, wound), uv=uv)
 
 
 def _outward(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ import merl_support
 import numpy as np
 import pytest
 import render_support as support
+import textures_support
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -22,6 +23,7 @@ from render.backend import variant
 from render.kernel import emitters, highlights, many_lights, reference, scene
 from render.materials import merl
 from render.materials.kernels.packed import pack
+from render.materials.kernels.textures import cover, gloss
 from render.planning import light_sets
 from render.records.manifest import View
 from render.shared.seeds import generator
@@ -93,16 +95,25 @@ CASES = [
     Case("sphere", "chrome", 0, 8, 2048, camera=2.5, slow=True),
     Case("bowl", "chrome", 1, 8, 2048, near=NEAR, slow=True),
     Case("blobby:8", "nickel", 2, 8, 1024, camera=2.5, near=NEAR, slow=True),
+    Case("bowl", "procedural:tiles:5", 2),
+    Case("blobby:4", "procedural:weave:2", 1),
+    Case("sculpture:4", "procedural:noise:3", 2),
+    Case("bowl", "procedural:print:4:gold-metallic-paint+lambertian:0.8", 2),
+    Case("bowl", "maps:rough", 2),
 ]
 
 
 @pytest.fixture(scope="module")
 def material(tmp_path_factory):
-    """Return the function that names a case's material; MERL tables are written from the library."""
+    """Return the function that names a case's material; MERL tables and folders of maps are written."""
 
     @cache
     def name(text: str) -> str:
         kind, _, source = text.partition(":")
+        if kind == "maps":
+            folder = tmp_path_factory.mktemp("maps")
+            textures_support.write_maps(folder)
+            return f"maps:0.8:{folder}"
         if kind != "merl":
             return text
         path = tmp_path_factory.mktemp("merl") / f"{source}.binary"
@@ -295,6 +306,39 @@ def test_notices_highlights_counted_twice(case, monkeypatch):
 def test_notices_a_missing_pattern():
     case = CASES[18]
     assert p_value(ours(case, case.material, change=first_material_only), expected(case, case.material)) < 1e-4
+
+
+TEXTURED, MAPS = (next(case for case in CASES if case.material.startswith(kind)) for kind in ("procedural", "maps"))
+
+
+@pytest.mark.parametrize("case", [TEXTURED, MAPS], ids=["procedural", "maps"])
+def test_notices_a_missing_relief(case, material, monkeypatch):
+    name = material(case.material)
+    truth = expected(case, name)
+    monkeypatch.setattr(cover, "turned", lambda normal, slope, wi: normal)
+    assert p_value(ours(case, name), truth) < 1e-4
+
+
+@pytest.mark.parametrize("part", ["roughness", "metallic", "base"])
+def test_notices_a_missing_map(part, material, monkeypatch):
+    name = material(MAPS.material)
+    truth, prepare = expected(MAPS, name), gloss.Gloss.prepare
+    constant = {"roughness": 0.5, "metallic": 0.5, "base": mi.Color3f(0.4)}[part]
+    monkeypatch.setattr(
+        gloss.Gloss,
+        "prepare",
+        lambda look, cosine: prepare(look._replace(**{part: constant + look.metallic * 0}), cosine),
+    )
+    assert p_value(ours(MAPS, name), truth) < 1e-4
+
+
+def test_surfaces_with_relief_share_rays_with_others():
+    """Frames of their own change no expectation: a textured surface beside a plain one and another textured one."""
+    case = TEXTURED
+    others = ("gold-metallic-paint", "procedural:wood:1", "lambertian:0.9")
+    assert p_value(ours(case, case.material, extra=others), expected(case, case.material)) > 0.01
+    plain = ours(CASES[0], "lambertian:0.9", extra=("procedural:wood:1", "gold-metallic-paint"))
+    assert p_value(plain, expected(CASES[0], "lambertian:0.9")) > 0.01
 
 
 @pytest.mark.parametrize("index", [0, 1])

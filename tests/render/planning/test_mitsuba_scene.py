@@ -236,8 +236,9 @@ def test_folder_is_replaced_whole_or_left_alone(tmp_path):
     target = tmp_path / "scene"
     mitsuba_scene.save(target, PLAIN, support.plane())
     before = (target / "scene.xml").read_bytes()
-    with pytest.raises(InputError, match="unknown material"):
-        mitsuba_scene.save(target, replace(PLAIN, material="chrom"), support.plane())
+    for name, message in (("chrom", "unknown material"), ("procedural:wood:1", "stock Mitsuba has no such material")):
+        with pytest.raises(InputError, match=message):
+            mitsuba_scene.save(target, replace(PLAIN, material=name), support.plane())
     assert (target / "scene.xml").read_bytes() == before
     mitsuba_scene.save(target, replace(PLAIN, bounces=5), support.plane())
     assert 'name="max_depth" value="7"' in (target / "scene.xml").read_text(encoding="utf-8")

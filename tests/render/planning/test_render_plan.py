@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from render.materials import surfaces
-from render.planning import light_sets
+from render.planning import composition, light_sets
 from render.planning.framing import measure
 from render.planning.plan import DataConfig, is_validation, material_pool, plan
 from render.records.manifest import SceneSpec, View, read_manifest, write_manifest
@@ -426,3 +426,25 @@ def test_held_out_materials_are_seen_in_validation_only() -> None:
             assert scene.material in unseen
         else:
             assert scene == before[scene.id]
+
+
+def test_procedural_materials_are_drawn_anew_for_every_scene():
+    config = DataConfig(families={"blobby": 12}, materials=("procedural",), spatially_varying=0.5, validation=0)
+    names = [scene.material for scene in plan(config)]
+    assert all(name.startswith("procedural:") for name in names)
+    assert len(set(names)) == len(names) and len({name.split(":")[1] for name in names}) >= 6
+    assert [scene.material for scene in plan(config)] == names
+    for name in names:
+        surfaces.load(name)
+
+
+def test_procedural_materials_beside_others_are_weighed_and_stay_unmixed():
+    pool = ("metal", "procedural:wood", "lambertian:0.5")
+    config = DataConfig(families={"blobby": 40}, materials=pool, material_weights={"procedural": 20}, validation=0,
+                        spatially_varying=0.8)  # fmt: skip
+    names = [scene.material for scene in plan(config)]
+    textured = [name for name in names if "procedural" in name]
+    assert len(textured) > 60 and all(name.startswith("procedural:wood:") for name in textured)
+    counted = composition.compose(plan(config))
+    assert counted.categories["procedural-wood"] == len(textured)
+    assert counted.materials["procedural:wood"] == len(textured)
