@@ -96,16 +96,14 @@ def trace(
     emitters = place(camera, lights, distances)
     ray, sample = _camera_rays(camera, spp, seed, first)
     parallel = camera.parallel and isinstance(emitters, DistantLights)
-    pixel_count = size * size
     halves = highlights.half_vectors(camera, emitters, parallel) if any(surfaces.glossy) else None
     depths: list[Vertices] = []
     throughput = (mi.Color3f(1),) * len(surfaces)
     for depth in range(bounces + 1):
         found, uv = scene.ray_intersect(ray, depth == 0)
-        wi = -ray.d
+        wi, prim = -ray.d, found.prim_index
         # A one-sided BSDF is black from behind, so such paths end here, as they do in Mitsuba's `path`.
         alive = found.is_valid() & ((depth == 0) | (dr.dot(found.sh_frame.n, wi) > 0))
-        prim = found.prim_index
         # Together, or each gather below would trace the rays again.
         dr.eval(alive, found.p, found.n, found.sh_frame.n, wi, prim, uv, sample, throughput)
         kept = dr.compress(alive)
@@ -118,9 +116,9 @@ def trace(
         throughput = tuple(take(mi.Color3f, value, kept) for value in throughput)
         position, normal = take(mi.Point3f, found.p, kept), take(mi.Vector3f, found.sh_frame.n, kept)
         facet, wi = take(mi.Vector3f, found.n, kept), take(mi.Vector3f, wi, kept)
-        sample, prim, uv = take(mi.UInt32, sample, kept), take(mi.UInt32, prim, kept), take(mi.Point2f, uv, kept)
+        sample, uv, prim = take(mi.UInt32, sample, kept), take(mi.Point2f, uv, kept), take(mi.UInt32, prim, kept)
         dr.eval(position, normal, facet, wi, sample, prim, uv, throughput)
-        segments = _segments(sample, spp, pixel_count)
+        segments = _segments(sample, spp, size * size)
         rays = (scene, position, normal, facet, emitters, len(lights))
         if depth == 0 and probe:
             probes = sample % opaque(mi.UInt32(spp)) < opaque(mi.UInt32(probe_count(spp)))
@@ -129,17 +127,16 @@ def trace(
             seen = visibility(*rays, coherent=depth == 0)
         centre, spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and halves else (None, None)
         covers = surfaces.at(Place(mi.Vector3f(position), normal, prim, uv), wi)  # weights, turned normals
-        depths.append(
-            Vertices(len(kept), position, normal, wi, sample, seen, throughput, *covers, centre, spread, *segments)
-        )
+        lit = position, normal, wi, sample, seen, throughput
+        depths.append(Vertices(len(kept), *lit, *covers, centre, spread, *segments))
         if depth < bounces:
             ray, factors = _bounce(depths[-1], facet, surfaces, seed, depth + 1, first, spp)
             throughput = tuple(value * factor for value, factor in zip(throughput, factors, strict=True))
     glints = None
     if halves and depths:
         glints = highlights.find(scene, camera, emitters, halves, len(lights), surfaces, spp, seed, first)
-    sums = _sums(depths, camera, surfaces)
-    return Paths(tuple(depths), glints, emitters, parallel, halves, len(lights), size, spp, *sums)
+    shared = emitters, parallel, halves, len(lights), size, spp
+    return Paths(tuple(depths), glints, *shared, *_sums(depths, camera, surfaces))
 
 
 def take(kind: type, source: Any, index: Any) -> Any:
