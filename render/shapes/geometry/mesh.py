@@ -1,5 +1,7 @@
 """The one mesh type of the renderer, and reading it from files."""
 
+import gzip
+import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -166,26 +168,45 @@ def load_mesh(path: str | Path) -> TriangleMesh:
     The parts of a scene are concatenated; see `from_trimesh`.
 
     Raises:
-        InputError: missing file, unreadable format, no triangles, or non-finite positions.
+        InputError: missing file, unreadable format, damaged content, no triangles, or non-finite positions.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh file")
     try:
-        scene = trimesh.load_scene(path, process=False)
-        geometry = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
-    # Every format has its own parser, and each fails in its own way on a damaged file.
+        return _read(path)
+    except InputError as error:
+        message = str(error)
+        raise error if message.startswith(str(path)) else InputError(f"{path}: {message}") from error
+    # Every format has its own parser, and each fails in its own way on a damaged file, or hands on damaged arrays.
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: cannot be read as a mesh ({reason})") from error
-    if not sum(len(part.faces) for part in geometry):
+
+
+def _read(path: Path) -> TriangleMesh:
+    """Read a mesh file; one that is compressed by gzip, as in `bunny.ply.gz`, is unpacked in memory."""
+    if path.suffix.lower() == ".gz":
+        with gzip.open(path) as file:
+            unpacked = io.BytesIO(file.read())
+        scene = trimesh.load_scene(unpacked, file_type=Path(path.stem).suffix[1:].lower(), process=False)
+    else:
+        scene = trimesh.load_scene(path, process=False)
+    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    if not parts:
         raise InputError(f"{path}: contains no triangles; export it as a surface mesh")
-    bare = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in geometry]
+    for part in parts:
+        if part.vertices.ndim != 2 or part.vertices.shape[1] != 3 or part.faces.ndim != 2 or part.faces.shape[1] != 3:
+            raise InputError(f"{path}: vertices and faces must have three columns; repair the file")
+        if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
+            raise InputError(f"{path}: a face names a vertex that the file does not hold; repair the file")
+    bare = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts]
     whole = trimesh.util.concatenate(bare)
     assert isinstance(whole, trimesh.Trimesh), type(whole)
-    known = [uv for part in geometry if (uv := _corner_uv(part)) is not None]
-    uv = np.concatenate(known) if len(known) == len(geometry) else None
-    return from_trimesh(whole, str(path), uv)
+    known = [uv for part in parts if (uv := _corner_uv(part)) is not None]
+    uv = np.concatenate(known) if len(known) == len(parts) else None
+    with np.errstate(over="ignore", invalid="ignore"):  # of positions beyond float32, which TriangleMesh refuses
+        return from_trimesh(whole, str(path), uv)
 
 
 def _corner_uv(mesh: trimesh.Trimesh) -> np.ndarray | None:

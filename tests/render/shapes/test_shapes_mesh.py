@@ -1,5 +1,7 @@
 """TriangleMesh and reading meshes from files."""
 
+import gzip
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,6 +9,7 @@ import trimesh
 from render import shapes
 from render.shapes.geometry.mesh import TriangleMesh, load_mesh, vertex_normals
 from render.shared.errors import InputError
+from render.shared.seeds import generator
 
 CUBE = trimesh.creation.box()
 
@@ -127,3 +130,31 @@ def test_unusable_files_are_one_line_errors(tmp_path, name, content, message):
     with pytest.raises(InputError, match=message) as caught:
         shapes.load(str(path))
     assert "\n" not in str(caught.value) and name in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb"])
+@pytest.mark.filterwarnings("ignore")
+def test_a_damaged_file_loads_or_ends_in_one_line_that_names_it(tmp_path, suffix):
+    sound = tmp_path / f"sound.{suffix}"
+    trimesh.creation.icosphere(subdivisions=1).export(sound)
+    content, path = sound.read_bytes(), tmp_path / f"damaged.{suffix}"
+    rng, refused = generator(0, "mutations", suffix), 0
+    for _ in range(120):
+        damaged = bytearray(content)
+        for place in rng.integers(len(damaged), size=rng.integers(1, 6)):
+            damaged[place] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            load_mesh(path).normalised()
+        except InputError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert 0 < refused < 120
+
+
+def test_a_compressed_file_is_the_same_mesh(tmp_path):
+    plain = tmp_path / "ball.ply"
+    trimesh.creation.icosphere(subdivisions=1).export(plain)
+    packed = tmp_path / "ball.ply.gz"
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    np.testing.assert_array_equal(load_mesh(packed).vertices, load_mesh(plain).vertices)
