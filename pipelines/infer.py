@@ -40,6 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--discontinuities", action="store_true", help="let the depth jump where slopes disagree")
     parser.add_argument("--refine", action="store_true",
                         help="refine normals and lights until a simple model explains the photographs")  # fmt: skip
+    parser.add_argument("--anyway", action="store_true",
+                        help="go on where a check of the photographs stops (the report says which)")  # fmt: skip
     using.add_arguments(parser)
     parser.add_argument("--self-test", action="store_true",
                         help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
@@ -74,7 +76,7 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     check_out(args.out, args.folder)
     photos = load(
         args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
-        gamma=args.gamma, names=args.images,
+        gamma=args.gamma, names=args.images, anyway=args.anyway,
     )  # fmt: skip
     findings = tuple(check(photos))
     height, width = photos.shape
@@ -82,7 +84,7 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
     return infer(
         photos, args.method, models=args.models, config=config, refine=args.refine,
-        discontinuities=args.discontinuities, findings=findings,
+        discontinuities=args.discontinuities, findings=findings, anyway=args.anyway,
     )  # fmt: skip
 
 

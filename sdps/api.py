@@ -33,6 +33,7 @@ from sdps.methods.parse import parse, refined
 from sdps.methods.runner import Runner
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load
+from sdps.photos.doubts import ANYWAY
 from sdps.surface.inferred import Inference, check_out
 from sdps.training.trainer import TrainingResult
 
@@ -56,6 +57,7 @@ def infer(
     refine: bool = False,
     discontinuities: bool = False,
     findings: tuple[Finding, ...] | None = None,
+    anyway: bool = False,
 ) -> Inference:
     """Estimate normals and lights of photographs.
 
@@ -69,6 +71,7 @@ def infer(
             `method`.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
+        anyway: Go on where the checks found an error. The method may still find that it cannot.
 
     Returns:
         Normals (H, W, 3), light directions (L, 3) and intensities (L,), and what follows from them: depth, albedo,
@@ -79,8 +82,8 @@ def infer(
     """
     findings = tuple(check(photos)) if findings is None else findings
     grave = next((finding for finding in findings if finding.level == "error"), None)
-    if grave is not None:
-        raise InputError(f"{photos.folder}: {grave.text}")
+    if grave is not None and not anyway:
+        raise InputError(f"{photos.folder}: {grave.text} ({ANYWAY})")
     runner = _runner(method, photos.light_directions is not None, models, config, refine)
     began = time.perf_counter()
     found = runner.estimate(photos, photos.mask, photos.light_directions, photos.intensities)

@@ -11,13 +11,20 @@ from sdps.photos.measures import Measures, measure, spread
 from sdps.photos.reading import Photographs
 
 LEVELS = ("error", "warning", "note")
-"""How grave a finding is: no result is to be expected, a worse one is, or merely worth knowing."""
+"""How grave a finding is.
+
+error: surely a fault of the pictures or files; `infer` stops, unless told to go on `anyway`.
+warning: it may be a fault or the object's nature (a mirror is black in most pictures); expect a worse result.
+note: worth knowing.
+"""
 
 _FEWEST, _FEW = 3, 8
 _SATURATED = 0.02
 _MANY_SATURATED = 0.5
 _BLACK, _DARK = 0.01, 0.05
+_NOTHING = 1e-3  # of full scale: a quarter of a code of 8 linear bits
 _SAME, _ALIKE = 0.02, 0.1
+_STEADY = 0.05  # relative deviation of the pictures' brightness; 0.1 for a flat object under lights 0 to 45 degrees off
 _LINE = 0.25
 _CONE = np.cos(np.radians(15.0))
 _FEW_CASTS = 0.05  # share of the pictures; on rendered glossy objects so many are flagged under lights all white
@@ -48,7 +55,8 @@ def check(photos: Photographs) -> list[Finding]:
         InputError: a file that can no longer be read.
     """
     measures = measure(photos)
-    found = [finding for rule in _RULES for finding in rule(photos, measures)]
+    found = [Finding("error", text) for text in photos.overridden]
+    found += [finding for rule in _RULES for finding in rule(photos, measures)]
     return sorted(found, key=lambda finding: LEVELS.index(finding.level))
 
 
@@ -66,12 +74,19 @@ def _count(photos: Photographs, _: Measures) -> Iterator[Finding]:
 
 
 def _brightness(photos: Photographs, measures: Measures) -> Iterator[Finding]:
-    typical = float(np.median(measures.levels))
-    if not photos.coding.floating and typical < _BLACK:
-        yield Finding("error", "The object is black in most pictures. Expose longer, or check the mask.")
+    typical, floating = float(np.median(measures.levels)), photos.coding.floating
+    if measures.peaks.max() <= (0.0 if floating else _NOTHING):
+        yield Finding("error", "The object is black in every picture. Expose longer, or check the mask.")
         return
-    black = measures.levels < _BLACK * max(typical, 1e-9)
-    if not photos.coding.floating:
+    mirror = not floating and typical < _BLACK
+    if mirror:
+        yield Finding(
+            "warning",
+            "The object is black in most pictures, but for some bright places, as mirrors and black gloss are. If it "
+            "is neither, expose longer, or check the mask.",
+        )
+    black = measures.peaks < _BLACK if mirror else measures.levels < _BLACK * max(typical, 1e-9)
+    if not floating and not mirror:
         black |= measures.levels < _BLACK / 4
         if float(measures.levels.max()) < _DARK:
             yield Finding("warning", "All pictures are very dark, so noise will show. Expose longer.")
@@ -126,10 +141,13 @@ def _light_spread(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     found = spread(measures.observations.mean(-1))[:3]
     values[: len(found)] = found
     if values[1] < _SAME:
+        brightness = measures.observations.mean((1, 2))
+        steady = brightness.std() < _STEADY * brightness.mean()
         yield Finding(
-            "error",
-            "The shading hardly changes between the pictures. Move the lamp around the object, switch all other lights "
-            "off, and check that the object is not flat.",
+            "error" if steady else "warning",
+            "The shading hardly changes between the pictures"
+            + (". " if steady else ", only the brightness of the whole, as on a flat object. ")
+            + "Move the lamp around the object, and switch all other lights off.",
         )
     elif values[1] < _ALIKE:
         yield Finding(

@@ -13,6 +13,7 @@ import numpy as np
 
 from render.shared.errors import InputError, unknown
 from render.shared.files import read_text, write_json
+from sdps.photos.doubts import Doubts
 
 FRAME = "x right, y up, z to the camera"
 """What lights.json states; no other is read."""
@@ -39,7 +40,7 @@ class Lights:
     notes: tuple[str, ...]
 
 
-def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up") -> Lights:
+def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up", doubts: Doubts | None = None) -> Lights:
     """Read one light per picture.
 
     Args:
@@ -47,6 +48,7 @@ def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up") -> 
             pictures' order; blanks, tabs, commas or semicolons between. Or lights.json.
         files: Names of the pictures, (L,).
         frame: Axes of the text: y-up, y-down, x-left, z-away, several joined by commas.
+        doubts: What becomes of lights that are not above the horizon; None refuses them.
 
     Raises:
         InputError: another number of rows, text for numbers, a vector that is zero or not above the horizon, an
@@ -67,7 +69,7 @@ def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up") -> 
     if (lengths < 1e-9).any():
         raise InputError(f"{path}: the light of {files[int(np.argmin(lengths))]} is 0 0 0; give its direction")
     directions = vectors / lengths[:, None]
-    _refuse_behind(path, directions, files)
+    _refuse_behind(path, directions, files, doubts or Doubts())
     notes = [f"lights are those of {path.name}, axes {frame}"]
     if np.abs(lengths - 1).max() > _LENGTH:
         notes.append(f"light vectors had lengths from {lengths.min():.3g} to {lengths.max():.3g}; they were normalised")
@@ -216,17 +218,16 @@ def _intensities(path: Path, values: np.ndarray, files: Sequence[str]) -> np.nda
     return values.squeeze(1).astype(np.float32) if values.shape[1] == 1 else values.astype(np.float32)
 
 
-def _refuse_behind(path: Path, directions: np.ndarray, files: Sequence[str]) -> None:
+def _refuse_behind(path: Path, directions: np.ndarray, files: Sequence[str], doubts: Doubts) -> None:
     """Refuse lights at or below the horizon, and say which flag helps."""
     behind = np.flatnonzero(directions[:, 2] <= 0)
     if not len(behind):
         return
     first = f"{path}: the light of {files[behind[0]]} has z = {directions[behind[0], 2]:.3g}, behind the object"
     if len(behind) == len(directions):
-        raise InputError(
-            f"{first}, as all others; if z points away from the camera there, add z-away to the frame flag"
+        doubts.stop(f"{first}, as all others; if z points away from the camera there, add z-away to the frame flag")
+    else:
+        doubts.stop(
+            f"{first} ({len(behind)} of {len(directions)}); leave these pictures out, or add z-away to the frame flag "
+            "if z points away from the camera"
         )
-    raise InputError(
-        f"{first} ({len(behind)} of {len(directions)}); leave these pictures out, or add z-away to the frame flag if z "
-        "points away from the camera"
-    )

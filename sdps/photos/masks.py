@@ -28,6 +28,9 @@ the University of Washington's set).
 
 _SMALLEST = 1e-4
 
+_STILL = 1e-6
+"""Standard deviation of the brightness under which a pixel does not change."""
+
 
 class Variation:
     """Mean and variance of every pixel's brightness (H, W), gathered image by image (Welford's recurrence)."""
@@ -41,6 +44,10 @@ class Variation:
         before = grey - self.mean
         self.mean += before / np.float32(self.count)
         self.squares += before * (grey - self.mean)
+
+    def changes(self) -> np.ndarray:
+        """Return where brightness changes by more than rounding does, (H, W) bool."""
+        return self.deviation() >= _STILL
 
     def deviation(self) -> np.ndarray:
         """Return the standard deviation over the images so far, (H, W) float32."""
@@ -56,13 +63,12 @@ def automatic_mask(variation: Variation) -> tuple[np.ndarray, str]:
     Returns:
         The mask (H, W) bool, the whole frame where object and background cannot be told apart, and one sentence that
         says which.
-
-    Raises:
-        InputError: nothing changes between the images.
     """
     changes = np.sqrt(variation.deviation())
-    if changes.max() < 1e-3:
-        raise InputError("nothing changes between the pictures; is the lamp on and moved? otherwise give a mask")
+    if not variation.changes().any():
+        return np.ones(changes.shape, bool), (
+            "nothing changes between the pictures, so the whole frame is taken for the object"
+        )
     threshold = threshold_otsu(changes)
     parts, count = ndimage.label(changes > threshold)  # 4-connected
     largest = 1 + int(np.argmax(np.bincount(parts.ravel())[1:])) if count else 1

@@ -30,6 +30,7 @@ class Measures:
     Attributes:
         observations: (L, P, 3) float32, the same pixels in all images.
         levels: (L,) 95th percentile of the brightness.
+        peaks: (L,) its maximum.
         outside: Mean brightness outside the mask over that inside; 0 where the mask is the frame.
         saturated: (L,) share of the pixels with a channel at full scale.
         casts: (L,) change of the light's colour, see `colour_casts`.
@@ -40,6 +41,7 @@ class Measures:
 
     observations: np.ndarray
     levels: np.ndarray
+    peaks: np.ndarray
     outside: float
     saturated: np.ndarray
     casts: np.ndarray
@@ -58,7 +60,7 @@ def measure(photos: Photographs) -> Measures:
     pixels = np.flatnonzero(photos.mask)
     sample = pixels[np.unique(np.linspace(0, len(pixels) - 1, _PIXELS).round().astype(int))]
     observations = np.empty((count, len(sample), 3), np.float32)
-    levels, saturated, outside = np.empty(count), np.empty(count), np.zeros(count)
+    levels, peaks, saturated, outside = np.empty(count), np.empty(count), np.empty(count), np.zeros(count)
     digests, settings, shifts = [], [], []
     tracker = Tracker(photos.mask)
     for number in progress_bar(range(count), desc="checking", unit="picture", delay=5):
@@ -70,13 +72,13 @@ def measure(photos: Photographs) -> Measures:
         observations[number] = image.reshape(-1, 3)[sample]
         inside, bright = image[photos.mask], grey[photos.mask]  # (Q, 3), (Q,)
         full = (inside >= photos.saturation).any(-1)
-        saturated[number], levels[number] = full.mean(), np.percentile(bright, 95)
+        saturated[number], levels[number], peaks[number] = full.mean(), np.percentile(bright, 95), bright.max()
         if len(pixels) < grey.size:
             rest = (grey.sum(dtype=np.float64) - bright.sum(dtype=np.float64)) / (grey.size - len(pixels))
             outside[number] = rest / max(float(bright.mean()), 1e-6)
     moved = second_look(tracker, shifts, lambda number: brightness(photos[number : number + 1][0]))
     casts = _casts(photos, observations)
-    return Measures(observations, levels, float(np.median(outside)), saturated, casts, digests, settings, moved)
+    return Measures(observations, levels, peaks, float(np.median(outside)), saturated, casts, digests, settings, moved)
 
 
 def _casts(photos: Photographs, observations: np.ndarray) -> np.ndarray:  # (L,)

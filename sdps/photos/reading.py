@@ -12,6 +12,7 @@ import numpy as np
 
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
+from sdps.photos.doubts import Doubts
 from sdps.photos.gamma import resolve_gamma
 from sdps.photos.light_files import Lights, read_intensities, read_lights
 from sdps.photos.listing import find_mask, list_pictures
@@ -35,13 +36,14 @@ class Photographs:
         shape: (H, W), once turned.
         bits: Per channel: 8 or 16, 32 of floating-point files (16 of half ones).
         gamma: The curve that was taken off: linear, srgb, or an exponent.
-        mask: (H, W) bool, not empty; every pixel in it is finite in all pictures.
+        mask: (H, W) bool, not empty; every pixel in it is finite in all pictures, but with `anyway`.
         mask_origin: `file` or `automatic`.
         light_directions: (L, 3) float32, unit, x right, y up, z to the camera, from the surface to the light; or None.
         intensities: (L,) or (L, 3) float32, relative; or None.
         notes: What was decided, in plain sentences.
         coding: Kind and depth of the files.
         orientation: EXIF orientation tag that all pictures were turned by.
+        overridden: Faults that would have stopped `load`, but for `anyway`.
     """
 
     folder: Path
@@ -56,6 +58,7 @@ class Photographs:
     notes: tuple[str, ...]
     coding: Coding
     orientation: int
+    overridden: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.files)
@@ -91,6 +94,7 @@ def load(
     frame: str = "y-up",
     gamma: str | float = "auto",
     names: Sequence[str] | None = None,
+    anyway: bool = False,
 ) -> Photographs:
     """Look through a folder of photographs of a static object under one distant light each, seen orthographically.
 
@@ -104,18 +108,22 @@ def load(
         frame: Axes of the lights file: y-up, y-down, x-left, z-away, several joined by commas.
         gamma: linear, srgb, the exponent of a power curve, or auto by kind of file and colour profile.
         names: Files or glob patterns to use, in this order; one that begins with `!` leaves files out.
+        anyway: Go on where a check stops although one could: values that are not finite in the mask, pictures that
+            never change without a mask, lights behind the object. `check` then lists these as errors.
 
     Raises:
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
     """
     folder = Path(folder)
     files, notes = list_pictures(folder, names)
-    survey = _survey(folder, files, gamma, find_mask(folder) if mask is None else Path(mask))
-    directions, strengths, told = _lights(folder, files, lights, intensities, frame)
+    doubts = Doubts(anyway)
+    survey = _survey(folder, files, gamma, find_mask(folder) if mask is None else Path(mask), doubts)
+    directions, strengths, told = _lights(folder, files, lights, intensities, frame, doubts)
     photos = Photographs(
         folder=folder, files=files, shape=survey.mask.shape, bits=survey.coding.bits, gamma=survey.gamma,
         mask=survey.mask, mask_origin=survey.origin, light_directions=directions, intensities=strengths,
         notes=(*notes, *survey.notes, *told), coding=survey.coding, orientation=survey.orientation,
+        overridden=tuple(doubts.overridden),
     )  # fmt: skip
     if photos.mask_origin == "automatic" and photos.mask.all():
         _LOG.warning("%s", next(note for note in photos.notes if "whole frame" in note))
@@ -134,7 +142,9 @@ class _Survey:
     notes: tuple[str, ...]
 
 
-def _survey(folder: Path, files: tuple[str, ...], gamma: str | float, mask_file: Path | None) -> _Survey:
+def _survey(
+    folder: Path, files: tuple[str, ...], gamma: str | float, mask_file: Path | None, doubts: Doubts
+) -> _Survey:
     """Decode every file once: all of one kind and size, finite in the mask, and the mask if it has to be found."""
     first = decode(folder / files[0])
     applied, why = resolve_gamma(gamma, first.coding, folder)
@@ -152,21 +162,17 @@ def _survey(folder: Path, files: tuple[str, ...], gamma: str | float, mask_file:
             broken[(broken < 0) & ~np.isfinite(pixels).all(-1)] = number
         if given is None:
             variation.add(brightness(to_linear(pixels, applied)))
-    notes = [why]
-    if len(turns) > 1:
-        notes.append(
-            "the pictures' orientation tags differ, as happens when the camera looks down; all were turned as the first"
-        )
-    elif first.orientation != 1:
-        notes.append("all pictures were turned upright as their orientation tag says")
+    notes = [why, *_orientation_note(first.orientation, turns)]
+    if given is None and not variation.changes().any():
+        doubts.stop(f"{folder}: nothing changes between the pictures; is the lamp on and moved? otherwise give a mask")
+    known = None if given is None or mask_file is None else (given, f"the mask is {mask_file.name}")
     try:
-        known = None if given is None or mask_file is None else (given, f"the mask is {mask_file.name}")
         mask, said = known or automatic_mask(variation)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
-    _refuse_broken(folder, files, broken, mask)
+    _refuse_broken(folder, files, broken, mask, doubts)
     if (broken >= 0).any():
-        notes.append("values that are not finite lie outside the mask and were set to 0")
+        notes.append("values that are not finite were set to 0")
     origin = "automatic" if given is None else "file"
     return _Survey(first.coding, applied, first.orientation, mask, origin, (*notes, said))
 
@@ -186,27 +192,40 @@ def _refuse_other(folder: Path, one: str, first: Picture, other: str, picture: P
         )
 
 
-def _refuse_broken(folder: Path, files: tuple[str, ...], broken: np.ndarray, mask: np.ndarray) -> None:
+def _refuse_broken(folder: Path, files: tuple[str, ...], broken: np.ndarray, mask: np.ndarray, doubts: Doubts) -> None:
     """Refuse values that are not finite inside the mask."""
     inside = broken[mask]
     bad = inside[inside >= 0]
     if len(bad):
         name = files[int(bad.min())]
-        raise InputError(
+        doubts.stop(
             f"{folder / name}: NaN or infinite values inside the mask ({len(bad)} pixels over all pictures); write it "
             "again or cut them out of the mask"
         )
 
 
+def _orientation_note(first: int, turns: set[int]) -> list[str]:
+    if len(turns) > 1:
+        return [
+            "the pictures' orientation tags differ, as happens when the camera looks down; all were turned as the first"
+        ]
+    return [] if first == 1 else ["all pictures were turned upright as their orientation tag says"]
+
+
 def _lights(
-    folder: Path, files: tuple[str, ...], lights: str | Path | None, intensities: str | Path | None, frame: str
+    folder: Path,
+    files: tuple[str, ...],
+    lights: str | Path | None,
+    intensities: str | Path | None,
+    frame: str,
+    doubts: Doubts,
 ) -> tuple[np.ndarray | None, np.ndarray | None, tuple[str, ...]]:
     """Read directions and intensities where asked for; frame flags without lights are checked all the same."""
     directions = strengths = None
     notes: tuple[str, ...] = ("lights are unknown and will be estimated, where the method can",)
     path = _beside(folder, lights, ("lights.json", "light_directions.txt"))
     if path is not None:
-        read: Lights = read_lights(path, files, frame)
+        read: Lights = read_lights(path, files, frame, doubts)
         directions, strengths, notes = read.directions, read.intensities, read.notes
     second = _beside(folder, intensities, ("light_intensities.txt",))
     if second is None and path is not None and path.name == "light_directions.txt" and str(lights) == "folder":

@@ -11,9 +11,16 @@ import trimesh
 
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_path
+from sdps.photos.response import to_linear
 from sdps.surface.integration import Depth
 
 FORMATS = (".ply", ".obj", ".glb")
+
+_MATT = {
+    "name": "matt",
+    "pbrMetallicRoughness": {"baseColorFactor": [1.0] * 4, "metallicFactor": 0.0, "roughnessFactor": 1.0},
+}
+_COLOURS = "_COLOURS"  # trimesh writes attributes of our own in their own type, but COLOR_0 in 8 bits
 
 
 def unit_scale(shape: tuple[int, int]) -> float:
@@ -38,7 +45,7 @@ def mesh(
     Args:
         depth: Of `integrate`, or (H, W) z in pixels towards the camera.
         mask: (H, W) bool; that of `depth` if not given.
-        colour: (H, W, 3) uint8, colours of the vertices.
+        colour: (H, W, 3) uint8, sRGB colours of the vertices.
         normals: (H, W, 3), normals of the vertices, not those of the triangles around them.
         steepest: Leave out triangles with an edge that rises by more pixels than this per pixel, such as walls across
             discontinuities; None keeps all.
@@ -73,6 +80,9 @@ def mesh(
 def write_mesh(surface: trimesh.Trimesh, path: str | Path) -> None:
     """Write a mesh with its normals and colours, whole or not at all, as .ply (binary), .obj or .glb.
 
+    A .glb has a matt material and linear colours of 16 bits, as glTF 2.0 (3.7.2.1) wants them; in the others they stay
+    sRGB's of 8 bits.
+
     Raises:
         InputError: another suffix, or a disk that refuses the file.
     """
@@ -83,10 +93,35 @@ def write_mesh(surface: trimesh.Trimesh, path: str | Path) -> None:
     options: dict[str, dict[str, Any]] = {
         ".ply": {"vertex_normal": True},
         ".obj": {"include_normals": True, "include_color": True},
+        ".glb": {"include_normals": True, "tree_postprocessor": _matt},
     }
-    data: Any = surface.export(file_type=suffix[1:], **options.get(suffix, {"include_normals": True}))
+    written = _linear(surface) if suffix == ".glb" else surface
+    data: Any = written.export(file_type=suffix[1:], **options[suffix])
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def _linear(surface: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the mesh with its colours as an attribute of linear 16-bit RGBA."""
+    colours = {}
+    if surface.visual.kind == "vertex":
+        rgb = np.rint(to_linear(surface.visual.vertex_colors[:, :3], "srgb") * 65535)
+        colours[_COLOURS] = np.pad(rgb, ((0, 0), (0, 1)), constant_values=65535).astype(np.uint16)  # (v, 4)
+    return trimesh.Trimesh(
+        vertices=surface.vertices, faces=surface.faces, vertex_normals=surface.vertex_normals,
+        vertex_attributes=colours, process=False,
+    )  # fmt: skip
+
+
+def _matt(tree: dict[str, Any]) -> None:
+    """Give the mesh of a glTF tree its material, and its colours their name."""
+    tree["materials"] = [_MATT]
+    for part in tree["meshes"][0]["primitives"]:
+        part["material"] = 0
+        place = part["attributes"].pop(_COLOURS, None)
+        if place is not None:
+            part["attributes"]["COLOR_0"] = place
+            tree["accessors"][place]["normalized"] = True
 
 
 def _checked(

@@ -194,6 +194,19 @@ def test_folders_and_methods_that_do_not_fit_are_one_line(hills: tuple, tmp_path
     assert not out.exists()
 
 
+def test_one_flag_goes_on_where_a_check_stops(hills: tuple, tmp_path: Path, capsys) -> None:
+    folder, _, mask = hills
+    images = load(folder)[0:2]
+    pair = folders.write_folder(tmp_path / "pair", np.clip(images * [[[[1.0]]], [[[0.5]]]], 0, 1), mask)
+    (pair / "lights.txt").write_text("\n".join(" ".join(map(str, light)) for light in LIGHTS[:2]))
+    flags = [pair, "--lights", pair / "lights.txt", "--method", "psfcn", "--out", tmp_path / "out"]
+    assert fails(capsys, *flags).endswith("Take more. (--anyway goes on all the same)")
+    assert main(["infer", *map(str, flags), "--anyway"]) == 0, capsys.readouterr().err
+    found = json.loads((tmp_path / "out" / "result.json").read_text())["findings"]
+    assert found[0]["level"] == "error" and "Only 2 pictures" in found[0]["text"]
+    assert "Only 2 pictures" in (tmp_path / "out" / "report.html").read_text()
+
+
 def test_a_corrupt_file_among_good_ones_leaves_nothing(hills: tuple, tmp_path: Path, capsys) -> None:
     images = np.random.default_rng(0).random((4, 32, 32, 3)).astype(np.float32)
     folder = folders.write_folder(tmp_path / "photos", images)

@@ -8,7 +8,6 @@ import photo_folders as folders
 import pytest
 from PIL import Image
 
-from render.shared.errors import InputError
 from sdps import photos
 from sdps.photos.checks import Finding
 from sdps.photos.masks import Variation, automatic_mask
@@ -85,8 +84,9 @@ def test_nothing_lit_has_no_mask() -> None:
     variation = Variation((20, 20))
     for _ in range(4):
         variation.add(np.full((20, 20), 0.3, np.float32))
-    with pytest.raises(InputError, match="nothing changes"):
-        automatic_mask(variation)
+    assert not variation.changes().any()
+    mask, said = automatic_mask(variation)
+    assert mask.all() and "nothing changes" in said
 
 
 def test_variation_is_the_standard_deviation() -> None:
@@ -120,8 +120,37 @@ def test_saturated_and_black_pictures_are_named(tmp_path: Path, bits: int) -> No
 def test_dark_and_black_folders(tmp_path: Path) -> None:
     images, mask = folders.matte(AROUND)
     assert said(findings(tmp_path / "dim", images * 0.04, mask), "very dark")
-    assert said(findings(tmp_path / "black", images * 0.004, mask), "black in most")[0].level == "error"
+    assert said(findings(tmp_path / "darker", images * 0.004, mask), "black in most")[0].level == "warning"
+    (only,) = said(findings(tmp_path / "black", images * 0.0005, mask), "black")
+    assert only.level == "error" and "every picture" in only.text
+    assert said(findings(tmp_path / "nothing", images * 0, mask, suffix=".exr"), "black in every")[0].level == "error"
     assert not serious(findings(tmp_path / "exr", images * 0.004, mask, suffix=".exr"))  # has no full scale
+
+
+def test_a_mirror_is_no_error_and_a_lamp_that_was_off_is_still_named(tmp_path: Path) -> None:
+    images, mask = folders.matte(AROUND, shape="sphere", size=128)
+    normals, inside = scenes.sphere(128)
+    half = AROUND + np.array([0, 0, 1])
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    images[:] = 0
+    for image, direction in zip(images, half, strict=True):
+        image[mask] = (normals[inside] @ direction > np.cos(np.radians(4)))[:, None]  # nothing but the lamp's picture
+    images[5] = 0
+    found = findings(tmp_path, images, mask)
+    assert not [finding.text for finding in found if finding.level == "error"]
+    assert said(found, "black in most pictures")[0].level == "warning"
+    assert said(found, "Was the lamp off")[0].images == ("6.png",)
+
+
+def test_a_flat_object_is_no_error_but_one_light_is(tmp_path: Path) -> None:
+    level = np.cos(np.radians(np.linspace(5, 60, 12)))[:, None, None, None]
+    noise = np.random.default_rng(0).normal(0, folders.NOISE, (12, 60, 60, 3))
+    flat = np.clip(0.8 * level + noise, 0, 1).astype(np.float32)
+    mask = np.ones((60, 60), bool)
+    (only,) = said(findings(tmp_path / "flat", flat, mask), "hardly changes")
+    assert only.level == "warning" and "flat object" in only.text
+    (only,) = said(findings(tmp_path / "lamp", np.clip(0.6 + noise, 0, 1), mask), "hardly changes")
+    assert only.level == "error"
 
 
 @pytest.mark.parametrize("lights", [AROUND, OPPOSITE], ids=["around", "opposite"])

@@ -282,6 +282,21 @@ def test_pictures_that_never_change_have_no_automatic_mask(good: Path) -> None:
     for number in range(1, 6):
         folders.write(good / f"{number}.png", RAMP, 16)
     assert "nothing changes between the pictures" in refusal(good)
+    read = photos.load(good, anyway=True)
+    assert read.mask.all() and "nothing changes" in " ".join(read.overridden)
+
+
+def test_what_stops_can_be_overridden_and_is_then_an_error_found(tmp_path: Path) -> None:
+    broken = PAIR.copy()
+    broken[1, 5, 5, 1] = np.inf
+    folders.write_folder(tmp_path, broken, WHOLE, suffix=".exr")
+    (tmp_path / "lights.txt").write_text("0 0 1\n0 1 -.1\n")
+    asked = {"lights": tmp_path / "lights.txt"}
+    assert refusal(tmp_path, **asked).endswith("(--anyway goes on all the same)")
+    read = photos.load(tmp_path, **asked, anyway=True)
+    assert ["NaN" in read.overridden[0], "behind the object" in read.overridden[1]] == [True, True]
+    assert read[1:2][0, 5, 5, 1] == 0 and read.light_directions[1, 2] < 0
+    assert [f.text for f in photos.check(read) if f.level == "error"][:2] == list(read.overridden)
 
 
 def test_a_file_that_changes_while_in_use(good: Path) -> None:

@@ -1,6 +1,8 @@
 """The mesh: frame, units, winding, colours, holes, and files read back by trimesh."""
 
 import io
+import json
+import struct
 
 import numpy as np
 import pytest
@@ -103,7 +105,42 @@ def test_files_read_back(tmp_path, surface, suffix):
         parts = READERS[suffix](handle if suffix != ".obj" else io.TextIOWrapper(handle))
     parts = next(iter(parts["geometry"].values())) if "geometry" in parts else parts
     assert np.allclose(parts["vertex_normals"], shape.vertex_normals, atol=1e-5)
-    assert np.array_equal(back.visual.vertex_colors[:, :3], shape.visual.vertex_colors[:, :3])
+    colours = shape.visual.vertex_colors[:, :3]
+    if suffix == ".glb":
+        assert back.visual.material.metallicFactor == 0.0
+        return
+    assert np.array_equal(back.visual.vertex_colors[:, :3], colours)
+
+
+def chunks(path):
+    """Return the JSON of a .glb and its bytes, read by the specification (glTF 2.0, 4.4)."""
+    data = path.read_bytes()
+    assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON" and struct.unpack_from("<4s", data, 24 + length) == (b"BIN\0",)
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def test_glb_is_matt_and_its_colours_are_linear(tmp_path, surface):
+    write_mesh(surface[0], tmp_path / "object.glb")
+    tree, data = chunks(tmp_path / "object.glb")
+    (part,) = tree["meshes"][0]["primitives"]
+    look = tree["materials"][part["material"]]["pbrMetallicRoughness"]
+    assert look == {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
+    assert set(part["attributes"]) == {"POSITION", "NORMAL", "COLOR_0"}
+    accessor = tree["accessors"][part["attributes"]["COLOR_0"]]
+    assert (accessor["componentType"], accessor["type"], accessor["normalized"]) == (5123, "VEC4", True)
+    begin = tree["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    found = np.frombuffer(data, "<u2", 4 * accessor["count"], begin).reshape(-1, 4) / 65535
+    coded = surface[0].visual.vertex_colors[:, :3] / 255
+    linear = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(found, np.pad(linear, ((0, 0), (0, 1)), constant_values=1), atol=1e-5)
+
+
+def test_glb_without_colours_is_matt_as_well(tmp_path, dome):
+    write_mesh(mesh(dome[0]), tmp_path / "object.glb")
+    (part,) = chunks(tmp_path / "object.glb")[0]["meshes"][0]["primitives"]
+    assert part["material"] == 0 and "COLOR_0" not in part["attributes"]
 
 
 def test_refusals(tmp_path, dome):
