@@ -18,6 +18,7 @@ RATES = {
     "normals": 0.01,
     "log_albedo": 0.02,
     "log_strength": 0.05,
+    "body": 0.01,
     "lobes": 0.05,
     "log_sharpness": 0.01,
     "directions": 0.003,
@@ -35,6 +36,7 @@ class Weights(NamedTuple):
         albedo: Of the roughness of the albedos' logarithms. Few and even colours tell how a relief is stretched.
         gloss: Of the roughness of the strengths' logarithms.
         gloss_size: Of their squares, within `gloss`.
+        body: Of the length of b: how far the body is from Lambertian.
         curl: Of the curl, at the start and at the end; in between it falls exponentially.
         shift: Of where the lights point on average, likewise. Networks tell that well, and highlights, once found,
             better.
@@ -44,6 +46,7 @@ class Weights(NamedTuple):
     albedo: float = 0.05
     gloss: float = 0.003
     gloss_size: float = 0.1
+    body: float = 0.01
     curl: tuple[float, float] = (0.6, 0.1)
     shift: tuple[float, float] = (10.0, 0.03)
 
@@ -117,6 +120,7 @@ def _priors(
     loss = weights.smooth * roughness(made.normals, beside)
     loss = loss + _falling(weights.curl, part) * curl(made.normals, beside)
     loss = loss + weights.albedo * roughness(state.log_albedo, beside)
+    loss = loss + weights.body * (state.body.pow(2).sum() + 0.01).sqrt()
     gloss = state.log_strength
     return loss + weights.gloss * (roughness(gloss, beside) + weights.gloss_size * (gloss**2).mean())
 

@@ -12,13 +12,24 @@ from numba import types
 from numba.extending import intrinsic
 from torch import Tensor
 
-from sdps.refinement.image_model import DATA_FLOOR, LOBES, ROBUST, SHADE_FLOOR, SHADOW_EXCESS, SHADOW_WEIGHT, Factors
+from sdps.refinement.image_model import (
+    DATA_FLOOR,
+    LEAST_COSINE,
+    LOBES,
+    ROBUST,
+    SHADE_FLOOR,
+    SHADOW_EXCESS,
+    SHADOW_WEIGHT,
+    SHAPES,
+    Factors,
+)  # fmt: skip
 
 BLOCKS = 64
 """Parts the pixels are cut into. Sums are taken part by part, so results do not depend on the number of threads."""
 _FLOOR, _ROBUST, _SHADE = np.float32(DATA_FLOOR), np.float32(ROBUST), np.float32(SHADE_FLOOR)
 _EXCESS, _WEIGHT = np.float32(SHADOW_EXCESS), np.float32(SHADOW_WEIGHT)
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_LEAST = np.float32(LEAST_COSINE)
+_ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
 
 def _read_bits(context: Any, value: Any) -> Any:
@@ -35,9 +46,9 @@ _bits: Any = intrinsic(_read_bits)
 
 @numba.njit(inline="always", fastmath=True)
 def _exp(x: Any) -> Any:
-    """Return e^x for x <= 0 to 1e-6 of it, in operations that run on several values at once; `math.exp` does not."""
-    y = max(x, np.float32(-80.0)) * np.float32(1.44269504)
-    whole = np.int32(y - np.float32(0.5))  # rounds to the nearest, since y <= 0
+    """Return e^x for x <= 40 to 1e-6 of it, in operations that run on several values at once; `math.exp` does not."""
+    y = min(max(x, np.float32(-80.0)), np.float32(40.0)) * np.float32(1.44269504)
+    whole = np.int32(np.int32(y - np.float32(64.5)) + np.int32(64))  # rounds to the nearest, since y <= 64
     part = (y - np.float32(whole)) * np.float32(0.69314718)
     series = np.float32(1.0 / 720.0) * part + np.float32(1.0 / 120.0)
     series = series * part + np.float32(1.0 / 24.0)
@@ -47,39 +58,105 @@ def _exp(x: Any) -> Any:
     return series * _bits((whole + np.int32(127)) << np.int32(23))
 
 
+@numba.njit(inline="always", fastmath=True)
+def _angles(cosine: Any, view: Any, across: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """Return x, y, n.l held above the least, what o is divided by, and o; of n.l, n.v and l.v."""
+    light = max(cosine, _LEAST)
+    gap = across - light * view
+    below = max(light, view) if gap > _ZERO else _ONE
+    return _ONE - light, _ONE - view, light, below, gap / below
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _highlights(
+    n: Any, lights: np.ndarray, half: np.ndarray, amplitudes: np.ndarray, sharpness: np.ndarray, lag: np.ndarray,
+    lobes: np.ndarray, bright: np.ndarray, slope: np.ndarray,
+) -> None:  # fmt: skip
+    """Write n.h - 1, the lobes over (l.h)^2, their sum and its derivative by n.h."""
+    for i in range(len(lag)):
+        lag[i] = min(n[0] * half[0, i] + n[1] * half[1, i] + n[2] * half[2, i] - _ONE, _ZERO)
+        bright[i] = _ZERO
+        slope[i] = _ZERO
+    for k in range(LOBES):
+        height, sharp = amplitudes[k], sharpness[k]
+        for i in range(len(lag)):
+            value = _exp(sharp * lag[i]) * (_TWO / (_ONE + lights[2, i]))
+            lobes[k, i] = value
+            bright[i] += height * value
+            slope[i] += height * sharp * value
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _matte(n: Any, body: np.ndarray, lights: np.ndarray, matte: np.ndarray) -> None:
+    """Write D."""
+    first, second, third, last = body[0], body[1], body[2], body[3]
+    view = max(n[2], _LEAST)
+    for i in range(len(matte)):
+        cosine = n[0] * lights[0, i] + n[1] * lights[1, i] + n[2] * lights[2, i]
+        x, y, _, _, o = _angles(cosine, view, lights[2, i])
+        matte[i] = _exp(first * (x + y) + second * x * y + third * (x * x + y * y) + last * o)
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _matte_gradient(
+    n: Any, body: np.ndarray, lights: np.ndarray, change: np.ndarray, own: np.ndarray, shape: np.ndarray
+) -> tuple[Any, Any, Any]:
+    """Add what relative changes of D (L,) are worth to the gradients of lights and body; return the normal's."""
+    first, second, third, last = body[0], body[1], body[2], body[3]
+    view, steep = max(n[2], _LEAST), _ONE if n[2] > _LEAST else _ZERO
+    gx = gy = gz = b0 = b1 = b2 = b3 = _ZERO
+    for i in range(len(change)):
+        cosine = n[0] * lights[0, i] + n[1] * lights[1, i] + n[2] * lights[2, i]
+        x, y, facing, below, o = _angles(cosine, view, lights[2, i])
+        worth = change[i]
+        b0 += worth * (x + y)
+        b1 += worth * x * y
+        b2 += worth * (x * x + y * y)
+        b3 += worth * o
+        turned = last / below
+        bend = turned * max(o, _ZERO)
+        nearer = _ONE if facing > view else _ZERO
+        by_light = first + second * y + _TWO * third * x + turned * view + bend * nearer
+        by_light = -worth * by_light if cosine > _LEAST else _ZERO
+        by_view = first + second * x + _TWO * third * y + turned * facing + bend * (_ONE - nearer)
+        gx += by_light * lights[0, i]
+        gy += by_light * lights[1, i]
+        gz += by_light * lights[2, i] - worth * by_view * steep
+        own[0, i] += by_light * n[0]
+        own[1, i] += by_light * n[1]
+        own[2, i] += by_light * n[2] + worth * turned
+    shape[0] += b0
+    shape[1] += b1
+    shape[2] += b2
+    shape[3] += b3
+    return gx, gy, gz
+
+
 @numba.njit(parallel=True, fastmath=True, cache=True, error_model="numpy")
 def _pass(
-    normals: np.ndarray, albedo: np.ndarray, strength: np.ndarray, amplitudes: np.ndarray, sharpness: np.ndarray,
-    lights: np.ndarray, half: np.ndarray, shares: np.ndarray, images: np.ndarray, kept: np.ndarray,
-    total: np.ndarray, pixel: np.ndarray, light: np.ndarray, lobe: np.ndarray,
+    normals: np.ndarray, albedo: np.ndarray, strength: np.ndarray, body: np.ndarray, amplitudes: np.ndarray,
+    sharpness: np.ndarray, lights: np.ndarray, half: np.ndarray, shares: np.ndarray, images: np.ndarray,
+    kept: np.ndarray, total: np.ndarray, pixel: np.ndarray, light: np.ndarray, lobe: np.ndarray, shape: np.ndarray,
 ) -> None:  # fmt: skip
     """Add up the term and its gradients.
 
-    Args: normals (P, 3), albedo (P, 3), strength (P,), amplitudes (K,), sharpness (K,), lights (3, L), half (3, L),
-    shares (3, L) reciprocal intensities, images (P, 3, L), kept (P, L) 0 or 1. Written: total (B,), pixel (P, 7) for
-    normals, albedo and strength, light (B, 9, L) for directions, half vectors and log intensities, lobe (B, 2, K).
+    Args: normals (P, 3), albedo (P, 3), strength (P,), body (4,), amplitudes (K,), sharpness (K,), lights (3, L),
+    half (3, L), shares (3, L) reciprocal intensities, images (P, 3, L), kept (P, L) 0 or 1. Written: total (B,),
+    pixel (P, 7) for normals, albedo and strength, light (B, 9, L) for directions, half vectors and log intensities,
+    lobe (B, 2, K), shape (B, 4).
     """
     count, lamps = images.shape[0], images.shape[2]
     for block in numba.prange(BLOCKS):
         lobes = np.empty((LOBES, lamps), np.float32)
         lag, bright, slope = np.empty(lamps, np.float32), np.empty(lamps, np.float32), np.empty(lamps, np.float32)
-        pull = np.empty(lamps, np.float32)
+        pull, matte, change = (np.empty(lamps, np.float32), np.empty(lamps, np.float32), np.empty(lamps, np.float32))
         own = light[block]
         summed = 0.0
         for p in range(block * count // BLOCKS, (block + 1) * count // BLOCKS):
             nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
-            scale = strength[p]
-            for i in range(lamps):
-                lag[i] = min(nx * half[0, i] + ny * half[1, i] + nz * half[2, i] - _ONE, _ZERO)
-                bright[i] = _ZERO
-                slope[i] = _ZERO
-            for k in range(LOBES):
-                height, sharp = amplitudes[k], sharpness[k]
-                for i in range(lamps):
-                    value = _exp(sharp * lag[i])
-                    lobes[k, i] = value
-                    bright[i] += height * value
-                    slope[i] += height * sharp * value
+            n, scale = (nx, ny, nz), strength[p]
+            _highlights(n, lights, half, amplitudes, sharpness, lag, lobes, bright, slope)
+            _matte(n, body, lights, matte)
             r0, r1, r2 = albedo[p, 0], albedo[p, 1], albedo[p, 2]
             term = gx = gy = gz = g0 = g1 = g2 = gs = _ZERO
             for i in range(lamps):
@@ -91,8 +168,11 @@ def _pass(
                 y0 = images[p, 0, i] * shares[0, i]
                 y1 = images[p, 1, i] * shares[1, i]
                 y2 = images[p, 2, i] * shares[2, i]
-                s0, s1, s2 = r0 * floor, r1 * floor, r2 * floor
-                d0, d1, d2 = (r0 + gloss) * shade - y0, (r1 + gloss) * shade - y1, (r2 + gloss) * shade - y2
+                value = matte[i]
+                o0, o1, o2 = r0 * value, r1 * value, r2 * value
+                f0, f1, f2 = o0 + gloss, o1 + gloss, o2 + gloss
+                s0, s1, s2 = f0 * floor, f1 * floor, f2 * floor
+                d0, d1, d2 = f0 * shade - y0, f1 * shade - y1, f2 * shade - y2
                 a0, a1, a2 = _ONE / (s0 * s0 + _FLOOR), _ONE / (s1 * s1 + _FLOOR), _ONE / (s2 * s2 + _FLOOR)
                 e0, e1, e2 = (np.sqrt(d0 * d0 * a0 + _ROBUST), np.sqrt(d1 * d1 * a1 + _ROBUST),
                               np.sqrt(d2 * d2 * a2 + _ROBUST))  # fmt: skip
@@ -101,28 +181,30 @@ def _pass(
                 w2 = kept[p, i] * (_WEIGHT if d2 > _EXCESS * s2 else _ONE)
                 term += w0 * e0 + w1 * e1 + w2 * e2
                 q0, q1, q2 = w0 * d0 * a0 / e0, w1 * d1 * a1 / e1, w2 * d2 * a2 / e2
-                g0 += q0 * shade
-                g1 += q1 * shade
-                g2 += q2 * shade
+                g0 += q0 * shade * value
+                g1 += q1 * shade * value
+                g2 += q2 * shade * value
+                change[i] = (q0 * o0 + q1 * o1 + q2 * o2) * shade
                 glossy = (q0 + q1 + q2) * shade
                 gs += glossy * bright[i]
                 pull[i] = glossy * scale
-                by_cosine = lit * (q0 * (r0 + gloss) + q1 * (r1 + gloss) + q2 * (r2 + gloss))
+                by_cosine = lit * (q0 * f0 + q1 * f1 + q2 * f2)
                 by_lag = pull[i] * slope[i]
                 gx += by_cosine * lights[0, i] + by_lag * half[0, i]
                 gy += by_cosine * lights[1, i] + by_lag * half[1, i]
                 gz += by_cosine * lights[2, i] + by_lag * half[2, i]
                 own[0, i] += by_cosine * nx
                 own[1, i] += by_cosine * ny
-                own[2, i] += by_cosine * nz
+                own[2, i] += by_cosine * nz - pull[i] * bright[i] / (_ONE + lights[2, i])
                 own[3, i] += by_lag * nx
                 own[4, i] += by_lag * ny
                 own[5, i] += by_lag * nz
                 own[6, i] += q0 * y0
                 own[7, i] += q1 * y1
                 own[8, i] += q2 * y2
+            mx, my, mz = _matte_gradient(n, body, lights, change, own, shape[block])
             summed += float(term)
-            pixel[p, 0], pixel[p, 1], pixel[p, 2] = gx, gy, gz
+            pixel[p, 0], pixel[p, 1], pixel[p, 2] = gx + mx, gy + my, gz + mz
             pixel[p, 3], pixel[p, 4], pixel[p, 5] = g0, g1, g2
             pixel[p, 6] = gs
             for k in range(LOBES):
@@ -141,21 +223,23 @@ class _DataTerm(torch.autograd.Function):
     @staticmethod
     def forward(context: Any, images: Tensor, kept: Tensor, *parts: Tensor) -> Tensor:
         arrays = (part.detach().numpy() for part in parts)
-        normals, albedo, strength, amplitudes, sharpness, directions, half, logs = arrays
+        normals, albedo, strength, body, amplitudes, sharpness, directions, half, logs = arrays
         count, lamps = images.shape[0], images.shape[2]
         total, pixel = np.zeros(BLOCKS), np.empty((count, 7), np.float32)
         light, lobe = np.zeros((BLOCKS, 9, lamps), np.float32), np.zeros((BLOCKS, 2, LOBES), np.float32)
+        shape = np.zeros((BLOCKS, SHAPES), np.float32)
         _pass(
-            normals, albedo, strength, amplitudes, sharpness, np.ascontiguousarray(directions.T),
+            normals, albedo, strength, body, amplitudes, sharpness, np.ascontiguousarray(directions.T),
             np.ascontiguousarray(half.T), np.ascontiguousarray(np.exp(-logs.T)), images.numpy(), kept.numpy(), total,
-            pixel, light, lobe,
+            pixel, light, lobe, shape,
         )  # fmt: skip
         scale = 1.0 / images.numel()
         lights = light.sum(axis=0, dtype=np.float64) * scale  # (9, L)
         heights, sharps = lobe.sum(axis=0, dtype=np.float64) * scale
         pixel *= scale
         of_pixels = pixel[:, :3], pixel[:, 3:6], pixel[:, 6]
-        found = (*of_pixels, heights, sharps, lights[:3].T, lights[3:6].T, lights[6:].T)
+        shapes = shape.sum(axis=0, dtype=np.float64) * scale
+        found = (*of_pixels, shapes, heights, sharps, lights[:3].T, lights[3:6].T, lights[6:].T)
         context.save_for_backward(*(torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in found))
         return torch.tensor(total.sum() * scale)
 

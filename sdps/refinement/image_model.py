@@ -1,12 +1,15 @@
-"""The image-formation model: a Lambertian surface with white highlights, directional lights, robust differences.
+"""The image-formation model: a coloured body with white highlights, directional lights, robust differences.
 
 Pixel p, image i, channel c; n unit normal, l unit direction to the light, v = (0, 0, 1), h = (l + v) / |l + v|:
 
-    q_pic = (rho_pc + S_pi) max(n_p . l_i, 0)                                           predicted radiance
-    S_pi  = s_p sum_k a_k exp(kappa_k (n_p . h_i - 1))                                  spherical Gaussians
+    q_pic = (rho_pc D_pi + S_pi) max(n_p . l_i, 0)                                      predicted radiance
+    D_pi  = exp(b_1 (x + y) + b_2 x y + b_3 (x^2 + y^2) + b_4 o)                        body; 1 is Lambertian
+    x, y  = 1 - n . l, 1 - n . v                                                        at grazing angles
+    o     = (l . v - n . l n . v) / (max(n . l, n . v) if positive, else 1)             towards the light, and away
+    S_pi  = s_p sum_k a_k exp(kappa_k (n_p . h_i - 1)) / (l_i . h_i)^2                  spherical Gaussians
     y_pic = I_pic / e_ic                                                                radiance under equal lights
     r_pic = w_pic sqrt((q_pic - y_pic)^2 / (sigma_pic^2 + 0.05) + 1e-4)                 robust difference
-    sigma_pic = rho_pc max(n_p . l_i, 0.05)                                             constant in the gradient
+    sigma_pic = (rho_pc D_pi + S_pi) max(n_p . l_i, 0.05)                               constant in the gradient
 
 with I divided by its mean over the object, and e by its own mean. w is 0 where a pixel is black although it is lit
 elsewhere (`shadowed`), 0.15 where it is darker than the model explains by half of sigma (a cast shadow), else 1.
@@ -20,6 +23,11 @@ from torch import Tensor
 from torch.nn.functional import normalize, softplus
 
 LOBES = 8
+SHAPES = 4
+"""Numbers b that say how the body's reflectance depends on the angles. o is the term of Oren and Nayar (1994) as
+Fujii writes it: cos(azimuth between l and v) sin sin / max(cos, cos)."""
+LEAST_COSINE = 0.02
+"""Cosines in D are held above it."""
 DATA_FLOOR = 0.05
 """Added to the squared scale of a difference, so that dark pixels do not outweigh bright ones."""
 ROBUST = 1e-4
@@ -35,6 +43,7 @@ class State(NamedTuple):
         normals: (P, 3) towards unit length.
         log_albedo: (P, 3) logarithm of rho.
         log_strength: (P,) logarithm of s.
+        body: (4,) b.
         lobes: (K,) a_k before softplus.
         log_sharpness: (K,) logarithm of kappa.
         directions: (L, 3) from the surface to the light, towards unit length.
@@ -44,6 +53,7 @@ class State(NamedTuple):
     normals: Tensor
     log_albedo: Tensor
     log_strength: Tensor
+    body: Tensor
     lobes: Tensor
     log_sharpness: Tensor
     directions: Tensor
@@ -57,6 +67,7 @@ class Factors(NamedTuple):
         normals: (P, 3) unit.
         albedo: (P, 3).
         strength: (P,).
+        body: (4,).
         amplitudes: (K,).
         sharpness: (K,).
         directions: (L, 3) unit.
@@ -67,6 +78,7 @@ class Factors(NamedTuple):
     normals: Tensor
     albedo: Tensor
     strength: Tensor
+    body: Tensor
     amplitudes: Tensor
     sharpness: Tensor
     directions: Tensor
@@ -82,6 +94,7 @@ def factors(state: State) -> Factors:
         normals=normals,
         albedo=state.log_albedo.exp(),
         strength=state.log_strength.exp(),
+        body=state.body,
         amplitudes=softplus(state.lobes),
         sharpness=state.log_sharpness.exp(),
         directions=directions,
@@ -111,18 +124,29 @@ def difference(made: Factors, images: Tensor, dark: Tensor) -> Tensor:  # (P, 3,
         dark: (P, L) bool, observations that count for nothing.
     """
     cosine = made.normals @ made.directions.T  # (P, L)
-    predicted = predict(made)
+    reflected = reflectance(made)
     observed = images / made.log_intensities.exp().T  # (P, 3, L)
-    sigma = (made.albedo[..., None] * cosine.clamp_min(SHADE_FLOOR)[:, None]).detach()
-    gap = predicted - observed
+    sigma = (reflected * cosine.clamp_min(SHADE_FLOOR)[:, None]).detach()
+    gap = reflected * cosine.clamp_min(0.0)[:, None] - observed
     weight = torch.where(gap > SHADOW_EXCESS * sigma, SHADOW_WEIGHT, 1.0) * ~dark[:, None]
     return weight * (gap**2 / (sigma**2 + DATA_FLOOR) + ROBUST).sqrt()
 
 
-def predict(made: Factors) -> Tensor:  # (P, 3, L)
-    """Return q of the module's text."""
-    shade = (made.normals @ made.directions.T).clamp_min(0.0)  # (P, L)
+def reflectance(made: Factors) -> Tensor:  # (P, 3, L)
+    """Return rho D + S of the module's text."""
     lag = (made.normals @ made.half.T - 1.0).clamp_max(0.0)
     lobes = (made.amplitudes[:, None, None] * (made.sharpness[:, None, None] * lag).exp()).sum(dim=0)
-    specular = made.strength[:, None] * lobes  # (P, L)
-    return (made.albedo[..., None] + specular[:, None]) * shade[:, None]
+    # The denominator of a microfacet highlight, 4 n.l n.v, is 4 (l.h)^2 where n = h; and 2 (l.h)^2 = 1 + l.v.
+    specular = made.strength[:, None] * lobes * (2.0 / (1.0 + made.directions[:, 2]))  # (P, L)
+    return made.albedo[..., None] * body(made)[:, None] + specular[:, None]
+
+
+def body(made: Factors) -> Tensor:  # (P, L)
+    """Return D of the module's text."""
+    light = (made.normals @ made.directions.T).clamp_min(LEAST_COSINE)
+    view = made.normals[:, 2:].clamp_min(LEAST_COSINE)  # (P, 1)
+    x, y = 1.0 - light, 1.0 - view
+    across = made.directions[:, 2] - light * view
+    o = across / torch.where(across > 0.0, torch.maximum(light, view), 1.0)
+    shapes = torch.stack([x + y, x * y, x**2 + y**2, o])  # (4, P, L)
+    return torch.tensordot(made.body, shapes, 1).exp()

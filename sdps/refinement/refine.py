@@ -18,7 +18,7 @@ from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.refinement.descent import Problem, Weights, solve
-from sdps.refinement.image_model import LOBES, State, difference, factors, shadowed
+from sdps.refinement.image_model import LOBES, SHAPES, State, difference, factors, shadowed
 from sdps.refinement.refined import Refined
 
 _FEWEST = 4
@@ -167,6 +167,7 @@ def _start(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensitie
         normals=torch.from_numpy(np.array(normals, np.float32)),
         log_albedo=torch.zeros(count, 3),
         log_strength=torch.zeros(count),
+        body=torch.zeros(SHAPES),
         lobes=torch.full((LOBES,), _START_HEIGHT),
         log_sharpness=torch.linspace(np.log(_SHARPEST), np.log(_BROADEST), LOBES),
         directions=torch.from_numpy(np.array(lights, np.float32)),
@@ -238,6 +239,7 @@ def _result(scene: ObjectImages, problem: Problem, state: State) -> Refined:
         intensities=made.log_intensities.exp().numpy(),
         albedo=picture(made.albedo),
         strength=picture(made.strength),
+        body=made.body.numpy(),
         amplitudes=made.amplitudes.numpy(),
         sharpness=made.sharpness.numpy(),
         pixel_residual=picture(by_pixel),

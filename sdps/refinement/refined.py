@@ -15,6 +15,7 @@ class Refined:
         intensities: (L, 3) float32, mean 1.
         albedo: (H, W, 3) float32, zero outside the mask, up to a common factor.
         strength: (H, W) float32, of the highlights, zero outside the mask.
+        body: (4,) numbers b of the body's reflectance (`sdps.refinement.image_model`); 0 is Lambertian.
         amplitudes: (K,) of the lobes.
         sharpness: (K,) of the lobes.
         pixel_residual: (H, W) float32, mean robust difference, zero outside the mask.
@@ -26,6 +27,7 @@ class Refined:
     intensities: np.ndarray
     albedo: np.ndarray
     strength: np.ndarray
+    body: np.ndarray
     amplitudes: np.ndarray
     sharpness: np.ndarray
     pixel_residual: np.ndarray

@@ -40,6 +40,7 @@ def lit(normals: np.ndarray, count: int, seed: int, gloss: float = 0.0) -> tuple
     albedo = np.array([0.7, 0.5, 0.3])
     shade = np.maximum(np.einsum("hwc,lc->lhw", normals, lights), 0.0)[..., None]
     lobe = gloss * np.exp(40.0 * (np.einsum("hwc,lc->lhw", normals, half) - 1.0))[..., None]
+    lobe *= (2.0 / (1.0 + lights[:, 2]))[:, None, None, None]  # over (l.h)^2, as microfacets reflect
     intensities = rng.uniform(0.5, 1.5, count)
     return ((albedo + lobe) * shade * intensities[:, None, None, None]).astype(np.float32), lights, intensities
 
@@ -75,7 +76,7 @@ def random_state(pixels: int, lights: int, seed: int = 0) -> tuple[State, torch.
     front = torch.tensor([0.0, 0.0, 1.5])
     state = State(
         torch.randn(pixels, 3) * 0.5 + front, torch.randn(pixels, 3) * 0.3 - 1.0, torch.randn(pixels) * 0.3,
-        torch.randn(LOBES), torch.linspace(5.7, 2.3, LOBES), torch.randn(lights, 3) * 0.5 + front,
+        torch.tensor([-0.8, 0.6, -0.5, -1.2]), torch.randn(LOBES), torch.linspace(5.7, 2.3, LOBES), torch.randn(lights, 3) * 0.5 + front,
         torch.randn(lights, 3) * 0.2,
     )  # fmt: skip
     return state, torch.rand(pixels, 3, lights), (torch.rand(pixels, lights) > 0.1).float()
