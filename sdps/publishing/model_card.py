@@ -30,6 +30,7 @@ UNKNOWN = "not recorded"
 _METRICS, _DATASET_CARD = "metrics.jsonl", "DATASET_CARD.md"
 _PRESET, _TRAINING = "config.yaml", "training.yaml"  # what `sdps train` leaves beside the weights
 _LICENCES = re.compile(r"^## Licences\n(.*?)(?=^## |\Z)", re.DOTALL | re.MULTILINE)  # section of a dataset card
+_OF_LIGHTS = ("direction_mae", "intensity_error")
 _TEMPLATE = Path(__file__).with_name("model_card.md.j2")
 
 
@@ -62,10 +63,10 @@ def render_card(weights: str | Path, data: str | Path | None = None, shipped: st
     metadata, config, entry = model.metadata, model.metadata["config"], registry.entry(model.name)
     metrics = weights.parent / _METRICS
     rows = read_metrics(metrics) if metrics.is_file() and metrics.stat().st_size else []
-    scores = {name.removeprefix("val_"): float(value) for name, value in (metadata.get("metrics") or {}).items()}
     folder = Path(data) if data is not None and (Path(data) / MANIFEST).is_file() else None
     card = read_text(folder / _DATASET_CARD) if folder is not None and (folder / _DATASET_CARD).is_file() else ""
     lights = metadata.get("lights") or entry.lights
+    scores = _scores(metadata, told=lights == TRUE_LIGHTS)
     composition = _data(model, folder)
     return fill(
         _TEMPLATE,
@@ -92,6 +93,12 @@ def render_card(weights: str | Path, data: str | Path | None = None, shipped: st
         data_terms="".join(_LICENCES.findall(card)).strip(),
         **_repeat(weights, model),
     )
+
+
+def _scores(metadata: Mapping[str, Any], *, told: bool) -> dict[str, float]:
+    """Return the metrics of validation, without the errors of lights that the network was told."""
+    scores = {name.removeprefix("val_"): float(value) for name, value in (metadata.get("metrics") or {}).items()}
+    return {name: value for name, value in scores.items() if not (told and name.startswith(_OF_LIGHTS))}
 
 
 def _repeat(weights: Path, model: TrainedModel) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from sdps.core.metrics import angle_degrees
 from sdps.data.dataset import Batch
 from sdps.models.base import Lights
 from sdps.models.observation_maps import observation_maps, predict_normals, rotate_about_view
-from sdps.training.stages import NormalStage, light_errors
+from sdps.training.stages import NormalStage
 from sdps.training.training_config import PixelTraining
 
 VALIDATION_ROTATIONS = 3
@@ -79,7 +79,7 @@ class PixelStage(NormalStage):
         if len(errors):
             squares = (normals - pixels.normals).square()
             values = {"loss": float(squares.mean()), "normal_mae": float(errors.mean())}
-        return values | light_errors(lights, batch, "")
+        return values | self.light_scores(lights, batch)
 
 
 def draw_pixels(batch: Batch, lights: Lights, seeds: Sequence[int], *, count: int, min_lights: int) -> Pixels:

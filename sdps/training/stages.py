@@ -213,14 +213,18 @@ class NormalStage(Stage):
         return loss, terms
 
     def metrics(self, batch: Batch) -> dict[str, float]:
-        """Return the normal MAE on whole images and the errors of the lights used."""
+        """Return the normal MAE on whole images, and the errors of lights that a model found."""
         lights = self.lights(batch)
         normals = self.network(self.network.observe(batch.images, batch.mask, lights))
         values = {
             "loss": float(masked_normal_loss(normals, batch.normals, batch.mask)),
             "normal_mae": normal_error(normals, batch),
         }
-        return values | (light_errors(lights, batch, "") if lights is not None else {})
+        return values | self.light_scores(lights, batch)
+
+    def light_scores(self, lights: Lights | None, batch: Batch) -> dict[str, float]:
+        """Return the errors of the lights the network is given; none of those that are the true ones."""
+        return {} if lights is None or self.lighting is None else light_errors(lights, batch, "")
 
 
 def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:

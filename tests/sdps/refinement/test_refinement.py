@@ -76,8 +76,8 @@ def random_state(pixels: int, lights: int, seed: int = 0) -> tuple[State, torch.
     front = torch.tensor([0.0, 0.0, 1.5])
     state = State(
         torch.randn(pixels, 3) * 0.5 + front, torch.randn(pixels, 3) * 0.3 - 1.0, torch.randn(pixels) * 0.3,
-        torch.tensor([-0.8, 0.6, -0.5, -1.2]), torch.randn(LOBES), torch.linspace(5.7, 2.3, LOBES), torch.randn(lights, 3) * 0.5 + front,
-        torch.randn(lights, 3) * 0.2,
+        torch.tensor([-0.8, 0.6, -0.5, -1.2]), torch.randn(LOBES), torch.linspace(5.7, 2.3, LOBES),
+        torch.randn(lights, 3) * 0.5 + front, torch.randn(lights, 3) * 0.2,
     )  # fmt: skip
     return state, torch.rand(pixels, 3, lights), (torch.rand(pixels, lights) > 0.1).float()
 

@@ -23,6 +23,7 @@ from sdps.publishing.model_card import UNKNOWN, render_card, write_model_card
 from sdps.training.training_config import LightingTraining, NormalTraining
 
 CONFIG = NormalTraining(steps=8, batch_scenes=2, images=2, size=32, crop=16, lights="true", schedule="cosine")
+LIGHT_ERRORS = {"val_direction_mae": 5.5, "val_intensity_error": 0.125}
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +33,14 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def write_run(out: Path, data: Path | None, *, model: str = "nenet", name: str = "own", config=CONFIG) -> Path:
+def write_run(
+    out: Path, data: Path | None, *, model: str = "nenet", name: str = "own", config=CONFIG, lights: str = "true"
+) -> Path:
     """Write what a finished run leaves and return its weights."""
     metadata = {
         "config": to_plain(config), "data": file_hash(data / MANIFEST) if data else "0" * 64, "code": "abc123",
-        "step": 8, "seconds": 5400.0, "metrics": {"val_loss": 0.3, "val_normal_mae": 12.3456}, "lights": "true",
+        "step": 8, "seconds": 5400.0, "metrics": {"val_loss": 0.3, "val_normal_mae": 12.3456, **LIGHT_ERRORS},
+        "lights": lights,
     }  # fmt: skip
     torch.manual_seed(0)
     path = out / name / f"{name}.safetensors"
@@ -68,6 +72,15 @@ def test_the_card_tells_what_the_files_tell(tmp_path: Path, data: Path) -> None:
     assert head["tags"][-1] == "nenet"
     metrics = head["model-index"][0]["results"][0]["metrics"]
     assert {"type": "normal_mae", "value": 12.3456} in metrics
+
+
+def test_errors_of_lights_are_those_of_lights_that_were_found(tmp_path: Path) -> None:
+    told = render_card(write_run(tmp_path / "told", None))
+    found = render_card(write_run(tmp_path / "found", None, lights="lcnet"))
+    assert "direction_mae" not in told and "intensity_error" not in told
+    assert "| direction_mae | 5.5 | degrees" in found and "| intensity_error | 0.125 |" in found
+    shipped = (pretrained.shipped_folder() / "psfcn.md").read_text()
+    assert "direction_mae" not in shipped and "intensity_error" not in shipped and "normal_mae" in shipped
 
 
 def test_its_preset_repeats_the_run(tmp_path: Path, data: Path) -> None:

@@ -90,6 +90,14 @@ def test_interrupted_and_resumed_run_is_the_uninterrupted_one(
     assert_same_run(uninterrupted[0], tmp_path)
 
 
+def test_lights_that_are_given_have_no_errors(folder: Path, uninterrupted: tuple) -> None:
+    (validated,) = [row for row in rows(uninterrupted[0]) if "val_normal_mae" in row]
+    assert set(validated) == {"step", "val_loss", "val_normal_mae"}
+    lighting = TrainedModel("lcnet", create("lcnet").eval(), {}, {"config": {"augmentation": {}}})
+    stage = NormalStage(replace(QUICK, lights="lcnet"), lighting)
+    assert {"direction_mae", "intensity_error"} <= set(evaluate(stage, folder))
+
+
 def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, uninterrupted: tuple, tmp_path: Path) -> None:
     config = replace(QUICK, checkpoint_minutes=1e-9)  # one every step
     with pytest.raises(RuntimeError, match="killed"):
