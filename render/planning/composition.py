@@ -10,7 +10,7 @@ import numpy as np
 
 from render.materials import library, surfaces
 from render.materials.textures import textured
-from render.records.manifest import SceneSpec
+from render.records.manifest import OWN_MESHES, SceneSpec
 from render.shared.errors import InputError
 
 IMPORTED = "imported"  # family of shapes, and prefix of materials, that came with another data set
@@ -56,6 +56,8 @@ class Composition:
 
 def family(shape: str) -> str:
     """Return the family of a shape name (`blobby:17` is `blobby`), or the file name of a mesh."""
+    if shape.startswith(f"{OWN_MESHES}:"):
+        return OWN_MESHES
     return Path(shape).name if "/" in shape or "\\" in shape else shape.split(":")[0]
 
 

@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 
 from render.materials.surfaces import MOST_COMPONENTS, PATTERNS
 from render.planning import light_sets
+from render.planning.mesh_family import MeshFamily
+from render.records.manifest import OWN_MESHES
 from render.shared.config import check_fields
 from render.shared.errors import InputError, unknown
 
@@ -19,7 +21,9 @@ class DataConfig:
 
     Attributes:
         seed: Root seed; 0 is a seed like any other.
-        families: Seeded shape families and how many shapes of each.
+        families: Seeded shape families, or `meshes`, and how many shapes of each.
+        meshes: Mesh files that are the family `meshes`: each once in a seeded order, then again in other poses. Whole
+            files are kept for validation, so that none is in both splits.
         views: Random views per shape.
         materials_per_view: Different random materials per view (each is a sample of its own; they share rays).
         materials: Names, categories, or `all`; `lambertian:<albedo>`, material files and folders of maps are allowed;
@@ -58,6 +62,7 @@ class DataConfig:
 
     seed: int = 0
     families: dict[str, int] = field(default_factory=lambda: {"blobby": 8, "sculpture": 8})
+    meshes: MeshFamily | None = None
     views: int = 2
     materials_per_view: int = 2
     materials: tuple[str, ...] = ("all",)
@@ -100,6 +105,11 @@ class DataConfig:
                 raise InputError(f"{name} must be two rising positive numbers, got {low}, {high}")
         if not self.families or min(self.families.values()) < 0:
             raise InputError("families must name at least one shape family with a count of 0 or more")
+        if (self.meshes is None) == (OWN_MESHES in self.families):
+            raise InputError(
+                "families.meshes and meshes belong together: how many shapes, and where their files are "
+                "(families: {meshes: 20}, meshes: {path: FOLDER})"
+            )
         self._check_surfaces()
         self._check_framing()
         self._check_distances()
@@ -138,7 +148,7 @@ class DataConfig:
             raise unknown("value for camera:", self.camera, CAMERAS)
         if self.camera == PERSPECTIVE and self.tiles > 1:
             raise InputError("tiles: parts of an image need camera: orthographic; set tiles to 1")
-        sizes = {family: (self.upright_scale if family in UPRIGHT else self.scale)[1] for family in self.families}
+        sizes = {family: (self.upright_scale if self.stands(family) else self.scale)[1] for family in self.families}
         largest = max(size * self.tiles_of(family) for family, size in sizes.items())
         used = {"near_light_distance": self.near_lights > 0, "camera_distance": self.camera == PERSPECTIVE}
         for name, is_used in used.items():
@@ -151,9 +161,13 @@ class DataConfig:
                     f"got {low}"
                 )
 
+    def stands(self, family: str) -> bool:
+        """Tell whether the shapes of a family have an up and stand."""
+        return family in UPRIGHT or (family == OWN_MESHES and self.meshes is not None and self.meshes.upright)
+
     def tiles_of(self, family: str) -> int:
         """Return the tiles along each side of the image of a family."""
-        return self.tiles if family in UPRIGHT else 1
+        return self.tiles if self.stands(family) else 1
 
     def is_framed(self, family: str) -> bool:
         """Tell whether the views of a family depend on how the mesh fills them."""

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from render.materials import library, surfaces
 from render.materials.textures import textured
 from render.planning import light_sets
-from render.planning.data_config import PERSPECTIVE, UPRIGHT, DataConfig
-from render.records.manifest import SceneSpec, View
+from render.planning.data_config import PERSPECTIVE, DataConfig
+from render.planning.mesh_family import choose
+from render.records.manifest import OWN_MESHES, SceneSpec, View
 from render.shared.errors import InputError, unknown
 from render.shared.progress import progress_bar
 from render.shared.seeds import derived_seed, generator
@@ -55,15 +56,18 @@ def plan(config: DataConfig, processes: int = 1) -> list[SceneSpec]:
     joined = next((name for name in pool if "+" in name and not textured.is_textured(name)), None)
     if config.spatially_varying and joined:
         raise InputError(f"materials: {joined!r} has a '+' and cannot be mixed with others; leave it out or rename it")
+    known = [*(name for name, entry in FAMILIES.items() if entry.seeded), OWN_MESHES]
     for family in config.families:
-        if family not in FAMILIES or not FAMILIES[family].seeded:
-            raise unknown("shape family", family, [name for name, entry in FAMILIES.items() if entry.seeded])
+        if family not in known:
+            raise unknown("shape family", family, known)
     shapes = [(family, number) for family, count in config.families.items() for number in range(count)]
     if not shapes:
         raise InputError("families: no scene to render; raise a count above 0")
+    count = config.families.get(OWN_MESHES, 0)
+    meshes = choose(config.meshes, config.seed, count) if config.meshes and count else []
     framed = any(config.is_framed(family) for family, _ in shapes)
     with _mapping(processes if framed else 1) as mapping:
-        planned = mapping(partial(_plan_shape, config, _Materials(pool, weights, unseen)), shapes)
+        planned = mapping(partial(_plan_shape, config, _Materials(pool, weights, unseen), meshes), shapes)
         bar = progress_bar(planned, total=len(shapes), desc="plan", unit="shape", disable=not framed)
         return [scene for scenes in bar for scene in scenes]
 
@@ -159,21 +163,25 @@ def material_pool(chosen: tuple[str, ...]) -> list[str]:
     return list(dict.fromkeys(pool))
 
 
-def _plan_shape(config: DataConfig, materials: _Materials, key: tuple[str, int]) -> list[SceneSpec]:
-    """Plan all views of one shape; a shape that cannot be framed as asked is replaced by another one."""
+def _plan_shape(config: DataConfig, materials: _Materials, meshes: list[str], key: tuple[str, int]) -> list[SceneSpec]:
+    """Plan all views of one shape; a seeded shape that cannot be framed as asked is replaced by another one."""
     family, number = key
-    for attempt in range(SHAPES_TRIED):
+    own = [meshes[number % len(meshes)]] if family == OWN_MESHES else []
+    # The split of a file is that of its place, however often it comes.
+    held_out = is_validation(number % len(meshes) if own else number, config.validation)
+    for attempt in range(1 if own else SHAPES_TRIED):
         replaced = ("instead", attempt) if attempt else ()
-        shape = f"{family}:{derived_seed(config.seed, family, number, *replaced)}"
+        shape = own[0] if own else f"{family}:{derived_seed(config.seed, family, number, *replaced)}"
         views = _views(config, family, number, shape)
         if views is not None:
             return [
                 scene
                 for view, pose in enumerate(views)
-                for scene in _plan_view(config, (family, number, view), shape, pose, materials)
+                for scene in _plan_view(config, (family, number, view), shape, pose, materials, held_out)
             ]
+    tried = f"{own[0].split(':', 3)[3]} has" if own else f"{SHAPES_TRIED} shapes in turn have"
     raise InputError(
-        f"{family} {number}: {SHAPES_TRIED} shapes in turn have a view without a fitting pose in {POSES_TRIED}; lower "
+        f"{family} {number}: {tried} a view without a fitting pose in {POSES_TRIED}; lower "
         f"min_foreground.{family} or min_normal_spread.{family}, or raise the scale"
     )
 
@@ -237,14 +245,13 @@ def _framed_view(config: DataConfig, family: str, keys: tuple[Any, ...], mesh: A
 
 
 def _plan_view(
-    config: DataConfig, keys: tuple[Any, ...], shape: str, pose: View, materials: _Materials
+    config: DataConfig, keys: tuple[Any, ...], shape: str, pose: View, materials: _Materials, held_out: bool
 ) -> list[SceneSpec]:
     """Draw lights and materials of one view; each from a stream of its own."""
     family, number, view = keys
     directions = light_sets.draw(config.lights, config.light_count, generator(config.seed, *keys, "lights"))
     order = materials.order(generator(config.seed, *keys, "materials"), config.materials_per_view)
     surface = [_surface(config, (*keys, "surface", slot), materials, index) for slot, index in enumerate(order)]
-    held_out = is_validation(number, config.validation)
     if held_out and materials.unseen:
         drawn = generator(config.seed, *keys, "unseen").permutation(len(materials.unseen))
         surface[1::2] = [materials.unseen[index] for index in np.resize(drawn, len(surface[1::2]))]
@@ -282,7 +289,7 @@ def _surface(config: DataConfig, keys: tuple[Any, ...], materials: _Materials, f
 
 def random_view(config: DataConfig, family: str, rng: np.random.Generator) -> View:
     """Draw a pose: any rotation for blobs; any yaw, but limited pitch and roll, for shapes that stand."""
-    if family in UPRIGHT:
+    if config.stands(family):
         # Turned about its own axis first, then tipped towards the camera (positive: seen from above), then rolled.
         yaw, pitch, roll = rng.uniform(-180, 180), rng.uniform(-30, 55), rng.uniform(-15, 15)
         rotation = Rotation.from_euler("yxz", [yaw, pitch, roll], degrees=True)
@@ -292,7 +299,7 @@ def random_view(config: DataConfig, family: str, rng: np.random.Generator) -> Vi
         scale = float(rng.uniform(*config.scale))
     reach = config.offset * max(scale - 0.5, 0.0)
     # Standing shapes are tall and thin: move along their height, or most of the frame is empty.
-    spread = np.array([0.4, 1.6]) if family in UPRIGHT else np.ones(2)
+    spread = np.array([0.4, 1.6]) if config.stands(family) else np.ones(2)
     offset = rng.uniform(-reach, reach, 2) * spread
     return View(
         rotation=tuple(round(float(value), 9) for value in rotation.as_matrix().ravel()),

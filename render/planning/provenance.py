@@ -13,7 +13,7 @@ import numpy as np
 from render.materials import library
 from render.materials.textures import textured
 from render.planning.composition import IMPORTED, Composition, components
-from render.records.manifest import SceneSpec
+from render.records.manifest import OWN_MESHES, SceneSpec
 from render.records.shards import read_shard
 from render.shared.errors import InputError
 
@@ -123,6 +123,7 @@ def _terms_of(name: str) -> tuple[str, str]:
     return source, terms or ("none needed" if source == "analytic" else UNSTATED)
 
 
-def mesh_terms(counts: Composition) -> dict[str, str]:
-    """Return {shape family or mesh file: terms of use} of a composition."""
-    return {name: ORIGINAL if name == IMPORTED else MESHES.get(name, UNSTATED) for name in counts.families}
+def mesh_terms(counts: Composition, own: str = "") -> dict[str, str]:
+    """Return {shape family or mesh file: terms of use} of a composition; `own` are those of the family `meshes`."""
+    known = MESHES | {IMPORTED: ORIGINAL} | ({OWN_MESHES: own} if own else {})
+    return {name: known.get(name, UNSTATED) for name in counts.families}

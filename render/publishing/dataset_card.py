@@ -82,7 +82,7 @@ def render_card(
         config=to_yaml({key: config[key] for key in ("name", "description", "data") if key in config} or config)
         if config else "",
         terms=provenance.material_terms(list(counts.materials)),
-        meshes=provenance.mesh_terms(counts).items(),
+        meshes=provenance.mesh_terms(counts, _mesh_licence(config)).items(),
         validation=_validation(folder),
     )  # fmt: skip
 
@@ -109,6 +109,13 @@ def _config(folder: Path) -> dict[str, Any]:
         return read_yaml(folder / CONFIG)
     except InputError:
         return {}
+
+
+def _mesh_licence(config: Mapping[str, Any]) -> str:
+    """Return the terms that the configuration states for the user's own meshes; empty where it states none."""
+    data = config.get("data", config)
+    meshes = data.get("meshes") if isinstance(data, dict) else None
+    return str(meshes.get("licence") or "") if isinstance(meshes, dict) else ""
 
 
 def _provenance(folder: Path, rendered: Mapping[str, str], config: Mapping[str, Any]) -> list[tuple[str, Any]]:

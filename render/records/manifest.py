@@ -16,6 +16,7 @@ from render.shared.files import read_jsonl, read_whole_lines, write_jsonl
 
 MANIFEST = "manifest.jsonl"
 FAILED = "failed.jsonl"
+OWN_MESHES = "meshes"  # family of shapes that are files of the user's own
 _LATER = ("light_distances",)
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import trimesh
 from threadpoolctl import threadpool_limits
 
-from render.shapes import blobby, primitives
+from render.records.manifest import OWN_MESHES
+from render.shapes import blobby, own_meshes, primitives
 from render.shapes.geometry.mesh import TriangleMesh, load_mesh
 from render.shapes.sculpture import family as sculpture
 from render.shared.errors import InputError, unknown
@@ -41,7 +42,8 @@ def load(name: str) -> TriangleMesh:
     Matrix products run on one thread here: their last bits depend on how many there are, and a shape's must not.
 
     Args:
-        name: `sphere`, `bunny`, `blobby:<seed>`, `sculpture:<seed>`, or the path of a mesh file.
+        name: `sphere`, `bunny`, `blobby:<seed>`, `sculpture:<seed>`, the path of a mesh file, or one with its hash
+            as plans have it (`render.shapes.own_meshes`).
 
     Raises:
         InputError: unknown name (with the nearest), bad seed, or a file that cannot be used.
@@ -52,6 +54,8 @@ def load(name: str) -> TriangleMesh:
 
 def _load(name: str) -> TriangleMesh:
     base, colon, text = name.partition(":")
+    if base == OWN_MESHES and colon:
+        return own_meshes.load_named(name)
     family = FAMILIES.get(base)
     if family is None:
         if Path(name).suffix[1:].lower() in trimesh.available_formats() or Path(name).is_file():

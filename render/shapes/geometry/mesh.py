@@ -9,7 +9,10 @@ import numpy as np
 import trimesh
 
 from render.records.manifest import View
+from render.shapes.geometry.strips import from_strips
 from render.shared.errors import InputError
+
+LARGEST_UNPACKED = 1 << 30  # bytes of what gzip compressed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,11 +191,14 @@ def _read(path: Path) -> TriangleMesh:
     """Read a mesh file; one that is compressed by gzip, as in `bunny.ply.gz`, is unpacked in memory."""
     if path.suffix.lower() == ".gz":
         with gzip.open(path) as file:
-            unpacked = io.BytesIO(file.read())
-        scene = trimesh.load_scene(unpacked, file_type=Path(path.stem).suffix[1:].lower(), process=False)
+            unpacked = file.read(LARGEST_UNPACKED + 1)
+        if len(unpacked) > LARGEST_UNPACKED:
+            raise InputError(f"{path}: unpacks to more than {LARGEST_UNPACKED >> 20:,} MiB; unpack it by hand")
+        scene = trimesh.load_scene(io.BytesIO(unpacked), file_type=Path(path.stem).suffix[1:].lower(), process=False)
     else:
         scene = trimesh.load_scene(path, process=False)
-    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    placed = [from_strips(part) for part in scene.dump()]
+    parts = [part for part in placed if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise InputError(f"{path}: contains no triangles; export it as a surface mesh")
     for part in parts:

@@ -95,6 +95,48 @@ def test_scene_parts_are_joined_where_the_scene_places_them(tmp_path):
     assert np.ptp(mesh.vertices[:, 0]) == pytest.approx(6)
 
 
+def test_nested_nodes_turn_scale_and_move_their_parts(tmp_path):
+    turn = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1])  # x to y
+    grow = np.diag([1.0, 3.0, 1.0, 1.0])
+    scene = trimesh.Scene(CUBE)
+    scene.graph.update("arm", matrix=trimesh.transformations.translation_matrix([10, 0, 0]) @ turn)
+    scene.add_geometry(CUBE, node_name="hand", parent_node_name="arm", transform=grow)
+    path = tmp_path / "nested.glb"
+    scene.export(path)
+    # The arm's cube, 3 long in y, lies along x after the turn, and is then moved to x = 10.
+    low, high = load_mesh(path).vertices.min(0), load_mesh(path).vertices.max(0)
+    np.testing.assert_allclose(low, [-0.5, -0.5, -0.5], atol=1e-6)
+    np.testing.assert_allclose(high, [11.5, 0.5, 0.5], atol=1e-6)
+
+
+STRIPPED = "\n".join([
+    "ply", "format {} 1.0", "element vertex 6", *(f"property float {axis}" for axis in "xyz"),
+    "element tristrips 1", "property list int int vertex_indices", "end_header", "",
+])  # fmt: skip
+PLACES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 2, 0], [5, 5, 1]])
+STRIPS = [0, 1, 2, 3, 4, -1, 3, 5, 4, -1, 1, 2]  # the last one is no triangle
+
+
+def wound(triangles):
+    return {tuple(map(tuple, np.roll(corners, -np.lexsort(corners.T)[0], axis=0).tolist())) for corners in triangles}
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian", "packed"])
+def test_triangle_strips_alternate_their_winding(tmp_path, kind):
+    order = ">" if "big" in kind else "<"
+    body = PLACES.astype(f"{order}f4").tobytes() + np.array([len(STRIPS), *STRIPS], f"{order}i4").tobytes()
+    if kind == "ascii":
+        rows = [*PLACES.tolist(), [len(STRIPS), *STRIPS]]
+        body = "\n".join(" ".join(map(str, row)) for row in rows).encode()
+    content = STRIPPED.format("binary_little_endian" if kind == "packed" else kind).encode() + body
+    path = tmp_path / ("scan.ply.gz" if kind == "packed" else "scan.ply")
+    path.write_bytes(gzip.compress(content) if kind == "packed" else content)
+    mesh = load_mesh(path)
+    assert len(mesh.faces) == 4
+    # The same corners in the same order round each triangle, whichever comes first.
+    assert wound(mesh.vertices[mesh.faces]) == wound(PLACES[[[0, 1, 2], [2, 1, 3], [2, 3, 4], [3, 5, 4]]])
+
+
 def test_inside_out_and_mixed_windings_are_repaired(tmp_path):
     for flipped in (np.arange(12), np.arange(5)):
         faces = np.array(CUBE.faces)
@@ -148,7 +190,7 @@ def test_a_damaged_file_loads_or_ends_in_one_line_that_names_it(tmp_path, suffix
             load_mesh(path).normalised()
         except InputError as error:
             refused += 1
-            assert "\n" not in str(error)
+            assert "\n" not in str(error) and str(path) in str(error)
     assert 0 < refused < 120
 
 
@@ -158,3 +200,11 @@ def test_a_compressed_file_is_the_same_mesh(tmp_path):
     packed = tmp_path / "ball.ply.gz"
     packed.write_bytes(gzip.compress(plain.read_bytes()))
     np.testing.assert_array_equal(load_mesh(packed).vertices, load_mesh(plain).vertices)
+
+
+def test_a_compressed_file_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("render.shapes.geometry.mesh.LARGEST_UNPACKED", 1 << 20)
+    path = tmp_path / "bomb.ply.gz"
+    path.write_bytes(gzip.compress(bytes((1 << 20) + 1)))
+    with pytest.raises(InputError, match=r"bomb.ply.gz: unpacks to more than 1 MiB"):
+        load_mesh(path)
