@@ -26,6 +26,8 @@ RATES = {
 }
 """Learning rates of Adam, by part of the state, before `boost`."""
 _LEAST_RATE = 0.02
+_FITS, _MISFITS = 0.01, 0.03
+"""A data term of a model that fits, and one of a model that does not; start and end of the trust in the start."""
 
 
 class Weights(NamedTuple):
@@ -40,6 +42,8 @@ class Weights(NamedTuple):
         curl: Of the curl, at the start and at the end; in between it falls exponentially.
         shift: Of where the lights point on average, likewise. Networks tell that well, and highlights, once found,
             better.
+        near: Of how far the normals are from the start, by how badly the model fits: a model that does not describe
+            the object's reflectance explains it by wrong normals.
     """
 
     smooth: float = 0.005
@@ -49,6 +53,7 @@ class Weights(NamedTuple):
     body: float = 0.01
     curl: tuple[float, float] = (0.6, 0.1)
     shift: tuple[float, float] = (10.0, 0.03)
+    near: float = 0.15
 
 
 class Problem(NamedTuple):
@@ -92,7 +97,8 @@ def solve(
     beside = neighbours(problem.mask)
     state = State(*(part.clone().requires_grad_(name in free) for name, part in zip(State._fields, state, strict=True)))
     groups = [{"params": [getattr(state, name)], "base": rate} for name, rate in RATES.items() if name in free]
-    adam, start = torch.optim.Adam(groups), normalize(state.directions.detach(), dim=-1)
+    adam = torch.optim.Adam(groups)
+    start, begun = normalize(state.directions.detach(), dim=-1), normalize(state.normals.detach(), dim=-1)
     for number in range(iterations):
         part = number / max(iterations - 1, 1)
         for group in adam.param_groups:
@@ -100,6 +106,8 @@ def solve(
         adam.zero_grad(set_to_none=True)
         made = factors(state)
         loss = data_term(made, problem.images, problem.kept)
+        misfit = min(max((float(loss.detach()) - _FITS) / (_MISFITS - _FITS), 0.0), 1.0)
+        loss = loss + weights.near * misfit * (1.0 - (made.normals * begun).sum(dim=1)).mean()
         loss = loss + _priors(state, made, beside, weights, part)
         if "directions" in free:
             stretch, shift = anchor(state.directions, start)

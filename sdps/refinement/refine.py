@@ -100,9 +100,10 @@ def refine(
         if stride > 1:
             problem, state = _finer(values, scene.mask, problem.mask, stride, state)
         if fine:
+            weights = Weights(curl=(config.fine_curl, config.fine_curl), near=0.0)
             state = solve(
                 problem, state, free=frozenset({"normals", "log_albedo", "log_strength"}), iterations=fine,
-                boost=config.fine_boost, weights=Weights(curl=(config.fine_curl, config.fine_curl)), after=bar.update,
+                boost=config.fine_boost, weights=weights, after=bar.update,
             )  # fmt: skip
     return _result(scene, problem, state)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from trimesh.visual.color import ColorVisuals
 
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_path
@@ -103,8 +104,8 @@ def write_mesh(surface: trimesh.Trimesh, path: str | Path) -> None:
 
 def _linear(surface: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return the mesh with its colours as an attribute of linear 16-bit RGBA."""
-    colours = {}
-    if surface.visual.kind == "vertex":
+    colours: dict[str, Any] = {}
+    if isinstance(surface.visual, ColorVisuals) and surface.visual.kind == "vertex":
         rgb = np.rint(to_linear(surface.visual.vertex_colors[:, :3], "srgb") * 65535)
         colours[_COLOURS] = np.pad(rgb, ((0, 0), (0, 1)), constant_values=65535).astype(np.uint16)  # (v, 4)
     return trimesh.Trimesh(
