@@ -5,7 +5,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -38,8 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--images", action="append", default=None, metavar="PATTERN",
                         help="files to use, in this order; one that begins with ! leaves files out")  # fmt: skip
     parser.add_argument("--discontinuities", action="store_true", help="let the depth jump where slopes disagree")
-    parser.add_argument("--refine", action="store_true",
-                        help="refine normals and lights until a simple model explains the photographs")  # fmt: skip
+    parser.add_argument("--refine", action=argparse.BooleanOptionalAction, default=None,
+                        help="refine normals and lights until a simple model explains the photographs (default: where "
+                        "networks find both)")  # fmt: skip
     parser.add_argument("--anyway", action="store_true",
                         help="go on where a check of the photographs stops (the report says which)")  # fmt: skip
     using.add_arguments(parser)
@@ -121,24 +122,49 @@ def _section(result: "Inference") -> SectionWriter:
     section = Section(
         name="photographs", title="What was found", text=text, tables=_tables(result), pictures_first=True
     )
-    writer = SectionWriter(section)
+    writer, box = SectionWriter(section), _box(mask)
     lit = photos[_brightest(result)][0]
-    exposure = pictures.auto_exposure(lit[None], mask)
-    shown = pictures.tone_map(lit, exposure)
-    normals = pictures.normal_map(result.normals, mask)
+    shown = pictures.tone_map(lit, pictures.auto_exposure(lit[None], mask))
     tiles: list[tuple[str, np.ndarray | Figure]] = [
-        ("a photograph", shown),
-        (f"mask ({photos.mask_origin})", _masked(shown, mask)),
-        ("normals", normals),
+        ("a photograph", shown[box]),
+        (f"mask ({photos.mask_origin})", _masked(shown, mask)[box]),
+        ("normals", pictures.normal_map(result.normals, mask)[box]),
+        ("depth, near is bright", _depth_picture(result)[box]),
     ]
-    tiles.append(("depth, near is bright", _depth_picture(result)))
     if len(result.light_directions):
         tiles.append(("lights, seen from the camera", pictures.light_plot(result.light_directions, result.gains)))
     writer.strip("Photograph, mask, normals, depth, lights", tiles)
     writer.strip("The surface from the left, the front and the right", [("", strip(result.depth, 360))], wide=True)
-    relit = [(name.replace("-", " "), pictures.tone_map(view)) for name, view in result.relit().items()]
+    relit = [(name.replace("-", " "), pictures.tone_map(view)[box]) for name, view in result.relit().items()]
     writer.strip("Under lights of our choice (matt, with cast shadows)", relit)
+    if "refined" in result.estimate.diagnostics:
+        writer.strip("Refinement", _refinement_pictures(result, box))
     return writer
+
+
+def _box(mask: np.ndarray) -> tuple[slice, slice]:
+    """Return the rows and columns of the object, with a little room around it."""
+    room = round(0.05 * max(mask.shape))
+    spans = ((places.min() - room, places.max() + room + 1) for places in np.nonzero(mask))
+    rows, columns = (slice(max(start, 0), end) for start, end in spans)
+    return rows, columns
+
+
+def _refinement_pictures(result: "Inference", box: tuple[slice, slice]) -> list[tuple[str, np.ndarray | Figure]]:
+    """Return how far normals moved, the error to expect, and what the model did not explain."""
+    from sdps.core.metrics import angle_degrees
+
+    found, mask = result.estimate.diagnostics, result.photos.mask
+    moved = angle_degrees(found["refined"].normals, found["start"].normals)
+    residual, expected = found["refined"].pixel_residual, found["trust"].normals
+    most = float(np.percentile(residual[mask], 99))
+    maps = (
+        ("normals before", pictures.normal_map(found["start"].normals, mask)),
+        ("moved (yellow: 20 degrees)", pictures.error_map(np.where(mask, moved, np.nan), 20.0)),
+        ("error to expect (yellow: 20 degrees)", pictures.error_map(np.where(mask, expected, np.nan), 20.0)),
+        (f"not explained (yellow: {most:.2f})", pictures.error_map(np.where(mask, residual, np.nan), most)),
+    )
+    return [(caption, picture[box]) for caption, picture in maps]
 
 
 def _brightest(result: "Inference") -> slice:
@@ -174,6 +200,7 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
             ("integrability, RMS residual", f"{result.depth.residual:.2f}°")]  # fmt: skip
     if result.residuals is not None:
         rows.append(("photographs against Lambert's law, relative RMS", f"{result.residuals.overall:.3f}"))
+    rows += _refinement_rows(facts)
     note = f"Terms of the weights: {facts['terms']}." if facts["terms"] else ""
     tables = [checks, Table(title="Figures", header=("what", "value"), rows=tuple(rows), note=note)]
     if len(result.light_directions):
@@ -184,5 +211,23 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
             for name, direction, gain in zip(result.photos.files, result.light_directions, gains, strict=True)
         )
         header = ("photograph", "x", "y", "z", "intensity / mean")
+        if "refined" in facts:
+            expected = facts["refined"]["expected_light_error_degrees"]
+            body = tuple((*row, f"{expected[row[0]]:.1f}°") for row in body)
+            header = (*header, "error to expect")
         tables.append(Table(title="Lights", header=header, rows=body))
     return tuple(tables)
+
+
+def _refinement_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return what the table of figures says of refinement."""
+    if "refined" not in facts:
+        return []
+    about = facts["refined"]
+    unexplained = about["unexplained"]
+    return [
+        ("refined", "yes" if about["kept"] else f"no: {about['doubt']}"),
+        ("refinement moved normals, lights", f"{about['normals_moved_degrees']}°, {about['lights_moved_degrees']}°"),
+        ("error of the refined normals to expect", f"{about['expected_normal_error_degrees']}°"),
+        ("photographs not explained", f"{len(unexplained)}{_named(unexplained)}"),
+    ]

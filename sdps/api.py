@@ -29,11 +29,12 @@ from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
 from sdps.methods.method import REFINE, Method
-from sdps.methods.parse import parse, refined
+from sdps.methods.parse import by_networks, parse, refined
 from sdps.methods.runner import Runner
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load
 from sdps.photos.doubts import ANYWAY
+from sdps.refinement.trust import FEWEST_IMAGES
 from sdps.surface.inferred import Inference, check_out
 from sdps.training.trainer import TrainingResult
 
@@ -54,7 +55,7 @@ def infer(
     *,
     models: str | Path | None = None,
     config: InferenceConfig | None = None,
-    refine: bool = False,
+    refine: bool | None = None,
     discontinuities: bool = False,
     findings: tuple[Finding, ...] | None = None,
     anyway: bool = False,
@@ -68,7 +69,7 @@ def infer(
         models: Folder of trained runs (`out` of `train`) to take weights from before the pretrained ones.
         config: How networks are used; the defaults are those of every command.
         refine: Refine normals and lights by inverse rendering (`sdps.refinement`); the same as `+refine` at the end of
-            `method`.
+            `method`. None: where networks find both, from eight images on.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
         anyway: Go on where the checks found an error. The method may still find that it cannot.
@@ -84,7 +85,7 @@ def infer(
     grave = next((finding for finding in findings if finding.level == "error"), None)
     if grave is not None and not anyway:
         raise InputError(f"{photos.folder}: {grave.text} ({ANYWAY})")
-    runner = _runner(method, photos.light_directions is not None, models, config, refine)
+    runner = _runner(method, photos.light_directions is not None, models, config, refine, len(photos))
     began = time.perf_counter()
     found = runner.estimate(photos, photos.mask, photos.light_directions, photos.intensities)
     seconds = time.perf_counter() - began
@@ -207,12 +208,15 @@ def _finder(models: str | Path | None) -> Callable[[str], Path]:
 
 
 def _runner(
-    method: str, lit: bool, models: str | Path | None, config: InferenceConfig | None, refine: bool = False
-) -> Runner:
+    method: str, lit: bool, models: str | Path | None, config: InferenceConfig | None, refine: bool | None = False,
+    images: int = 0,
+) -> Runner:  # fmt: skip
     """Return the method of an expression with its networks; `lit`: the light directions are known."""
     find = _finder(models)
     plain = method.removesuffix(f"+{REFINE}")
     chosen = _told(_automatic(lit, find) if plain == AUTO else plain, lit, find)
+    if refine is None:
+        refine = by_networks(chosen) and images >= FEWEST_IMAGES
     return Runner(refined(chosen) if refine or plain != method else chosen, find, config)
 
 

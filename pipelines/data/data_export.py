@@ -106,6 +106,7 @@ def report(found: RuleReport, tree: str) -> int:
         sys.stdout.write(f"{line}\n")
     if len(found.violations) > _SHOWN:
         sys.stdout.write(f"... and {len(found.violations) - _SHOWN} more\n")
+    sys.stdout.write("".join(f"warning: {line}\n" for line in found.warnings))
     low, high = found.lights
     lights = f"{low}" if low == high else f"{low} to {high}"
     verdict = f"{len(found.violations)} violations" if found.violations else "every rule of its loaders holds"

@@ -120,7 +120,7 @@ def light_plot(directions: np.ndarray, intensities: np.ndarray, truth: np.ndarra
         truth: (L, 3) true directions, or None.
     """
     grey = intensities if intensities.ndim == 1 else intensities.mean(1)
-    figure = Figure(figsize=(3.0, 2.6), dpi=100, layout="tight")
+    figure = Figure(figsize=(3.4, 2.8), dpi=130, layout="tight")
     axes = figure.add_subplot()
     points = light_disc(axes, directions, grey, truth)
     figure.colorbar(points, ax=axes, shrink=0.7, label="intensity / strongest")

@@ -19,16 +19,18 @@ from render.records.shards import read_shard
 from render.shared.errors import InputError, unknown
 from render.shared.progress import progress_bar
 
+_CROP = 128  # pixels; what the authors' trainers cut pictures to where nothing else is said
 _ANGLE_TOLERANCE = 0.6  # degrees; the greatest error of rounding to 8 bits is 0.39
 
 
 @dataclass
 class RuleReport:
-    """Result of a check: how many samples were looked at, with how many lights, and what is wrong."""
+    """Result of a check: how many samples were looked at, with how many lights, what is wrong, and what may be."""
 
     samples: int = 0
     lights: tuple[int, int] = (0, 0)
     violations: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 def check_tree(
@@ -58,14 +60,20 @@ def check_tree(
     report.samples = len(samples)
     if limit is not None and limit < len(samples):
         samples = [samples[place] for place in np.linspace(0, len(samples) - 1, limit).round().astype(int)]
-    counts = set()
+    counts, least = set(), _CROP
     for load in progress_bar(samples, unit="sample", desc=f"check {layout}"):
         with noted(note):
             pictures = load()
             counts.add(len(pictures.images))
+            least = min(least, *pictures.mask.shape)
             _check_pictures(pictures, note)
             if source is not None:
                 _compare(pictures, Path(source), planned, note)
+    if layout == "psfcn" and least < _CROP:
+        report.warnings.append(
+            f"{root}: pictures of {least} pixels; SDPS-Net's defaults want {_CROP}x{_CROP}: render at that size, or "
+            "set the sizes of its options"
+        )
     report.lights = (min(counts, default=0), max(counts, default=0))
     return report
 

@@ -99,6 +99,11 @@ def refined(method: Method) -> Method:
     return replace(method, name=f"{method.name}, refined", refined=True, paper="")
 
 
+def by_networks(method: Method) -> bool:
+    """Tell whether networks find both the lights and the normals."""
+    return method.lights not in (NONE, TRUE_LIGHTS) and method.normals not in (NONE, *CLASSICAL)
+
+
 def model_of(name: str, find: Callable[[str], Path]) -> str:
     """Return the registry model of a run or weights file.
 

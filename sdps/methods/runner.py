@@ -151,8 +151,9 @@ class Runner:
         return replace(estimate, normals=normals)
 
     def _refine(self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any]) -> Estimate:
-        """Refine an estimate; lights it was given stay."""
+        """Refine an estimate, or keep it where refinement cannot be trusted; lights it was given stay."""
         from sdps.refinement.refine import refine
+        from sdps.refinement.trust import trust
 
         if not len(estimate.light_directions):
             raise InputError(
@@ -167,12 +168,12 @@ class Runner:
             known=frozenset(name for key, name in names.items() if given.get(key) is not None),
             stray=self.config.stray_light,
         )  # fmt: skip
-        return Estimate(
-            refined.normals,
-            refined.light_directions,
-            refined.intensities.mean(axis=1),
-            estimate.diagnostics | {"refined": refined, "start": estimate},
-        )
+        told = given.get("lights") is not None
+        expected = trust(refined, mask, estimate.normals, estimate.light_directions, given=told)
+        diagnostics = estimate.diagnostics | {"refined": refined, "start": estimate, "trust": expected}
+        if expected.doubt:
+            return replace(estimate, diagnostics=diagnostics)
+        return Estimate(refined.normals, refined.light_directions, refined.intensities.mean(axis=1), diagnostics)
 
     def score(
         self,

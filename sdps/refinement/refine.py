@@ -100,7 +100,7 @@ def refine(
         if stride > 1:
             problem, state = _finer(values, scene.mask, problem.mask, stride, state)
         if fine:
-            weights = Weights(curl=(config.fine_curl, config.fine_curl), near=0.0)
+            weights = Weights(curl=(config.fine_curl, config.fine_curl))
             state = solve(
                 problem, state, free=frozenset({"normals", "log_albedo", "log_strength"}), iterations=fine,
                 boost=config.fine_boost, weights=weights, after=bar.update,

@@ -20,7 +20,6 @@ from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
-from sdps.refinement.refined import Refined
 from sdps.surface.integration import Depth, integrate
 from sdps.surface.meshing import mesh, write_mesh
 from sdps.surface.relight import Residuals, fit_albedo, relit, residuals
@@ -134,7 +133,7 @@ class Inference:
             )
         refined = self.estimate.diagnostics.get("refined")
         if refined is not None:
-            facts["refined"] = _about_refined(refined, self.estimate.diagnostics["start"], photos)
+            facts["refined"] = _about_refined(self.estimate.diagnostics, photos)
         if self.residuals is not None:
             facts["lambertian_residual"] = round(self.residuals.overall, 4)
         return facts
@@ -177,6 +176,7 @@ class Inference:
             _save_array(folder / "albedo.npy", refined.albedo)
             _save_array(folder / "highlights.npy", refined.strength)
             _save_array(folder / "residual.npy", refined.pixel_residual)
+            _save_array(folder / "expected-error.npy", self.estimate.diagnostics["trust"].normals)
         _save_array(folder / "depth.npy", self.depth.z)
         colour = None if self.albedo is None else _display(self.albedo, mask)
         surface = mesh(self.depth, colour=colour, normals=normals)
@@ -198,18 +198,23 @@ def check_out(out: Path, photographs: Path) -> None:
         raise InputError(f"--out {out}: holds the photographs; choose another folder")
 
 
-def _about_refined(refined: Refined, start: Estimate, photos: Photographs) -> dict[str, Any]:
-    """Say how far refinement went, and which photographs its model explains worst; JSON ready."""
-    mask = photos.mask
+def _about_refined(diagnostics: dict[str, Any], photos: Photographs) -> dict[str, Any]:
+    """Say how far refinement went, what to expect of it, and which photographs it explains worst; JSON ready."""
+    refined, start, expected = diagnostics["refined"], diagnostics["start"], diagnostics["trust"]
+    mask, residual = photos.mask, refined.image_residual
     moved = angle_degrees(refined.normals[mask], start.normals[mask])
     turned = angle_degrees(refined.light_directions, start.light_directions)
-    residual = refined.image_residual
     limit = 2.0 * float(np.median(residual))
     return {
+        "kept": not expected.doubt,
+        "doubt": expected.doubt,
         "normals_moved_degrees": round(float(moved.mean()), 2),
         "lights_moved_degrees": round(float(turned.mean()), 2),
+        "expected_normal_error_degrees": round(float(expected.normals[mask].mean()), 2),
+        "expected_light_error_degrees": dict(zip(photos.files, expected.lights.round(2).tolist(), strict=True)),
         "residual": round(float(refined.pixel_residual[mask].mean()), 4),
         "unexplained": [name for name, value in zip(photos.files, residual, strict=True) if value > limit],
+        "body": refined.body.round(4).tolist(),
         "lobes": {"amplitudes": refined.amplitudes.round(4).tolist(), "sharpness": refined.sharpness.round(1).tolist()},
     }
 

@@ -168,6 +168,8 @@ def test_unips_loader(trees, data):
 def test_exported_trees_keep_every_rule(trees, data, layout):
     report = check_tree(trees[layout], layout, source=data)
     assert report.violations == [] and report.samples == len(SCENES) and report.lights == (LIGHTS, LIGHTS)
+    assert [line for line in report.warnings if "128x128" in line] == report.warnings  # the trees of tests are small
+    assert len(report.warnings) == (layout == "psfcn")
     kept = record(trees[layout])
     assert kept["layout"] == layout and set(kept["versions"]) == {"sdps", "numpy", "opencv"}
     assert set(kept["scenes"]) == {name for name, *_ in SCENES}

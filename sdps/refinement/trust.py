@@ -1,0 +1,100 @@
+"""How far refinement can be trusted: the errors to expect of it and of its start, and reasons to keep the start.
+
+The formulas were fitted on rendered scenes of shapes and lights that no network was trained on, by
+`docs/scripts/refinement_study.py --fit`; docs/studies/refinement.md shows expected against actual errors.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from sdps.core.metrics import angle_degrees
+from sdps.refinement.refined import Refined
+
+FEWEST_IMAGES = 8
+"""With fewer, what a method found is kept."""
+_PLANE = 0.08
+"""Lights are taken to lie in one plane with the object if they leave it by less, root mean square."""
+_FLAT = 0.1
+"""An object is taken to be flat if its normals spread by less, root mean square."""
+_WINDOW = 5  # pixels that a residual is averaged over
+_BEST, _LEAST = 0.008, 0.001  # the residual of a perfect model, and the least above it that is told apart
+_UPRIGHT, _STILL, _FAINT = 0.1, 0.3, 0.003
+
+NORMAL = (5.478, 0.684, -0.558, 0.074, -0.243, 0.263)
+"""Of log degrees per pixel: constant, misfit, images, residual of the pixel, its n_z, how far its normal has moved."""
+LIGHT = (5.395, 0.601, -0.558, 0.039, 0.180)
+"""Of log degrees per light: constant, misfit, images, residual of the image, how far the light has moved."""
+START = (0.439, 0.086, 0.988)
+"""Of the start's log mean degrees: constant, misfit, how far the normals have moved."""
+
+
+class Trust(NamedTuple):
+    """What to expect.
+
+    Attributes:
+        normals: (H, W) float32, expected error in degrees, zero outside the mask.
+        lights: (L,) float32, expected error in degrees.
+        start: Expected mean error of the start's normals in degrees.
+        doubt: Why the start is to be kept, in one line; empty where refinement is better.
+    """
+
+    normals: np.ndarray
+    lights: np.ndarray
+    start: float
+    doubt: str
+
+
+def trust(found: Refined, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, *, given: bool = False) -> Trust:
+    """Return the errors to expect of what refinement found.
+
+    Args:
+        found: What it found.
+        mask: (H, W) bool.
+        normals: (H, W, 3) unit, its start.
+        lights: (L, 3) unit, its start.
+        given: The lights were given. The formulas know of lights that were found; they then expect too much error, and
+            are no reason to keep the start.
+    """
+    of_normals, of_lights, moved = features(found, mask, normals, lights)
+    expected = np.zeros(mask.shape, np.float32)
+    expected[mask] = np.exp(of_normals @ NORMAL)
+    start = float(np.exp(moved @ START))
+    doubt = _doubt(mask, normals, lights)
+    if not doubt and not given and (mean := float(expected[mask].mean())) > start:
+        doubt = f"the model does not explain the photographs: {mean:.1f} degrees expected, {start:.1f} without it"
+    return Trust(expected, np.exp(of_lights @ LIGHT).astype(np.float32), start, doubt)
+
+
+def features(
+    found: Refined, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `NORMAL` (P, 6), `LIGHT` (L, 5) and `START` (3,) are multiplied with; arguments as of `trust`."""
+    pixels, images = int(mask.sum()), len(lights)
+    residual = float(found.pixel_residual[mask].mean())
+    misfit, count = np.log(max(residual - _BEST, _LEAST)), np.log(images)
+    share = ndimage.uniform_filter(mask.astype(np.float32), _WINDOW)[mask]
+    around = ndimage.uniform_filter(np.where(mask, found.pixel_residual, 0.0), _WINDOW)[mask] / share
+    turned = angle_degrees(found.normals[mask], normals[mask])
+    of_normals = np.stack([
+        np.ones(pixels), np.full(pixels, misfit), np.full(pixels, count), np.log((around + _FAINT) / residual),
+        np.log(np.maximum(found.normals[mask][:, 2], _UPRIGHT)), np.log(turned + _STILL),
+    ], axis=1)  # fmt: skip
+    shifted = angle_degrees(found.light_directions, lights)
+    of_lights = np.stack([
+        np.ones(images), np.full(images, misfit), np.full(images, count), np.log(found.image_residual / residual),
+        np.log(shifted + _STILL),
+    ], axis=1)  # fmt: skip
+    return of_normals, of_lights, np.array([1.0, misfit, np.log(turned.mean() + _STILL)])
+
+
+def _doubt(mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> str:
+    """Return why photographs such as these do not tell the shape, or nothing."""
+    if len(lights) < FEWEST_IMAGES:
+        return f"{len(lights)} images are too few to refine with; {FEWEST_IMAGES} are needed"
+    if np.linalg.svd(lights, compute_uv=False)[-1] / np.sqrt(len(lights)) < _PLANE:
+        return "the lights lie in one plane with the object, so photographs do not tell its shape"
+    if np.sqrt(np.square(normals[mask] - normals[mask].mean(axis=0)).sum(axis=1).mean()) < _FLAT:
+        return "the object is flat, so photographs do not tell its tilt from the lights' directions"
+    return ""

@@ -1,0 +1,100 @@
+"""What refinement is expected to be worth, and when the start is kept."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from sdps.api import _runner
+from sdps.core.estimate import Estimate
+from sdps.methods import pretrained
+from sdps.methods.parse import parse
+from sdps.methods.runner import Runner
+from sdps.refinement import refine as refining
+from sdps.refinement.refined import Refined
+from sdps.refinement.trust import FEWEST_IMAGES, trust
+
+SIDE, COUNT = 24, 40
+
+
+def dome() -> tuple[np.ndarray, np.ndarray]:
+    """Return normals (SIDE, SIDE, 3) and mask of a half sphere."""
+    y, x = np.mgrid[1 : -1 : SIDE * 1j, -1 : 1 : SIDE * 1j]
+    mask = x**2 + y**2 < 0.9
+    normals = np.stack([x, y, np.sqrt(np.maximum(1.0 - x**2 - y**2, 0.0))], axis=-1)
+    return (normals * mask[..., None]).astype(np.float32), mask
+
+
+def around(count: int = COUNT) -> np.ndarray:
+    """Return lights (count, 3) all around, 40 degrees off the camera."""
+    turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    return np.stack([0.64 * np.cos(turns), 0.64 * np.sin(turns), np.full(count, 0.77)], axis=1).astype(np.float32)
+
+
+def tilted(vectors: np.ndarray, degrees: float) -> np.ndarray:
+    """Return vectors turned about the y axis."""
+    sine, cosine = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+    return vectors @ np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]], np.float32)
+
+
+def found(residual: float, lights: np.ndarray) -> Refined:
+    normals, mask = dome()
+    images = np.full(len(lights), residual, np.float32)
+    return Refined(
+        normals=normals, light_directions=lights, intensities=np.ones((len(lights), 3)), albedo=normals,
+        strength=mask.astype(np.float32), body=np.zeros(4), amplitudes=np.zeros(8), sharpness=np.ones(8),
+        pixel_residual=np.where(mask, residual, 0.0).astype(np.float32), image_residual=images,
+    )  # fmt: skip
+
+
+def test_more_is_expected_of_a_model_that_fits_and_of_more_images() -> None:
+    normals, mask = dome()
+    start, lights = tilted(normals, 5.0) * mask[..., None], around()
+    good, bad = (trust(found(residual, lights), mask, start, tilted(lights, 5.0)) for residual in (0.015, 0.1))
+    assert good.normals[mask].mean() < 0.5 * bad.normals[mask].mean() and good.lights.mean() < 0.5 * bad.lights.mean()
+    assert not good.normals[~mask].any() and good.normals.shape == mask.shape and good.lights.shape == (COUNT,)
+    few = around(10)
+    assert trust(found(0.015, few), mask, start, tilted(few, 5.0)).normals.max() > good.normals.max()
+    assert good.doubt == "" and 2.0 < good.start < 10.0
+
+
+@pytest.mark.parametrize(
+    ("normals", "lights", "residual", "doubt"),
+    [
+        ("dome", around(FEWEST_IMAGES - 1), 0.015, "too few"),
+        ("dome", around() * np.array([1.0, 0.0, 1.0], np.float32), 0.015, "one plane"),
+        ("flat", around(), 0.015, "flat"),
+        ("dome", around(), 0.5, "does not explain the photographs"),
+    ],
+    ids=["few images", "coplanar lights", "flat object", "misfit"],
+)
+def test_what_cannot_be_trusted_is_doubted(normals: str, lights: np.ndarray, residual: float, doubt: str) -> None:
+    curved, mask = dome()
+    lights = lights / np.linalg.norm(lights, axis=1, keepdims=True)
+    begun = curved if normals == "dome" else np.where(mask[..., None], np.array([0.0, 0.0, 1.0], np.float32), 0.0)
+    start = tilted(begun, 1.0) * mask[..., None]
+    said = trust(found(residual, lights), mask, start, lights).doubt
+    assert doubt in said and "\n" not in said
+
+
+@pytest.mark.parametrize("count", [FEWEST_IMAGES - 1, FEWEST_IMAGES], ids=["doubted", "trusted"])
+def test_a_doubted_refinement_leaves_what_the_method_found(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    normals, mask = dome()
+    lights = around(count)
+    images = np.maximum(np.einsum("hwc,lc->lhw", normals, lights), 0.0)[..., None].repeat(3, axis=-1).astype(np.float32)
+    quick = refining.RefineConfig(coarse_pixels=200, iterations=3, fine_iterations=0)
+    monkeypatch.setattr(refining, "refine", partial(refining.refine, config=quick))
+    runner = Runner(parse("true+least-squares+refine", pretrained.require), pretrained.require)
+    estimate = runner.estimate(images, mask, lights, np.ones(count, np.float32))
+    start, expected = estimate.diagnostics["start"], estimate.diagnostics["trust"]
+    assert isinstance(start, Estimate) and bool(expected.doubt) == (count < FEWEST_IMAGES)
+    assert (estimate.normals is start.normals) == bool(expected.doubt)
+
+
+def test_refinement_is_the_default_where_networks_find_both() -> None:
+    cases = {("auto", False): True, ("lcnet+psfcn", False): True, ("auto", True): False, ("pf14", False): False}
+    for (method, lit), wanted in cases.items():
+        assert _runner(method, lit, None, None, None, images=FEWEST_IMAGES).method.refined == wanted, method
+    assert not _runner("auto", False, None, None, None, images=FEWEST_IMAGES - 1).method.refined
+    assert not _runner("auto", False, None, None, False, images=96).method.refined
+    assert _runner("pf14", False, None, None, True, images=96).method.refined
