@@ -144,9 +144,9 @@ def _section(result: "Inference") -> SectionWriter:
 
 def _box(mask: np.ndarray) -> tuple[slice, slice]:
     """Return the rows and columns of the object, with a little room around it."""
-    room = round(0.05 * max(mask.shape))
-    spans = ((places.min() - room, places.max() + room + 1) for places in np.nonzero(mask))
-    rows, columns = (slice(max(start, 0), end) for start, end in spans)
+    found = np.nonzero(mask)
+    room = round(0.06 * max(np.ptp(places) for places in found)) + 1
+    rows, columns = (slice(max(places.min() - room, 0), places.max() + room + 1) for places in found)
     return rows, columns
 
 

@@ -74,8 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     tag = f"{'merltest' if args.merltest else 'dev'}-{args.images or 'all'}{'-given' if args.lights else ''}"
     tag += f"-{args.light_error:g}" if args.light_error else ""
     results = []
-    specs = read_manifest(folder)[:: args.every]
-    for number, spec in enumerate(tqdm(specs, unit="scene", disable=None)):
+    specs = list(enumerate(read_manifest(folder)))[:: args.every]
+    for number, spec in tqdm(specs, unit="scene", disable=None):
         scene = Scene(folder, spec, not args.merltest and number % 2 == 1, args.images, args.merltest is not None)
         results.append((scene, *_refined(scene, args.out / tag, args.lights, args.light_error)))
     for line in _fit(results) if args.fit else _table(results):
@@ -105,6 +105,11 @@ def _refined(scene: Scene, out: Path, given: bool, wrong: float) -> tuple[dict[s
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             begun = {"normals": start.normals, "lights": start.light_directions, "gains": gains}
             np.savez(file, **{f"start_{name}": value for name, value in begun.items()}, **vars(found))
+    return kept(path)
+
+
+def kept(path: Path) -> tuple[dict[str, np.ndarray], Refined]:
+    """Return a start and its refinement, read back."""
     with np.load(path) as archive:
         begun = {name: archive[f"start_{name}"] for name in ("normals", "lights", "gains")}
         return begun, Refined(**{name: archive[name] for name in Refined.__dataclass_fields__})
@@ -125,11 +130,12 @@ def _errors(scene: Scene, normals: np.ndarray, lights: np.ndarray, gains: np.nda
     return (
         float(angle_degrees(normals[scene.mask], scene.normals[scene.mask]).mean()),
         float(angle_degrees(lights, scene.lights).mean()),
-        intensity_error(gains if gains.ndim == 1 else gains.mean(axis=1), scene.gains),
+        intensity_error(gains, scene.gains),
     )
 
 
-def _expected(scene: Scene, begun: dict[str, np.ndarray], found: Refined) -> Trust:
+def expected(scene: Scene, begun: dict[str, np.ndarray], found: Refined) -> Trust:
+    """Return the errors to expect."""
     given = np.array_equal(begun["lights"], found.light_directions)
     return trust(found, scene.mask, begun["normals"], begun["lights"], given=given)
 
@@ -140,14 +146,14 @@ def _table(results: list[tuple[Scene, dict[str, np.ndarray], Refined]]) -> Itera
     yield f"{'scene':28s} {'material':26s}   L  normals       lights        intensities    expected  doubt"
     for scene, begun, found in results:
         before = _errors(scene, **begun)
-        after = _errors(scene, found.normals, found.light_directions, found.intensities)
-        expected = _expected(scene, begun, found)
-        doubts += bool(expected.doubt)
-        rows.append((scene.shape, before, after, before if expected.doubt else after))
+        after = _errors(scene, found.normals, found.light_directions, found.grey_intensities)
+        judged = expected(scene, begun, found)
+        doubts += bool(judged.doubt)
+        rows.append((scene.shape, before, after, before if judged.doubt else after))
         yield (
             f"{scene.name:28s} {scene.material:26s} {len(scene.lights):3d} {before[0]:6.2f} {after[0]:6.2f} "
             f"{before[1]:6.2f} {after[1]:6.2f}  {before[2]:6.3f} {after[2]:6.3f}  "
-            f"{expected.normals[scene.mask].mean():6.2f}   {expected.doubt}"
+            f"{judged.normals[scene.mask].mean():6.2f}   {judged.doubt}"
         )
     kinds = sorted({row[0] for row in rows}) if len({row[0] for row in rows}) < 4 else []
     for kind in [*kinds, "all"]:
@@ -164,11 +170,11 @@ def _reliability(results: list[tuple[Scene, dict[str, np.ndarray], Refined]], bi
     """Yield the mean error by eighths of the expected one, every scene with the same weight."""
     normals, lights = [], []
     for scene, begun, found in results:
-        expected = _expected(scene, begun, found)
+        judged = expected(scene, begun, found)
         actual = angle_degrees(found.normals[scene.mask], scene.normals[scene.mask])
         some = np.linspace(0, len(actual) - 1, 500).astype(int)
-        normals.append(np.stack([expected.normals[scene.mask], actual])[:, some])
-        lights.append(np.stack([expected.lights, angle_degrees(found.light_directions, scene.lights)]))
+        normals.append(np.stack([judged.normals[scene.mask], actual])[:, some])
+        lights.append(np.stack([judged.lights, angle_degrees(found.light_directions, scene.lights)]))
     for name, parts in (("normals", normals), ("lights", lights)):
         pairs = np.concatenate(parts, axis=1)
         for part in np.array_split(pairs[:, np.argsort(pairs[0])], bins, axis=1):

@@ -87,7 +87,7 @@ def repeated(folder: Path, source: Path, count: int) -> Path:
 
 
 def _work(folder: Path, method: str, models: Path | None, config: InferenceConfig) -> dict[str, Any]:
-    """Do what `sdps infer` does, and tell what it took: seconds per step and in all, peak_gib, pixels, precision."""
+    """Do what `sdps infer --no-refine` does, and tell what it took: seconds per step and in all, peak_gib, pixels, precision."""
     marks = [time.perf_counter()]
 
     def done(result: Any) -> Any:
@@ -96,7 +96,7 @@ def _work(folder: Path, method: str, models: Path | None, config: InferenceConfi
 
     photos = done(load(folder))
     findings = done(tuple(check(photos)))
-    result = done(infer(photos, method, models=models, config=config, findings=findings))
+    result = done(infer(photos, method, models=models, config=config, refine=False, findings=findings))
     with tempfile.TemporaryDirectory() as out:
         done(result.save(out))
     return {

@@ -173,7 +173,7 @@ class Runner:
         diagnostics = estimate.diagnostics | {"refined": refined, "start": estimate, "trust": expected}
         if expected.doubt:
             return replace(estimate, diagnostics=diagnostics)
-        return Estimate(refined.normals, refined.light_directions, refined.intensities.mean(axis=1), diagnostics)
+        return Estimate(refined.normals, refined.light_directions, refined.grey_intensities, diagnostics)
 
     def score(
         self,

@@ -32,3 +32,9 @@ class Refined:
     sharpness: np.ndarray
     pixel_residual: np.ndarray
     image_residual: np.ndarray
+
+    @property
+    def grey_intensities(self) -> np.ndarray:
+        """Intensities (L,): channels weighted by how much of them the object reflects, since dark ones tell little."""
+        weights = self.albedo.reshape(-1, 3).sum(axis=0, dtype=np.float64)
+        return (self.intensities @ (weights / weights.sum())).astype(np.float32)

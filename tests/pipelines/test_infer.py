@@ -133,7 +133,7 @@ def test_the_two_verbs(hills: tuple) -> None:
 def test_networks_with_and_without_known_lights(hills: tuple, tmp_path: Path, capsys) -> None:
     folder, _, mask = hills
     models = random_models(tmp_path / "runs")
-    result = infer(load(folder), "sdps", models=models)
+    result = infer(load(folder), "sdps", models=models, refine=False)
     assert result.method == "lcnet + nenet" and result.light_directions.shape == (16, 3)
     assert set(result.files) == {"lcnet", "nenet"} and "light_confidence" in result.summary()
     told = infer(load(folder, lights=folder / "known.txt", frame="y-down"), "sdps", models=models)
@@ -141,7 +141,7 @@ def test_networks_with_and_without_known_lights(hills: tuple, tmp_path: Path, ca
     assert set(told.files) == {"nenet"}
     # Over all eight views an untrained network's lights average to a single one.
     config = InferenceConfig(light_views=1)
-    only = infer(load(folder), "lcnet+least-squares", models=models, config=config)
+    only = infer(load(folder), "lcnet+least-squares", models=models, config=config, refine=False)
     assert only.method == "lcnet + least-squares" and only.normals[mask].any()
 
 
@@ -149,7 +149,7 @@ def test_the_terms_of_pretrained_weights_are_told(
     hills: tuple, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     models = random_models(tmp_path / "runs")
-    result = infer(load(hills[0]), "sdps", models=models)
+    result = infer(load(hills[0]), "sdps", models=models, refine=False)
     assert result.summary()["terms"] == ""
     monkeypatch.setattr(pretrained, "shipped_folder", lambda: models / "models" / "lcnet")
     assert result.summary()["terms"] == pretrained.TERMS and "research use" in pretrained.TERMS
@@ -169,7 +169,7 @@ def test_a_method_means_the_same_to_photographs_as_to_benchmarks(
     monkeypatch.setattr(api, "Runner", runner)
     monkeypatch.setattr(api.pretrained, "require", lambda name, out: Path(name))
     with pytest.raises(InputError, match="enough"):
-        infer(load(hills[0]), "sdps-plus")
+        infer(load(hills[0]), "sdps-plus", refine=False)
     method, _, config = asked[0]
     assert method == parse("sdps-plus", Path) and config is None
     flags = build_parser(["infer"]).parse_args(["infer", "photographs"])

@@ -15,7 +15,7 @@ from sdps.api import infer, load
 def main(folder: str, models: str) -> None:
     """Infer, save, and print one line of JSON."""
     began = time.perf_counter()
-    result = infer(load(folder), "sdps", models=models)
+    result = infer(load(folder), "sdps", models=models, refine=False)
     with tempfile.TemporaryDirectory() as out:
         result.save(out)
     peak = peak_bytes() / 2**30

@@ -1,5 +1,6 @@
 """What refinement is expected to be worth, and when the start is kept."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -98,3 +99,11 @@ def test_refinement_is_the_default_where_networks_find_both() -> None:
     assert not _runner("auto", False, None, None, None, images=FEWEST_IMAGES - 1).method.refined
     assert not _runner("auto", False, None, None, False, images=96).method.refined
     assert _runner("pf14", False, None, None, True, images=96).method.refined
+
+
+def test_channels_that_the_object_hardly_reflects_say_little_of_intensities() -> None:
+    _, mask = dome()
+    of_channels = np.array([[1.0, 2.0, 9.0], [1.0, 2.0, 0.1]], np.float32)
+    albedo = np.where(mask[..., None], np.array([0.75, 0.25, 0.0], np.float32), 0.0)
+    one = replace(found(0.02, around(2)), intensities=of_channels, albedo=albedo)
+    assert np.allclose(one.grey_intensities, 1.25)
