@@ -87,7 +87,7 @@ def repeated(folder: Path, source: Path, count: int) -> Path:
 
 
 def _work(folder: Path, method: str, models: Path | None, config: InferenceConfig) -> dict[str, Any]:
-    """Do what `sdps infer --no-refine` does, and tell what it took: seconds per step and in all, peak_gib, pixels, precision."""
+    """Do what `sdps infer --no-refine` does; return seconds per step and in all, peak_gib, pixels, precision."""
     marks = [time.perf_counter()]
 
     def done(result: Any) -> Any:
