@@ -17,7 +17,7 @@ from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Re
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from pipelines.app.rooms import photo_routes, studio_routes
+from pipelines.app.rooms import data_routes, photo_routes, studio_routes
 from pipelines.app.work.jobs import Jobs
 from pipelines.app.work.sessions import COOKIE, Sessions
 from pipelines.app.work.uploads import Limits
@@ -25,7 +25,7 @@ from render.shared.errors import InputError
 from render.shared.templates import fill
 
 HERE = Path(__file__).parent
-ROOMS = {"photographs": "Photographs", "studio": "Studio"}
+ROOMS = {"photographs": "Photographs", "studio": "Studio", "data": "Data and runs"}
 _POLICY = (
     "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; connect-src 'self' blob:; "
     "object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
@@ -63,6 +63,7 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
         Route("/jobs/{number:int}/cancel", _cancel, methods=["POST"]),
         Mount("/photographs", routes=photo_routes.ROUTES),
         Mount("/studio", routes=studio_routes.ROUTES),
+        Mount("/data", routes=data_routes.ROUTES),
         Mount("/static", StaticFiles(directory=HERE / "static")),
     ]
     app = Starlette(

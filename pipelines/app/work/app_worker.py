@@ -1,11 +1,14 @@
 """The process that runs jobs: tasks by name, arguments in, stages and a result out over a pipe."""
 
+import ctypes
+import gc
 import importlib
 import resource
 import signal
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -39,7 +42,9 @@ def serve(pipe: Connection) -> None:
         answer: tuple[Any, ...]
         try:
             with listening(_teller(pipe)):
-                answer = ("done", task(name)(**arguments), memory())
+                result = task(name)(**arguments)
+            _tidy()
+            answer = ("done", result, memory())
         except InputError as error:
             answer = ("failed", str(error))
         except MemoryError:
@@ -65,6 +70,15 @@ def memory() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
     except OSError:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def _tidy() -> None:
+    """Give back what the libraries keep for later; a rare large scene would otherwise stay for good."""
+    gc.collect()
+    if "drjit" in sys.modules:
+        sys.modules["drjit"].flush_malloc_cache()
+    with suppress(OSError, AttributeError):  # other systems have no such call
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _warm() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import photo_folders as folders
 import pytest
+from app_data import write_run
 from app_server import serving
 from sdps_scenes import hemisphere_lights
 
@@ -23,7 +24,9 @@ PATIENCE = 120_000  # milliseconds; the first job loads torch and Mitsuba
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with serving(tmp_path_factory.mktemp("root")) as place:
+    folder = tmp_path_factory.mktemp("root")
+    write_run(folder / "run")
+    with serving(folder) as place:
         yield place
 
 
@@ -113,3 +116,24 @@ def test_studio(page, address: str) -> None:
     page.locator("#status").wait_for(state="hidden")
     page.click("#preset")
     page.locator("#preset-text", has_text="families").wait_for()
+
+
+def test_data_and_runs(page, address: str) -> None:
+    page.goto(f"{address}/data")
+    page.get_by_role("button", name="data: run/data").click()
+    page.locator("#tiles .note", has_text="mean radiance").first.wait_for()
+    assert page.locator("#tiles button").count() == 3
+    page.fill("#find", "failed")
+    page.locator("#tiles .note", has_text="out of memory").wait_for()
+    assert page.locator("#tiles button").count() == 1
+    page.fill("#find", "")
+    page.locator("#tiles button").first.click()
+    page.locator("#lamp-card").wait_for()
+    before = page.locator("#view").screenshot()
+    page.locator("#scrub").fill("2")
+    page.wait_for_timeout(300)
+    assert page.locator("#view").screenshot() != before
+    page.get_by_role("button", name="run: run").click()
+    page.locator("#charts article", has_text="loss").wait_for()
+    page.get_by_role("button", name="degrees").click()
+    assert page.locator("tbody tr td").first.text_content() == "cat"
