@@ -26,13 +26,15 @@ SDPS := $(VENV)/bin/sdps
 READY := $(VENV)/.ready
 ASSETS_READY := $(VENV)/.assets-ready
 DOCS_READY := $(VENV)/.docs-ready
+APP_READY := $(VENV)/.app-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
-.PHONY: help setup doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
+.PHONY: help setup app doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
 	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow test-gpu lint bench bench-train bench-classical bench-infer bench-surface docs clean
 .DEFAULT_GOAL := help
 
 help:
+	@echo "make app   a local page: photographs to surfaces, scenes to play with, data to look at"
 	@echo "make demo | test | lint | bench | bench-train | models | doctor | docs"
 	@echo "make render-data | train | eval-merltest   PRESET=smoke|demo|small|study|paper OUT=folder SET='section.field=value ...'"
 	@echo "make train MODELS=lcnet,nenet,sdps-plus   also STREAM=1: render while training, store nothing"
@@ -60,7 +62,15 @@ $(DOCS_READY): $(READY)
 	$(VENV)/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[test,docs]'
 	@touch $@
 
+$(APP_READY): $(ASSETS_READY)
+	$(VENV)/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[test,app]'
+	@touch $@
+
 setup: $(ASSETS_READY)
+
+app: OUT = out
+app: $(APP_READY)
+	$(SDPS) app '$(OUT)'
 
 doctor: $(READY)
 	$(SDPS) doctor

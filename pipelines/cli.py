@@ -47,7 +47,8 @@ DATA = Group("plan, check, preview, describe, export, relight and import data fo
 
 COMMANDS: dict[str, Command | Group] = {
     "infer": Command("infer", "find normals, lights and a surface in a folder of photographs"),
-    "doctor": Command("doctor", "show what this machine has and what is missing"),
+    "app": Command("app.app", "serve a local page for photographs, scenes and data"),
+    "doctor": Command("bench.doctor", "show what this machine has and what is missing"),
     "demo": Command("demo", "render, train, evaluate and regenerate, fitted to this machine"),
     "render-data": Command("rendering.render_data", "render the training scenes of a preset"),
     "data": DATA,

@@ -129,7 +129,7 @@ def _section(result: "Inference") -> SectionWriter:
         ("a photograph", shown[box]),
         (f"mask ({photos.mask_origin})", _masked(shown, mask)[box]),
         ("normals", pictures.normal_map(result.normals, mask)[box]),
-        ("depth, near is bright", _depth_picture(result)[box]),
+        ("depth, near is bright", depth_picture(result)[box]),
     ]
     if len(result.light_directions):
         tiles.append(("lights, seen from the camera", pictures.light_plot(result.light_directions, result.gains)))
@@ -182,7 +182,7 @@ def _masked(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) u
     return np.where(mask[..., None], picture, outside).astype(np.uint8)
 
 
-def _depth_picture(result: "Inference") -> np.ndarray:  # (H, W, 3) uint8
+def depth_picture(result: "Inference") -> np.ndarray:  # (H, W, 3) uint8
     """Return depth as grey, from the farthest (dark) to the nearest (bright) of each component, white outside."""
     z, mask = result.depth.z, result.photos.mask
     low, high = np.percentile(z[mask], (0.5, 99.5))

@@ -29,7 +29,7 @@ FOLDERS = [
     *(f"pipelines.{name}" for name in (
         "shared", "rendering", "data", "train", "report", "evaluate", "evaluate.figures", "benchmarks", "bench",
     )),
-    "pipelines",
+    "pipelines", "pipelines.app.work", "pipelines.app.rooms", "pipelines.app",
 ]  # fmt: skip
 RANK = {folder: place for place, folder in enumerate(FOLDERS)}
 PACKAGES = ("render", "sdps", "pipelines")

@@ -1,9 +1,17 @@
-"""Progress bars with ETA: live on a terminal, a line now and then in a log."""
+"""Progress: bars with ETA, live on a terminal, a line now and then in a log; and shares of stages for who listens."""
 
+import itertools
 import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from tqdm import tqdm
+
+Listener = Callable[[str, float], None]
+"""Called with the name of a stage and the share of it that is done, in [0, 1]."""
+_listener: Listener | None = None
+_place = (0, 1)
 
 
 def progress_bar(*args: Any, **options: Any) -> "tqdm[Any]":
@@ -11,3 +19,49 @@ def progress_bar(*args: Any, **options: Any) -> "tqdm[Any]":
     if not sys.stderr.isatty():
         options = {"mininterval": 20.0, "maxinterval": 20.0, "ncols": 100, "ascii": True} | options
     return tqdm(*args, **options)
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Tell `listener` the stages that `stage` names meanwhile; in one thread at a time."""
+    global _listener
+    before, _listener = _listener, listener
+    try:
+        yield
+    finally:
+        _listener = before
+
+
+@contextmanager
+def repeat(number: int, count: int) -> Iterator[None]:
+    """Take the stages inside for repeat `number` of `count`, so that their shares do not begin anew with each."""
+    global _place
+    before, _place = _place, (number, count)
+    try:
+        yield
+    finally:
+        _place = before
+
+
+def stage(name: str, done: float = 0, total: float = 1) -> None:
+    """Say that `done` of `total` steps of a stage are done; costs nothing where nobody listens."""
+    if _listener is not None:
+        number, count = _place
+        _listener(name, (number + done / total) / count)
+
+
+@contextmanager
+def together(weights: Mapping[str, float]) -> Iterator[None]:
+    """Tell who listens the share of a whole job: its stages in order, each with its part of the time; no others."""
+    outer, total = _listener, sum(weights.values())
+    if outer is None:
+        yield
+        return
+    starts = dict(zip(weights, itertools.accumulate(weights.values(), initial=0.0), strict=False))
+
+    def tell(name: str, share: float) -> None:
+        if name in weights:
+            outer(name, (starts[name] + weights[name] * share) / total)
+
+    with listening(tell):
+        yield

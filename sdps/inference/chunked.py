@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from render.shared.progress import stage
 from sdps.inference.turned_views import AnyView
 from sdps.models.base import LightingNetwork, Lights, NormalNetwork, divide
 from sdps.models.observation_maps import predict_normals
@@ -42,6 +43,7 @@ def lighting_prediction(
         extra = None if context is None else context(part)
         with autocast():
             feature = network.encode(images, mask, extra)  # (1, n, F, 8, 8)
+        stage("lights", part.stop, len(view))
         local.append(feature)
         shared = _maximum(shared, feature.amax(dim=1, keepdim=True))
     assert shared is not None  # a view has an image
@@ -67,6 +69,7 @@ def normal_map(network: NormalNetwork, view: AnyView, lights: Lights | None, aut
         seen = network.observe(images, mask, some, mean_square)
         with autocast():
             feature = _maximum(feature, network.encode(seen))
+        stage("normals", part.stop, len(view))
     assert feature is not None  # a view has an image
     with autocast():
         return network.regress(feature).float()
@@ -110,6 +113,7 @@ def pixel_normal_map(
             with autocast():
                 found = predict_normals(network, values, lights.directions[0], valid, rotations=rotations)
             normals[some[start : start + count]] = found
+        stage("normals", int(some[-1]) + 1, inside.numel())
     return normals.T.unflatten(1, inside.shape)[None]
 
 

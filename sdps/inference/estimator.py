@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from render.shared.errors import InputError
+from render.shared.progress import repeat
 from sdps.core.estimate import Estimate
 from sdps.core.lighting import ReadOut
 from sdps.core.precision import Arithmetic, arithmetic
@@ -225,9 +226,10 @@ class Estimator(InferenceConfig):
         views = self.light_views or 1
         view: View | KeptView = KeptView(read) if views > 1 else read
         found = []
-        for symmetry in SYMMETRIES[:views]:
+        for number, symmetry in enumerate(SYMMETRIES[:views]):
             turned, extra = TurnedView(view, symmetry), turned_context(symmetry, context)
-            prediction = lighting_prediction(network, turned, self.arithmetic.autocast, extra)
+            with repeat(number, views):
+                prediction = lighting_prediction(network, turned, self.arithmetic.autocast, extra)
             found.append((symmetry, network.lights(prediction, read_out)))
         return mean_lights(found)
 
@@ -238,9 +240,11 @@ class Estimator(InferenceConfig):
             assert lights is not None  # these models need lights
             return pixel_normal_map(model.network, view, lights, self.arithmetic.autocast, rotations=self.rotations)
         network, found = cast(NormalNetwork, model.network), []
-        for symmetry in SYMMETRIES[: self.normal_views or 1]:
+        views = self.normal_views or 1
+        for number, symmetry in enumerate(SYMMETRIES[:views]):
             lit = turned_lights(symmetry, lights)
-            turned = normal_map(network, TurnedView(view, symmetry), lit, self.arithmetic.autocast)
+            with repeat(number, views):
+                turned = normal_map(network, TurnedView(view, symmetry), lit, self.arithmetic.autocast)
             found.append(symmetry.back.vectors(symmetry.back.images(turned), dim=1))
         return functional.normalize(torch.stack(found).mean(0), dim=1) if len(found) > 1 else found[0]
 

@@ -7,6 +7,7 @@ What was measured: docs/studies/refinement.md.
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from render.shared.config import check_fields
 from render.shared.errors import InputError
-from render.shared.progress import progress_bar
+from render.shared.progress import progress_bar, stage
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.image_model import LOBES, SHAPES, State, difference, factors, shadowed
@@ -93,9 +94,10 @@ def refine(
     free = set(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
     fine = config.fine_iterations if stride > 1 else 0
     with progress_bar(None, total=config.iterations + fine, desc="refine", unit="iteration") as bar:
+        after = _advance(bar, config.iterations + fine)
         state = solve(
             problem, _start(problem, begun, lights, gains), free=frozenset(free), iterations=config.iterations,
-            boost=config.boost, weights=Weights(), after=bar.update,
+            boost=config.boost, weights=Weights(), after=after,
         )  # fmt: skip
         if stride > 1:
             problem, state = _finer(values, scene.mask, problem.mask, stride, state)
@@ -103,9 +105,19 @@ def refine(
             weights = Weights(curl=(config.fine_curl, config.fine_curl))
             state = solve(
                 problem, state, free=frozenset({"normals", "log_albedo", "log_strength"}), iterations=fine,
-                boost=config.fine_boost, weights=weights, after=bar.update,
+                boost=config.fine_boost, weights=weights, after=after,
             )  # fmt: skip
     return _result(scene, problem, state)
+
+
+def _advance(bar: Any, total: int) -> Callable[[], None]:
+    """Return what moves the bar on by an iteration, and says so."""
+
+    def after() -> None:
+        bar.update()
+        stage("refinement", bar.n, total)
+
+    return after
 
 
 def _check(count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> None:

@@ -1,0 +1,1 @@
+"""`sdps app`: a local page for photographs, scenes and data."""

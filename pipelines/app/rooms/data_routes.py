@@ -1,0 +1,184 @@
+"""The room "Data and runs": what lies in one folder of this machine: scenes, learning curves, results."""
+
+import asyncio
+import json
+import os
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from pipelines.report.sections import FOLDER as REPORT
+from pipelines.report.sections import read_sections
+from pipelines.shared import pictures
+from render.records.ledger import survey
+from render.records.manifest import MANIFEST, SceneSpec, read_manifest
+from render.records.shards import read_shard
+from render.shared.config import to_plain
+from render.shared.errors import InputError
+from render.shared.files import read_whole_lines
+
+_PLACE = "shard"
+_DEEP, _MOST = 4, 300
+_SIDE = 96
+_POINTS = 400  # of a learning curve
+_READING = asyncio.Semaphore(2)
+
+
+def _folder(request: Request) -> Path:
+    """Return the folder a request names, which must lie in the one that is shown.
+
+    Raises:
+        InputError: it does not, or is not there.
+    """
+    root = Path(request.app.state.folder).resolve()
+    folder = (root / request.query_params.get("folder", ".")).resolve()
+    if not folder.is_relative_to(root) or not folder.is_dir():
+        raise InputError("no such folder")
+    return folder
+
+
+async def listing(request: Request) -> Response:
+    """Send the data folders and runs there are, newest first."""
+    root = Path(request.app.state.folder).resolve()
+    found = await asyncio.to_thread(lambda: sorted(_found(root), reverse=True)[:_MOST])
+    rows = [{"folder": str(path.relative_to(root)), "kind": kind} for _, kind, path in found]
+    return JSONResponse({"root": str(request.app.state.folder), "rows": rows})
+
+
+def _found(root: Path) -> Iterator[tuple[float, str, Path]]:
+    for place, folders, files in os.walk(root):
+        path = Path(place)
+        if MANIFEST in files:
+            yield (path / MANIFEST).stat().st_mtime, "data", path
+        if REPORT in folders or any((path / "models").glob("*/metrics.jsonl")):
+            yield path.stat().st_mtime, "run", path
+        deep = len(path.relative_to(root).parts) >= _DEEP
+        folders[:] = [] if deep else [name for name in folders if name not in ("shards", "models", REPORT, "log")]
+
+
+async def scenes(request: Request) -> Response:
+    """Send the scenes of a data folder, and what became of each."""
+    folder = _folder(request)
+    return JSONResponse(await asyncio.to_thread(_scenes, folder))
+
+
+def _scenes(folder: Path) -> list[dict[str, Any]]:
+    manifest = read_manifest(folder)
+    failed = survey(folder, manifest).failed
+    return [_row(scene, folder, failed.get(scene.id)) for scene in manifest]
+
+
+def _row(scene: SceneSpec, folder: Path, failures: list[dict[str, Any]] | None) -> dict[str, Any]:
+    there = (folder / scene.file).is_file()
+    return {
+        "id": scene.id, "shape": scene.shape, "material": scene.material, "split": scene.split,
+        "lights": len(scene.lights), "size": scene.resolution[0],
+        "state": "rendered" if there else "failed" if failures else "planned",
+        "reason": str(failures[-1].get("reason", "")) if failures and not there else "",
+    }  # fmt: skip
+
+
+async def scene(request: Request) -> Response:
+    """Send the strip of pictures and the mean radiance of one scene."""
+    folder, chosen = _chosen(request)
+    async with _READING:
+        found = await asyncio.to_thread(_strip, folder / chosen.file, chosen)
+    return JSONResponse(found)
+
+
+@lru_cache(maxsize=1024)
+def _strip(path: Path, scene: SceneSpec) -> dict[str, Any]:
+    shard = read_shard(path, scene)
+    strip = pictures.fitted(pictures.preview_strip(shard, lights=3), _SIDE)
+    mean = float(shard.images[:, shard.mask].mean(dtype="float64"))
+    return {"picture": pictures.data_uri(strip, quality=82), "radiance": round(mean, 5)}
+
+
+def _chosen(request: Request) -> tuple[Path, SceneSpec]:
+    folder, name = _folder(request), request.query_params.get("id")
+    chosen = next((item for item in _manifest(folder, (folder / MANIFEST).stat().st_mtime) if item.id == name), None)
+    if chosen is None:
+        raise InputError("no such scene")
+    return folder, chosen
+
+
+@lru_cache(maxsize=4)
+def _manifest(folder: Path, _time: float) -> list[SceneSpec]:
+    return read_manifest(folder)
+
+
+async def start(request: Request) -> Response:
+    """Queue the preparation of a scene for the lamp."""
+    session = request.state.session
+    folder, chosen = _chosen(request)
+    place = session.folder / _PLACE
+    place.mkdir(exist_ok=True)
+    job = request.app.state.jobs.submit(session.token, "shard", place=str(place), shard=str(folder / chosen.file))
+    if job is None:
+        raise InputError("too many jobs wait; try again in a minute")
+    return JSONResponse(request.app.state.jobs.describe(job))
+
+
+async def file(request: Request) -> Response:
+    """Send what was made of the scene under the lamp."""
+    name = request.path_params["name"]
+    path = request.state.session.folder / _PLACE / name
+    if name not in ("basis.bin", "truth.bin") or not path.is_file():
+        return JSONResponse({"message": "no such file"}, 404)
+    return FileResponse(path)
+
+
+async def curves(request: Request) -> Response:
+    """Send the learning curves of a run as they are now: {model: {metric: [[step, value], ...]}}."""
+    folder = _folder(request)
+    return JSONResponse(await asyncio.to_thread(_curves, folder))
+
+
+def _curves(folder: Path) -> dict[str, dict[str, list[list[float]]]]:
+    found: dict[str, dict[str, list[list[float]]]] = {}
+    for path in sorted((folder / "models").glob("*/metrics.jsonl")):
+        series: dict[str, list[list[float]]] = {}
+        for row in read_whole_lines(path):
+            for key, value in row.items() if isinstance(row, dict) and "step" in row else ():
+                if key == "loss" or key.startswith("val_"):
+                    series.setdefault(key, []).append([row["step"], value])
+        found[path.parent.name] = {key: _thinned(values) for key, values in series.items()}
+    return found
+
+
+def _thinned(values: list[list[float]]) -> list[list[float]]:
+    step = -(-len(values) // _POINTS)
+    return values[::step] + ([values[-1]] if (len(values) - 1) % step else [])
+
+
+async def sections(request: Request) -> Response:
+    """Send what was evaluated: text, tables and the names of the pictures."""
+    folder = _folder(request)
+    found = await asyncio.to_thread(lambda: [to_plain(section) for _, section in read_sections(folder)])
+    return Response(json.dumps(found), media_type="application/json")
+
+
+async def picture(request: Request) -> Response:
+    """Send a picture of a section."""
+    report = _folder(request) / REPORT
+    path = (report / request.query_params.get("section", "") / request.query_params.get("file", "")).resolve()
+    if not path.is_relative_to(report) or path.suffix not in (".png", ".jpg") or not path.is_file():
+        return JSONResponse({"message": "no such file"}, 404)
+    return FileResponse(path)
+
+
+ROUTES = [
+    Route("/list", listing),
+    Route("/scenes", scenes),
+    Route("/scene", scene),
+    Route("/start", start, methods=["POST"]),
+    Route("/files/{name}", file),
+    Route("/curves", curves),
+    Route("/sections", sections),
+    Route("/picture", picture),
+]

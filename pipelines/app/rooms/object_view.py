@@ -1,0 +1,143 @@
+"""What the page shows of an object: small arrays from which the browser makes pictures under any light.
+
+Pictures are thinned to at most 384 pixels a side. Everything is in the frame x right, y up, z to the camera.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from pipelines.infer import depth_picture
+from pipelines.shared import pictures
+from render.shared.progress import stage
+from sdps.surface.meshing import mesh, write_mesh
+
+if TYPE_CHECKING:
+    from sdps.surface.inferred import Inference
+
+SIDE = 384
+_MESH_SIDE = 512
+_FULL = 65535
+
+
+def write(result: "Inference", folder: Path) -> dict[str, Any]:
+    """Write pictures, a mesh and arrays of an inference, and return what the page has to know of them.
+
+    `basis.bin` holds little-endian int16 normals (h, w, 3), n * 32767, uint16 albedo (h, w, 3) and highlight strength
+    (h, w), each over its largest value in the description; `observed.npy` (h, w, L) float16 the grey photographs and
+    `model.npy` what explains them.
+    """
+    mask, normals = result.photos.mask, result.normals
+    step = -(-max(mask.shape) // SIDE)
+    few = (slice(None, None, step), slice(None, None, step))
+    albedo, strength, lobes = _reflectance(result)
+    scale = 0.9 / max(float(np.percentile(albedo[mask], 99)), 1e-9)
+    peak, shine = float(albedo.max()) or 1.0, float(strength.max()) or 1.0
+    unit = np.where(mask[..., None], normals, 0.0)[few]
+    parts = [
+        np.rint(unit * 32767).astype("<i2"), np.rint(albedo[few] / peak * _FULL).astype("<u2"),
+        np.rint(strength[few] / shine * _FULL).astype("<u2"),
+    ]  # fmt: skip
+    (folder / "basis.bin").write_bytes(b"".join(part.tobytes() for part in parts))
+    height, width = mask[few].shape
+    Image.fromarray(pictures.normal_map(normals, mask)).save(folder / "normals.png")
+    Image.fromarray(depth_picture(result)).save(folder / "depth.png")
+    _mesh(result, folder / "mesh.ply")
+    stage("surface", 1, 2)
+    _observations(result, few, unit, albedo[few], strength[few], lobes, folder)
+    facts = result.summary()
+    found = bool(len(result.light_directions))
+    confidence = facts.get("light_confidence", {})
+    return {
+        "method": result.method, "seconds": facts["seconds"], "terms": facts["terms"], "width": width,
+        "height": height, "step": step, "full": [mask.shape[1], mask.shape[0]], "albedo": peak * scale,
+        "strength": shine * scale if lobes else 0.0, "lobes": lobes, "files": list(result.photos.files),
+        "lights": np.round(result.light_directions, 5).tolist() if found else [],
+        "intensities": _grey(result.gains).round(4).tolist() if found else [],
+        "confidence": [confidence[name] for name in result.photos.files] if confidence else [],
+        "components": result.depth.components, "integrability": facts["depth"]["residual_degrees"],
+        "residual": facts.get("lambertian_residual"),
+    }  # fmt: skip
+
+
+def shading(
+    normals: np.ndarray, albedo: np.ndarray, strength: np.ndarray, lobes: dict[str, list[float]], light: np.ndarray
+) -> np.ndarray:  # (h, w, 3)
+    """Return the radiance under a light of intensity 1: Lambert's law, or the model of `sdps.refinement.image_model`.
+
+    `static/relight.js` computes the same.
+
+    Args:
+        normals: (h, w, 3), zero outside the object.
+        albedo: (h, w, 3).
+        strength: (h, w) of the highlights.
+        lobes: `amplitudes`, `sharpness` and `body` of a refined object; empty for Lambert's law.
+        light: (3,) unit.
+    """
+    cosine = np.maximum(normals @ light, 0.0)
+    if not lobes:
+        return albedo * cosine[..., None]
+    half = light + np.array([0.0, 0.0, 1.0])
+    half = half / np.linalg.norm(half)
+    view = np.maximum(normals[..., 2], 0.02)
+    lit = np.maximum(cosine, 0.02)
+    x, y = 1.0 - lit, 1.0 - view
+    opposed = light[2] - lit * view
+    opposed = opposed / np.where(opposed > 0, np.maximum(lit, view), 1.0)
+    b = lobes["body"]
+    body = np.exp(b[0] * (x + y) + b[1] * x * y + b[2] * (x * x + y * y) + b[3] * opposed)
+    away = normals @ half - 1.0
+    glints = sum(a * np.exp(k * away) for a, k in zip(lobes["amplitudes"], lobes["sharpness"], strict=True))
+    shine = strength * glints / max(float(light @ half), 1e-3) ** 2
+    return (albedo * body[..., None] + shine[..., None]) * cosine[..., None]
+
+
+def _reflectance(result: "Inference") -> tuple[np.ndarray, np.ndarray, dict[str, list[float]]]:
+    """Return albedo (H, W, 3), strength of highlights (H, W) and lobes; grey and matt where no lights were found."""
+    refined = result.estimate.diagnostics.get("refined")
+    if refined is not None:
+        lobes = {name: getattr(refined, name).astype(float).tolist() for name in ("amplitudes", "sharpness", "body")}
+        return refined.albedo, refined.strength, lobes
+    albedo = result.albedo
+    if albedo is None:
+        albedo = np.repeat(result.photos.mask[..., None], 3, -1).astype(np.float32)
+    return albedo, np.zeros(albedo.shape[:2], np.float32), {}
+
+
+def _observations(
+    result: "Inference", few: tuple[slice, slice], normals: np.ndarray, albedo: np.ndarray, strength: np.ndarray,
+    lobes: dict[str, list[float]], folder: Path,
+) -> None:  # fmt: skip
+    """Write what every shown pixel measures in every photograph, and what the model says it should."""
+    count = len(result.photos)
+    observed = np.stack([_grey(result.photos[k : k + 1][0][few]) for k in range(count)], axis=-1)
+    np.save(folder / "observed.npy", observed.astype(np.float16))
+    if not len(result.light_directions):
+        return
+    gains = _grey(result.gains)
+    lights = result.light_directions.astype(np.float64)
+    model = np.stack(
+        [gain * _grey(shading(normals, albedo, strength, lobes, light))
+         for gain, light in zip(gains, lights, strict=True)], axis=-1,
+    )  # fmt: skip
+    scale = float((observed * model).sum() / max(float((model**2).sum()), 1e-12))
+    np.save(folder / "model.npy", (scale * model).astype(np.float16))
+
+
+def _grey(values: np.ndarray) -> np.ndarray:
+    """Return the mean of the colours, if there are any: (L, 3) to (L,), (h, w, 3) to (h, w)."""
+    return values.mean(-1) if values.ndim > 1 else values
+
+
+def _mesh(result: "Inference", path: Path) -> None:
+    """Write the surface as a PLY file of at most 512 pixels a side."""
+    mask, z = result.depth.mask, result.depth.z
+    step = -(-max(mask.shape) // _MESH_SIDE)
+    few = (slice(None, None, step), slice(None, None, step))
+    albedo = result.albedo
+    colour = None
+    if albedo is not None:
+        colour = pictures.tone_map(albedo / max(float(np.percentile(albedo[mask], 99)), 1e-9))[few]
+    write_mesh(mesh(z[few] / step, mask[few], colour=colour, normals=result.normals[few]), path)

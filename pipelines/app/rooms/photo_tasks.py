@@ -1,0 +1,184 @@
+"""What the worker does with photographs: the example, the checks, an inference and what the page shows of it.
+
+A set of photographs is a folder with `photos` (what was uploaded), `painted.png` (a mask painted on the page), `view`
+(thumbnails) and `runs/<number>`, each with `files` (what `sdps infer` writes) and `view`.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pipelines.app.rooms import object_view
+from pipelines.shared import pictures
+from render.shared.errors import InputError
+from render.shared.files import write_json
+from render.shared.progress import stage, together
+
+PHOTOS, VIEW, PAINTED, TRUTH = "photos", "view", "painted.png", "truth.npy"
+_EXAMPLE = {"shape": "bunny", "material": "red-phenolic", "lights": "near-uniform:48", "size": 256, "spp": 32}
+_THUMBNAIL, _PICTURE = 112, 640
+_CHECKING = {"reading": 2.0, "checks": 1.0, "pictures": 1.0}
+_INFERRING = {"reading": 1.0, "lights": 5.0, "normals": 30.0, "refinement": 0.0, "surface": 3.0, "files": 2.0}
+"""Stages and about how long each takes with the recommended method."""
+
+
+def example(place: str) -> dict[str, Any]:
+    """Render the bunny under 48 lights of unequal strength as 16-bit photographs with a mask; then check them."""
+    import render
+    from pipelines.evaluate.workbench import write_photographs
+
+    stage("rendering the example")
+    view = render.render_view(**_EXAMPLE)  # type: ignore[arg-type]
+    gains = np.random.default_rng(0).uniform(0.5, 2.0, len(view.images))
+    images = view.images * gains[:, None, None, None]
+    images = images / np.percentile(images[:, view.mask], 99.9)
+    write_photographs(Path(place) / PHOTOS, images, view.mask)
+    np.save(Path(place) / TRUTH, view.normals)
+    return check(place)
+
+
+def check(place: str, **options: Any) -> dict[str, Any]:
+    """Read and check the photographs, and make their thumbnails.
+
+    Args:
+        place: The set's folder.
+        options: `gamma`, `frame`, `lights` (use those beside the photographs).
+
+    Returns:
+        What the page shows.
+
+    Raises:
+        InputError: photographs that cannot be used; paths are told from the set's folder.
+    """
+    from sdps import photos as photographs
+
+    folder = Path(place)
+    with together(_CHECKING), _ShortPaths(folder):
+        stage("reading")
+        photos = _load(folder, anyway=True, **options)
+        stage("checks")
+        findings = photographs.check(photos)
+        view = folder / VIEW
+        view.mkdir(exist_ok=True)
+        exposure = pictures.auto_exposure(photos[0:1], photos.mask)
+        for number in range(len(photos)):
+            shown = pictures.tone_map(photos[number : number + 1][0], exposure)
+            _save(view / f"{number}.jpg", shown, _THUMBNAIL)
+            if number == len(photos) // 2:
+                _save(view / "picture.jpg", shown, _PICTURE)
+            stage("pictures", number + 1, len(photos))
+        Image.fromarray(photos.mask.astype(np.uint8) * 255).save(view / "mask.png")
+    height, width = photos.shape
+    return {
+        "files": list(photos.files), "width": width, "height": height, "bits": photos.bits, "gamma": str(photos.gamma),
+        "mask": photos.mask_origin if not (folder / PAINTED).is_file() else "painted",
+        "pixels": int(photos.mask.sum()), "notes": list(photos.notes), "lit": photos.light_directions is not None,
+        "findings": [{"level": item.level, "text": item.text, "images": list(item.images)} for item in findings],
+        "lights_there": _has_lights(folder / PHOTOS), "methods": methods(photos.light_directions is not None),
+    }  # fmt: skip
+
+
+def methods(lit: bool) -> list[dict[str, str]]:
+    """Return the methods that can be used, the recommended one first.
+
+    Args:
+        lit: The light directions are known.
+    """
+    import sdps
+    from sdps.classical.registry import METHODS
+    from sdps.models.registry import COMBINATIONS
+
+    there = sdps.available_methods()
+    found = [{"name": "auto", "about": "the best there is for these photographs (recommended)"}]
+    for name, about in there.items():
+        combined = name in COMBINATIONS
+        classical = name in METHODS and METHODS[name].calibrated == lit
+        if (combined and not lit) or classical or (name == "psfcn" and lit):
+            found.append({"name": name, "about": about})
+    return found
+
+
+def infer(place: str, number: int, method: str, refine: bool, anyway: bool, discontinuities: bool,
+          **options: Any) -> dict[str, Any]:  # fmt: skip
+    """Run a method, write all files of `sdps infer` and what the page shows.
+
+    Args:
+        place: The set's folder.
+        number: Of the run.
+        method, refine, anyway, discontinuities: As of `sdps.infer`.
+        options: As of `check`.
+
+    Returns:
+        What the page shows of the run.
+
+    Raises:
+        InputError: as `sdps.infer`.
+    """
+    import sdps
+    from pipelines.infer import write_page
+
+    folder = Path(place)
+    run = folder / "runs" / str(number)
+    shares = _INFERRING | ({"refinement": 40.0} if refine or method.endswith("+refine") else {})
+    with together(shares), _ShortPaths(folder):
+        stage("reading")
+        photos = _load(folder, anyway=anyway, **options)
+        stage("lights")
+        result = sdps.infer(photos, method, refine=refine, anyway=anyway, discontinuities=discontinuities)
+        stage("surface")
+        (run / "view").mkdir(parents=True, exist_ok=True)
+        shown = object_view.write(result, run / "view")
+        stage("files")
+        result.save(run / "files")
+        stage("files", 1, 2)
+        write_page(run / "files" / "report.html", result)
+    shown |= {"number": number, "error": _error(folder, result.normals, photos.mask)}
+    write_json(run / "view" / "view.json", shown)
+    return shown
+
+
+def _error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float | None:
+    """Return the mean angular error in degrees where the truth is known, which it is of the example."""
+    if not (folder / TRUTH).is_file():
+        return None
+    from sdps.core.metrics import normal_mae
+
+    truth = np.load(folder / TRUTH)
+    return round(normal_mae(normals, truth, mask & (np.linalg.norm(truth, axis=-1) > 0.5)), 2)
+
+
+def _load(folder: Path, *, anyway: bool, gamma: str = "auto", frame: str = "y-up", lights: bool = False) -> Any:
+    import sdps
+
+    painted = folder / PAINTED
+    return sdps.load(
+        folder / PHOTOS, mask=painted if painted.is_file() else None, lights="folder" if lights else None,
+        frame=frame, gamma=gamma, anyway=anyway,
+    )  # fmt: skip
+
+
+def _has_lights(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in ("lights.json", "light_directions.txt"))
+
+
+def _save(path: Path, picture: np.ndarray, side: int) -> None:
+    image = Image.fromarray(picture)
+    image.thumbnail((side, side))
+    image.save(path, quality=88)
+
+
+class _ShortPaths:
+    """Take the temporary folder out of what an error says."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, InputError):
+            text = str(error).replace(f"{self.folder / PHOTOS}/", "").replace(str(self.folder / PHOTOS), "photographs")
+            raise InputError(text.replace(f"{self.folder}/", "")) from error

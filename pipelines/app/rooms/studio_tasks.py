@@ -1,0 +1,230 @@
+"""What the worker does for the studio: scenes under one light at a time, the gallery of materials, files to keep.
+
+A scene is rendered once under lights spread over the hemisphere. The browser mixes the three images around the light
+that is dragged, so nothing is rendered while it moves.
+"""
+
+import json
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.spatial import Delaunay
+from scipy.spatial.transform import Rotation
+
+from pipelines.shared import pictures
+from render.records.manifest import SceneSpec
+from render.records.shards import Shard, read_shard, write_shard
+from render.shared.config import to_yaml
+from render.shared.errors import InputError
+from render.shared.files import atomic_path, cache_folder, write_json
+from render.shared.progress import stage
+
+UPLOADS = "uploads"
+_LIGHTS, _SPP, _SIZES = "near-uniform:60", 8, (128, 256)
+_FINAL_SPP = 64
+_HEADROOM = 4.0
+"""Largest radiance that is sent, with the brightest 5 % of the object at 0.8; highlights above it are clipped."""
+_SHAPE = re.compile(r"sphere|bunny|(blobby|sculpture):\d{1,9}")
+_MATERIAL = re.compile(r"[a-z0-9:.+-]+|lambertian:[0-9.]+(/[0-9.]+){0,2}")
+_FILES = re.compile(r"\.(ya?ml|binary|bsdf)\b|\b(maps|uv):")
+_TILE = 56
+_SEEDED = ("blobby", "sculpture")
+
+
+def gallery() -> dict[str, Any]:
+    """Return the built-in materials by category and a strip of spheres, rendered once and kept in the user's cache."""
+    import render
+    from render.materials import library
+
+    groups = library.categories()
+    names = [name for group in groups.values() for name in group]
+    picture = cache_folder() / f"studio-materials-{len(names)}-{_TILE}.jpg"
+    if not picture.is_file():
+        views = render.render_views("sphere", names, np.array([[-0.45, 0.55, 0.70]]), size=_TILE, spp=16, scale=0.95)
+        tiles = []
+        for number, view in enumerate(views):
+            exposure = pictures.auto_exposure(view.images, view.mask)
+            tiles.append(pictures.tone_map(view.images[0], exposure))
+            stage("materials", number + 1, len(names))
+        with atomic_path(picture) as temporary:
+            Image.fromarray(np.concatenate(tiles, axis=1)).save(temporary, quality=88)
+    return {"groups": groups, "tile": _TILE, "picture": pictures.data_uri(Image.open(picture))}
+
+
+def scene(place: str, direct: bool = False, **asked: Any) -> dict[str, Any]:
+    """Render a scene for the page.
+
+    Args:
+        place: Its folder; gets `basis.bin` and, with `direct`, `direct.bin`, the same without interreflections.
+        direct: Leave interreflections out.
+        asked: What `wanted` takes.
+
+    Returns:
+        What the page needs to know.
+
+    Raises:
+        InputError: an unknown shape or material, or a scene that cannot be rendered.
+    """
+    import render
+
+    spec = wanted(Path(place), **asked)
+    stage("rendering")
+    view = render.render_view(**_arguments(spec), spp=_SPP, bounces=0 if direct else spec["bounces"])
+    if direct:
+        stored = json.loads((Path(place) / "view.json").read_text(encoding="utf-8"))
+        (Path(place) / "direct.bin").write_bytes(_coded(view.images, stored["exposure"]))
+        return {}
+    exposure = pictures.auto_exposure(view.images, view.mask)
+    about = write_basis(Path(place), view.images, view.light_directions, view.normals, view.depth, view.mask, exposure)
+    return about | {"name": f"{spec['shape']}, {spec['material']}"}
+
+
+def write_basis(
+    folder: Path, images: np.ndarray, lights: np.ndarray, normals: np.ndarray, depth: np.ndarray, mask: np.ndarray,
+    exposure: float,
+) -> dict[str, Any]:  # fmt: skip
+    """Write what the page mixes a picture from, and return the rest.
+
+    `basis.bin`: uint8 images (L, h, w, 3), round(255 sqrt(radiance * exposure / 4)), then `truth.bin`: int8 normals
+    (h, w, 3), n * 127, and uint8 depth (h, w), 1 to 255 from far to near, 0 outside the mask.
+    """
+    (folder / "basis.bin").write_bytes(_coded(images, exposure))
+    inside = depth[mask]
+    near = 1 + 254 * (depth - inside.min()) / max(float(np.ptp(inside)), 1e-9)
+    parts = np.rint(normals * 127).astype(np.int8), np.where(mask, near, 0).astype(np.uint8)
+    (folder / "truth.bin").write_bytes(b"".join(part.tobytes() for part in parts))
+    about = {
+        "lights": np.round(lights.astype(float), 5).tolist(), "triangles": triangles(lights), "exposure": exposure,
+        "headroom": _HEADROOM, "width": mask.shape[1], "height": mask.shape[0],
+    }  # fmt: skip
+    write_json(folder / "view.json", about)
+    return about
+
+
+def triangles(lights: np.ndarray) -> list[list[int]]:
+    """Return triangles of neighbouring lights (L, 3), by their numbers; none where all lie on a line."""
+    try:
+        return Delaunay(lights[:, :2] / (1.0 + lights[:, 2:])).simplices.tolist()
+    except (ValueError, RuntimeError):  # QhullError is a RuntimeError
+        return []
+
+
+def shard_scene(place: str, shard: str) -> dict[str, Any]:
+    """Prepare a shard for the page, as `scene` does with what it renders."""
+    read: Shard = read_shard(Path(shard))
+    images = read.images.astype(np.float32)
+    exposure = pictures.auto_exposure(images, read.mask)
+    return write_basis(Path(place), images, read.light_directions, read.normals, read.depth, read.mask, exposure)
+
+
+def keep(place: str, **asked: Any) -> str:
+    """Render the scene well and pack shard, preset and the program that repeats it; return the name of the ZIP.
+
+    Raises:
+        InputError: as `scene`.
+    """
+    import render
+
+    folder, spec = Path(place), wanted(Path(place), **asked)
+    stage("rendering")
+    view = render.render_view(**_arguments(spec), spp=_FINAL_SPP, bounces=spec["bounces"])
+    write_shard(folder / "scene.exr", view.shard("scene"))
+    with (
+        atomic_path(folder / "scene.zip") as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as opened,
+    ):
+        opened.write(folder / "scene.exr", "scene.exr")
+        opened.writestr("scene.yaml", _test_preset(spec))
+        opened.writestr("repeat.py", _program(spec, view.scene))
+        opened.writestr("README.txt", _ABOUT)
+        for name in (spec["shape"], spec["material"]):
+            if Path(name).is_file():
+                opened.write(name, Path(name).name)
+    return "scene.zip"
+
+
+_ABOUT = """scene.exr   the shard: images under every light, normals, depth, mask
+repeat.py   writes the same shard again: python repeat.py
+scene.yaml  preset of test scenes of this shape and material, upright: sdps regenerate --preset scene.yaml --out scenes
+"""
+
+
+def training_preset(place: str, **asked: Any) -> str:
+    """Return the YAML of a preset that trains on such scenes: many shapes of the family in this material.
+
+    Raises:
+        InputError: a shape that belongs to no family.
+    """
+    spec = wanted(Path(place), **asked)
+    family = spec["shape"].split(":")[0]
+    if family not in _SEEDED:
+        raise InputError("training needs many shapes; choose blobby or sculpture, or see `meshes` in the guide")
+    data = {
+        "families": {family: 200}, "views": 2, "materials_per_view": 1, "materials": [_local(spec["material"])],
+        "bounces": spec["bounces"], "light_count": 64, "size": 128, "spp": 64,
+    }  # fmt: skip
+    return to_yaml({"name": "my-scenes", "description": f"{family} in {_local(spec['material'])}", "data": data})
+
+
+def wanted(place: Path, **asked: Any) -> dict[str, Any]:
+    """Return the shape, material and pose that were asked for, checked; uploads are files of the scene's folder.
+
+    Raises:
+        InputError: a name that is none, or a number out of range.
+    """
+    shape, material = str(asked.get("shape", "")), str(asked.get("material", ""))
+    uploads = place.parent / UPLOADS
+    if (uploads / shape).is_file() and shape:
+        shape = str(uploads / Path(shape).name)
+    elif not _SHAPE.fullmatch(shape):
+        raise InputError(f"shape {shape[:60]!r}: choose sphere, bunny, blobby:<seed>, sculpture:<seed> or load a mesh")
+    if (uploads / material).is_file() and material:
+        material = str(uploads / Path(material).name)
+    elif not _MATERIAL.fullmatch(material) or _FILES.search(material):
+        raise InputError(f"material {material[:60]!r}: give a name, lambertian:<albedo> or a pattern, or load a file")
+    try:
+        turn = [float(asked.get(name, 0.0)) for name in ("yaw", "pitch", "roll")]
+        bounces, size = int(asked.get("bounces", 1)), int(asked.get("size", 256))
+    except (TypeError, ValueError) as error:
+        raise InputError("the pose, bounces and size must be numbers") from error
+    if not np.isfinite(turn).all() or not 0 <= bounces <= 8 or size not in _SIZES:
+        raise InputError("bounces must be 0 to 8 and the size 128 or 256")
+    rotation = Rotation.from_euler("yxz", turn, degrees=True).as_matrix().round(9).tolist()
+    return {"shape": shape, "material": material, "rotation": rotation, "bounces": bounces, "size": size}
+
+
+def _arguments(spec: dict[str, Any]) -> dict[str, Any]:
+    rotation = np.array(spec["rotation"])
+    return {name: spec[name] for name in ("shape", "material", "size")} | {"lights": _LIGHTS, "rotation": rotation}
+
+
+def _local(name: str) -> str:
+    return Path(name).name if Path(name).is_file() else name
+
+
+def _coded(images: np.ndarray, exposure: float) -> bytes:
+    """Return images as uint8, the square root over the headroom."""
+    return (255 * np.sqrt(np.clip(images * (exposure / _HEADROOM), 0, 1)) + 0.5).astype(np.uint8).tobytes()
+
+
+def _test_preset(spec: dict[str, Any]) -> str:
+    test = {
+        "shapes": [_local(spec["shape"])], "materials": [_local(spec["material"])], "lights": _LIGHTS,
+        "size": spec["size"], "spp": _FINAL_SPP, "bounces": spec["bounces"], "scale": 0.9,
+    }  # fmt: skip
+    return to_yaml({"name": "my-scene", "description": "A scene of the studio.", "test": test})
+
+
+def _program(spec: dict[str, Any], made: SceneSpec) -> str:
+    """Return the Python program that writes the shard again."""
+    shape, material = repr(_local(spec["shape"])), repr(_local(spec["material"]))
+    return (
+        f'"""Writes scene.exr; its manifest line is {made.digest()}."""\n\nimport numpy as np\n\nimport render\n\n'
+        f"view = render.render_view(\n    {shape}, {material}, {_LIGHTS!r}, size={spec['size']}, spp={_FINAL_SPP}, "
+        f"bounces={spec['bounces']},\n    rotation=np.array({spec['rotation']}),\n)\n"
+        'render.write_shard("scene.exr", view.shard("scene"))\n'
+    )

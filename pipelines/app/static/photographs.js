@@ -1,0 +1,281 @@
+// The room "Photographs".
+
+import { $, ask, element, follow, post, seconds, showError } from "./jobs.js";
+import { MaskPainter } from "./mask_painter.js";
+import { MeshView } from "./mesh_view.js";
+import { LightPad, Reflectance } from "./relight.js";
+
+const state = { set: null, checked: null, runs: [], run: null, mesh: null, thumbs: [] };
+const painter = new MaskPainter($("mask"), () => { $("mask-use").disabled = $("mask-reset").disabled = false; });
+const inSet = (path) => `/photographs/sets/${state.set}/${path}`;
+
+// ---- Loading ----
+
+async function begin() {
+  state.set = (await post("/photographs/sets")).set;
+  state.runs = [];
+  for (const id of ["review", "choose", "results"]) $(id).hidden = true;
+}
+
+async function upload(files) {
+  const box = $("load-status");
+  try {
+    if (!files.length) throw new Error("nothing that can be used was chosen");
+    await begin();
+    const bar = element("progress", { max: files.length, value: 0, "aria-label": "Uploading" });
+    box.className = "status";
+    box.replaceChildren(`Loading ${files.length} file${files.length > 1 ? "s" : ""}`, bar);
+    box.hidden = false;
+    for (const file of files) {
+      await ask(inSet(`uploads/${encodeURIComponent(file.name)}`), { method: "PUT", body: file });
+      bar.value += 1;
+    }
+    await check();
+  } catch (error) { showError(box, error); }
+}
+
+async function example() {
+  const box = $("load-status");
+  $("example").disabled = true;
+  try {
+    await begin();
+    const found = await follow(await post(inSet("start/example")), box, "Example");
+    if (found) review(found);
+  } catch (error) { showError(box, error); }
+  $("example").disabled = false;
+}
+
+const USABLE = /\.(png|tiff?|jpe?g|exr|txt|json|zip)$/i;
+const usable = (files) => [...files].filter((file) => USABLE.test(file.name) && !file.name.startsWith("."));
+
+async function dropped(transfer) {
+  const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
+  const files = [];
+  const walk = async (entry) => {
+    if (entry.isFile) files.push(await new Promise((resolve, reject) => entry.file(resolve, reject)));
+    else {
+      const reader = entry.createReader();
+      for (;;) {
+        const some = await new Promise((resolve, reject) => reader.readEntries(resolve, reject));
+        if (!some.length) break;
+        for (const child of some) await walk(child);
+      }
+    }
+  };
+  for (const entry of entries) await walk(entry);
+  return usable(entries.length ? files : transfer.files);
+}
+
+// ---- Checks and mask ----
+
+const options = () => ({ gamma: $("gamma").value, lights: $("lights").checked, frame: $("frame").value });
+
+async function check() {
+  const box = $("load-status");
+  try {
+    const found = await follow(await post(inSet("start/check"), options()), box, "Checks");
+    if (found) review(found);
+  } catch (error) { showError(box, error); }
+}
+
+function review(found) {
+  state.checked = found;
+  const about = [`${found.files.length} photographs`, `${found.width} x ${found.height} pixels`, `${found.bits} bits`, `curve: ${found.gamma}`, `mask: ${found.mask}, ${found.pixels.toLocaleString("en")} pixels`];
+  $("facts").replaceChildren(...about.map((text) => element("span", {}, text)));
+  const marked = new Set(found.findings.flatMap((finding) => finding.images));
+  const stamp = Date.now();
+  $("thumbs").replaceChildren(...found.files.map((name, number) => element("figure", { class: marked.has(name) ? "marked" : "" },
+    element("img", { src: inSet(`files/view/${number}.jpg?${stamp}`), alt: name, loading: "lazy" }), element("figcaption", { title: name }, name))));
+  const items = found.findings.map(({ level, text, images }) => element("li", { class: level }, element("b", {}, `${level}: `), text,
+    images.length && images.length < found.files.length ? element("span", { class: "note" }, ` (${images.slice(0, 6).join(", ")}${images.length > 6 ? ", ..." : ""})`) : ""));
+  $("findings").replaceChildren(...(items.length ? items : [element("li", {}, "Nothing speaks against these photographs.")]));
+  $("notes").replaceChildren(...found.notes.map((note) => element("li", {}, note)));
+  $("lights-row").hidden = !found.lights_there;
+  const chosen = $("method").value;
+  $("method").replaceChildren(...found.methods.map(({ name }) => element("option", { value: name }, name === "auto" ? "recommended" : name)));
+  if (found.methods.some(({ name }) => name === chosen)) $("method").value = chosen;
+  aboutMethod();
+  painter.load(inSet(`files/view/picture.jpg?${stamp}`), inSet(`files/view/mask.png?${stamp}`));
+  $("mask-use").disabled = true;
+  $("mask-reset").disabled = found.mask !== "painted";
+  $("review").hidden = $("choose").hidden = false;
+  $("review").scrollIntoView({ behavior: "smooth" });
+}
+
+function aboutMethod() { $("method-about").textContent = state.checked.methods.find(({ name }) => name === $("method").value)?.about ?? ""; }
+
+async function sendMask(blob) {
+  try {
+    await ask(inSet("mask"), { method: "PUT", body: blob });
+    await check();
+  } catch (error) { showError($("load-status"), error); }
+}
+
+// ---- Inference ----
+
+async function infer(event) {
+  event.preventDefault();
+  $("start").disabled = true;
+  const asked = { ...options(), method: $("method").value };
+  for (const name of ["refine", "discontinuities", "anyway"]) asked[name] = $(name).checked;
+  try {
+    if (!$("mask-use").disabled) await ask(inSet("mask"), { method: "PUT", body: await painter.blob() });
+    const found = await follow(await post(inSet("start/infer"), asked), $("run-status"), "Surface");
+    if (found) { state.runs.push(found); await show(found); $("results").scrollIntoView({ behavior: "smooth" }); }
+  } catch (error) { showError($("run-status"), error); }
+  $("start").disabled = false;
+}
+
+// ---- Results ----
+
+const inRun = (path, run = state.run) => inSet(`files/runs/${run.number}/view/${path}`);
+
+async function show(run) {
+  state.run = run;
+  $("results").hidden = false;
+  $("runs").replaceChildren(...state.runs.map((other) => {
+    const button = element("button", { type: "button", "aria-pressed": other === run }, `${other.number}. ${other.method}`);
+    button.addEventListener("click", () => show(other));
+    return button;
+  }));
+  const facts = [`method: ${run.method}`, `${seconds(run.seconds)}`, `${run.components} part${run.components > 1 ? "s" : ""}`, `integrability: ${run.integrability}°`];
+  if (run.residual !== null) facts.push(`off Lambert's law: ${run.residual}`);
+  if (run.error !== null) facts.push(`normals off the truth: ${run.error}°`);
+  $("run-facts").replaceChildren(...facts.map((text) => element("span", {}, text)), ...(run.terms ? [element("span", {}, `weights: ${run.terms}`)] : []));
+  $("download").href = inSet(`runs/${run.number}/download`);
+  $("report").href = inSet(`files/runs/${run.number}/files/report.html`);
+  $("normals").src = inRun("normals.png");
+  $("depth").src = inRun("depth.png");
+  const object = new Reflectance(await (await fetch(inRun("basis.bin"))).arrayBuffer(), run);
+  if (state.run !== run) return;
+  new LightPad($("relit-light"), $("relit"), (light) => object.draw($("relit"), light), run.lights);
+  sphere(run);
+  $("cross").hidden = true;
+  $("chart").replaceChildren();
+  compare();
+  try {
+    state.mesh ??= new MeshView($("mesh"));
+    await state.mesh.load(inRun("mesh.ply"));
+  } catch (error) { $("mesh").replaceChildren(element("p", { class: "note" }, `No three dimensions here: ${error.message}`)); }
+}
+
+function sphere(run) {
+  if (!run.lights.length) {
+    $("sphere").replaceChildren();
+    $("sphere-note").textContent = "This method finds no lights.";
+    return;
+  }
+  const strongest = Math.max(...run.intensities);
+  const svg = element("svg", { viewBox: "-1.08 -1.08 2.16 2.16", role: "img", "aria-label": `${run.lights.length} lights on the hemisphere` },
+    element("circle", { r: 1, fill: "none", stroke: "currentColor", "stroke-width": 0.008 }),
+    ...[30, 60].map((angle) => element("circle", { r: Math.sin(angle * Math.PI / 180), fill: "none", stroke: "currentColor", "stroke-width": 0.004, "stroke-dasharray": "0.02 0.03" })));
+  run.lights.forEach(([x, y], number) => {
+    const part = run.intensities[number] / strongest, sure = run.confidence.length ? run.confidence[number] : 1;
+    const text = `${run.files[number]}: intensity ${part.toFixed(2)}${run.confidence.length ? `, confidence ${sure.toFixed(2)}` : ""}`;
+    svg.append(element("circle", { class: "light", cx: x, cy: -y, r: 0.02 + 0.03 * Math.sqrt(part), fill: `hsl(${45 - 20 * (1 - part)} 95% ${35 + 25 * part}%)`, stroke: "currentColor", "stroke-width": 0.008, "fill-opacity": 0.25 + 0.75 * Math.min(1, sure) }, element("title", {}, text)));
+  });
+  $("sphere").replaceChildren(svg);
+  $("sphere-note").textContent = `Seen from the camera; rings at 30° and 60°. Larger: stronger.${run.confidence.length ? " Fainter: less sure." : ""}`;
+}
+
+// ---- A pixel's intensities ----
+
+let pixel = null, asking = false;
+
+function point(event) {
+  const image = $("normals"), box = image.getBoundingClientRect(), { width, height } = state.run;
+  const scale = Math.min(box.width / width, box.height / height);
+  const column = Math.floor((event.clientX - box.left - (box.width - width * scale) / 2) / scale);
+  const row = Math.floor((event.clientY - box.top - (box.height - height * scale) / 2) / scale);
+  if (column >= 0 && row >= 0 && column < width && row < height) inspect(row, column);
+}
+
+async function inspect(row, column) {
+  pixel = [row, column];
+  const image = $("normals"), { width, height } = state.run, scale = Math.min(image.clientWidth / width, image.clientHeight / height);
+  $("cross").style.left = `${(image.clientWidth - width * scale) / 2 + (column + 0.5) * scale}px`;
+  $("cross").style.top = `${(image.clientHeight - height * scale) / 2 + (row + 0.5) * scale}px`;
+  $("cross").hidden = false;
+  if (asking) return;
+  asking = true;
+  try {
+    do {
+      const [wanted, run] = [pixel, state.run];
+      chart(await ask(inSet(`runs/${run.number}/pixel?row=${wanted[0]}&column=${wanted[1]}`)), wanted, run);
+      if (wanted === pixel) break;
+    } while (true);
+  } catch { /* a run that is gone */ }
+  asking = false;
+}
+
+function chart({ observed, model }, [row, column], run) {
+  const most = Math.max(...observed, ...(model ?? []), 1e-6), x = (i) => 4 + 92 * i / Math.max(1, observed.length - 1), y = (v) => 56 - 52 * v / most;
+  const svg = element("svg", { viewBox: "0 0 100 62", role: "img", "aria-label": `Intensities of pixel row ${row * run.step}, column ${column * run.step}` }, element("line", { x1: 4, x2: 96, y1: 56, y2: 56, stroke: "currentColor", "stroke-width": 0.3 }));
+  if (model) svg.append(element("polyline", { points: model.map((v, i) => `${x(i)},${y(v)}`).join(" "), fill: "none", stroke: "var(--accent)", "stroke-width": 0.7 }));
+  observed.forEach((v, i) => svg.append(element("circle", { cx: x(i), cy: y(v), r: 0.9, fill: "#e0702c" }, element("title", {}, `${run.files[i]}: ${v.toFixed(4)}`))));
+  $("chart").replaceChildren(svg);
+  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: ${run.lobes.body ? "the refined model" : "Lambert's law"} on what was found. ` : ""}Highest: ${most.toFixed(3)}.`;
+}
+
+// ---- Comparison ----
+
+function compare() {
+  $("compare-card").hidden = state.runs.length < 2;
+  if (state.runs.length < 2) return;
+  for (const [id, offset] of [["left", 1], ["right", 0]]) {
+    $(id).replaceChildren(...state.runs.map((run, place) => element("option", { value: place + 1 }, `${run.number}. ${run.method}`)));
+    $(id).value = state.runs.length - offset;
+  }
+  showCompared();
+}
+
+function showCompared() {
+  for (const id of ["left", "right"]) $(`${id}-image`).src = inRun(`${$("kind").value}.png`, state.runs[$(id).value - 1]);
+  divide();
+}
+
+function divide() {
+  const part = $("divide").value;
+  $("right-image").style.clipPath = `inset(0 0 0 ${part}%)`;
+  $("divider").style.left = `${part}%`;
+}
+
+// ---- Wiring ----
+
+$("choose-files").addEventListener("click", () => $("files").click());
+$("choose-folder").addEventListener("click", () => $("folder").click());
+for (const id of ["files", "folder"]) $(id).addEventListener("change", () => { const chosen = usable($(id).files); $(id).value = ""; upload(chosen); });
+$("example").addEventListener("click", example);
+$("drop").addEventListener("dragover", (event) => { event.preventDefault(); $("drop").classList.add("over"); });
+$("drop").addEventListener("dragleave", () => $("drop").classList.remove("over"));
+$("drop").addEventListener("drop", async (event) => { event.preventDefault(); $("drop").classList.remove("over"); upload(await dropped(event.dataTransfer)); });
+for (const [id, adding] of [["brush-add", true], ["brush-take", false]]) $(id).addEventListener("click", () => {
+  painter.adding = adding;
+  $("brush-add").setAttribute("aria-pressed", adding);
+  $("brush-take").setAttribute("aria-pressed", !adding);
+});
+$("brush-size").addEventListener("input", () => { painter.radius = Number($("brush-size").value); });
+$("mask-use").addEventListener("click", async () => sendMask(await painter.blob()));
+$("mask-reset").addEventListener("click", () => sendMask(new Blob([])));
+$("method").addEventListener("change", aboutMethod);
+for (const id of ["gamma", "lights", "frame"]) $(id).addEventListener("change", () => { if (id !== "frame" || $("lights").checked) check(); });
+$("form").addEventListener("submit", infer);
+const hover = $("normals").parentElement;
+hover.tabIndex = 0;
+hover.setAttribute("role", "group");
+hover.setAttribute("aria-label", "Pixels of the normal map; arrow keys move");
+hover.addEventListener("pointermove", point);
+hover.addEventListener("pointerdown", point);
+hover.addEventListener("keydown", (event) => {
+  const step = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] }[event.key];
+  if (!step) return;
+  event.preventDefault();
+  const { width, height } = state.run, [row, column] = pixel ?? [height >> 1, width >> 1], by = event.shiftKey ? 10 : 1;
+  inspect(Math.min(height - 1, Math.max(0, row + by * step[0])), Math.min(width - 1, Math.max(0, column + by * step[1])));
+});
+for (const id of ["left", "right", "kind"]) $(id).addEventListener("change", showCompared);
+$("divide").addEventListener("input", divide);
+const compared = $("divider").parentElement;
+const slide = (event) => { const box = compared.getBoundingClientRect(); $("divide").value = 100 * (event.clientX - box.left) / box.width; divide(); };
+compared.addEventListener("pointerdown", (event) => { compared.setPointerCapture(event.pointerId); slide(event); });
+compared.addEventListener("pointermove", (event) => { if (compared.hasPointerCapture(event.pointerId)) slide(event); });

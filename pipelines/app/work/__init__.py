@@ -1,0 +1,1 @@
+"""What all rooms share: visitors, uploads, the queue and its worker."""

@@ -1,0 +1,99 @@
+"""The process that runs jobs: tasks by name, arguments in, stages and a result out over a pipe."""
+
+import ctypes
+import gc
+import importlib
+import resource
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from render.shared.errors import InputError
+from render.shared.progress import listening
+
+TASKS = {
+    "example": "pipelines.app.rooms.photo_tasks:example",
+    "check": "pipelines.app.rooms.photo_tasks:check",
+    "infer": "pipelines.app.rooms.photo_tasks:infer",
+    "gallery": "pipelines.app.rooms.studio_tasks:gallery",
+    "scene": "pipelines.app.rooms.studio_tasks:scene",
+    "keep": "pipelines.app.rooms.studio_tasks:keep",
+    "preset": "pipelines.app.rooms.studio_tasks:training_preset",
+    "shard": "pipelines.app.rooms.studio_tasks:shard_scene",
+}
+"""Task by name: module and function. Loaded when first asked for."""
+_STEP = 0.004  # smallest advance of a share that is told
+
+
+def serve(pipe: Connection) -> None:
+    """Run jobs until the other end of the pipe closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
+    _warm()
+    while True:
+        try:
+            name, arguments = pipe.recv()
+        except (EOFError, OSError):
+            return
+        answer: tuple[Any, ...]
+        try:
+            with listening(_teller(pipe)):
+                result = task(name)(**arguments)
+            _tidy()
+            answer = ("done", result, memory())
+        except InputError as error:
+            answer = ("failed", str(error))
+        except MemoryError:
+            answer = ("failed", "there is not enough memory; try fewer or smaller pictures")
+        except Exception as error:  # a defect: its traceback is for the terminal, a line for the page
+            traceback.print_exc()
+            answer = ("failed", f"this should not have happened ({type(error).__name__}); see the terminal")
+        try:
+            pipe.send(answer)
+        except OSError:
+            return
+
+
+def task(name: str) -> Callable[..., Any]:
+    """Return the function of a task."""
+    module, function = TASKS[name].split(":")
+    return getattr(importlib.import_module(module), function)
+
+
+def memory() -> int:
+    """Return the bytes this process holds now; where the system does not say, the most it ever held."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def _tidy() -> None:
+    """Give back what the libraries keep for later; a rare large scene would otherwise stay for good."""
+    gc.collect()
+    if "drjit" in sys.modules:
+        sys.modules["drjit"].flush_malloc_cache()
+    with suppress(OSError, AttributeError):  # other systems have no such call
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _warm() -> None:
+    """Load what the first job would wait for."""
+    for name in ("sdps.api", "render.api"):
+        importlib.import_module(name)
+
+
+def _teller(pipe: Connection) -> Callable[[str, float], None]:
+    """Return what passes stages on, but not every one of thousands."""
+    last: list[Any] = ["", -1.0]
+
+    def tell(name: str, share: float) -> None:
+        if name != last[0] or abs(share - last[1]) >= _STEP:
+            last[:] = [name, share]
+            pipe.send(("stage", name, share))
+
+    return tell

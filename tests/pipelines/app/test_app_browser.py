@@ -1,0 +1,139 @@
+"""Every room of `sdps app` in Chromium, at two widths: it works, without console errors, and axe is content."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import photo_folders as folders
+import pytest
+from app_data import write_run
+from app_server import serving
+from sdps_scenes import hemisphere_lights
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs pip install sdps[browser]")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="needs pip install sdps[browser]")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium"),
+]
+WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
+PATIENCE = 120_000  # milliseconds; the first job loads torch and Mitsuba
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("root")
+    write_run(folder / "run")
+    with serving(folder) as place:
+        yield place
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[object]:
+    with playwright.sync_playwright() as started:
+        options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        opened = started.chromium.launch(executable_path=CHROMIUM, args=options)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(params=WIDTHS)
+def page(request: pytest.FixtureRequest, browser, address: str) -> Iterator[object]:
+    """A page whose console must stay clean, and which may ask nobody but our server."""
+    width, height = WIDTHS[request.param]
+    context = browser.new_context(viewport={"width": width, "height": height})
+    opened, wrong = context.new_page(), []
+    opened.set_default_timeout(PATIENCE)
+    opened.on("console", lambda item: wrong.append(item.text) if item.type == "error" else None)
+    opened.on("pageerror", lambda error: wrong.append(str(error)))
+    opened.on(
+        "request", lambda item: wrong.append(item.url) if not item.url.startswith((address, "blob:", "data:")) else None
+    )
+    yield opened
+    assert opened.evaluate("document.documentElement.scrollWidth") <= width, "the page scrolls sideways"
+    found = axe.Axe().run(opened).response["violations"]
+    assert not found, [(item["id"], [node["target"] for node in item["nodes"]][:4]) for item in found]
+    context.close()
+    assert not wrong
+
+
+def test_photographs(page, address: str, tmp_path: Path) -> None:
+    images, mask = folders.matte(hemisphere_lights(12, np.random.default_rng(0)), size=40)
+    folder = folders.write_folder(tmp_path, images, mask, bits=8)
+    page.goto(f"{address}/photographs")
+    page.set_input_files("#files", sorted(folder.iterdir()))
+    page.wait_for_selector("#findings li")
+    assert page.locator("#thumbs img").count() == 12
+    page.locator("#mask").scroll_into_view_if_needed()
+    box = page.locator("#mask").bounding_box()
+    page.click("#brush-take")
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.click("#mask-use")
+    page.locator("#facts span", has_text="mask: painted").wait_for()
+    for number, method in enumerate(("factorisation", "am07"), start=1):
+        page.select_option("#method", method)
+        page.click("#start")
+        page.locator("#runs button").nth(number - 1).wait_for()
+    page.locator("#compare-card").wait_for()
+    page.locator("#mesh canvas").wait_for()
+    page.locator("#sphere circle.light").nth(11).wait_for(state="attached")
+    page.locator(".hover").focus()
+    page.keyboard.press("ArrowDown")
+    page.locator("#chart polyline").wait_for()
+    before = page.locator("#relit").screenshot()
+    page.locator("#relit-light input").first.fill("150")
+    page.wait_for_timeout(200)
+    assert page.locator("#relit").screenshot() != before
+    with page.expect_download() as download:
+        page.click("#download")
+    assert download.value.suggested_filename == "sdps-infer.zip"
+
+
+def test_a_bad_upload_gets_one_line(page, address: str, tmp_path: Path) -> None:
+    (tmp_path / "<img src=x onerror=alert(1)>.txt").write_text("no")
+    page.goto(f"{address}/photographs")
+    page.set_input_files("#files", sorted(tmp_path.iterdir()))
+    page.locator("#load-status.error", has_text="no pictures in it").wait_for()
+
+
+def test_studio(page, address: str) -> None:
+    page.goto(f"{address}/studio")
+    page.locator("#rate", has_text="rendered in").wait_for()
+    box = page.locator("#view").bounding_box()
+    before = page.locator("#view").screenshot()
+    page.mouse.move(box["x"] + 20, box["y"] + 20)
+    page.mouse.down()
+    for step in range(20):
+        page.mouse.move(box["x"] + 20 + 8 * step, box["y"] + 60)
+    page.mouse.up()
+    assert page.locator("#view").screenshot() != before
+    page.select_option("#shape", "blobby")
+    page.locator("#rate", has_text="blobby:4").wait_for()
+    page.locator("#gallery button").first.wait_for()
+    page.select_option("#overlay", "interreflections")
+    page.locator("#status").wait_for(state="hidden")
+    page.click("#preset")
+    page.locator("#preset-text", has_text="families").wait_for()
+
+
+def test_data_and_runs(page, address: str) -> None:
+    page.goto(f"{address}/data")
+    page.get_by_role("button", name="data: run/data").click()
+    page.locator("#tiles .note", has_text="mean radiance").first.wait_for()
+    assert page.locator("#tiles button").count() == 3
+    page.fill("#find", "failed")
+    page.locator("#tiles .note", has_text="out of memory").wait_for()
+    assert page.locator("#tiles button").count() == 1
+    page.fill("#find", "")
+    page.locator("#tiles button").first.click()
+    page.locator("#lamp-card").wait_for()
+    before = page.locator("#view").screenshot()
+    page.locator("#scrub").fill("2")
+    page.wait_for_timeout(300)
+    assert page.locator("#view").screenshot() != before
+    page.get_by_role("button", name="run: run").click()
+    page.locator("#charts article", has_text="loss").wait_for()
+    page.get_by_role("button", name="degrees").click()
+    assert page.locator("tbody tr td").first.text_content() == "cat"

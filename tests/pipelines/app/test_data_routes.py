@@ -1,0 +1,52 @@
+"""The room "Data and runs" over HTTP: it shows what lies in its folder, and nothing else."""
+
+import json
+from pathlib import Path
+
+import pytest
+from app_data import write_run
+from app_server import Client, serving
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory):
+    pytest.importorskip("starlette", reason="needs pip install sdps[app]")
+    pytest.importorskip("uvicorn", reason="needs pip install sdps[app]")
+    folder = tmp_path_factory.mktemp("root")
+    write_run(folder / "out" / "run")
+    (folder / "secret").mkdir()
+    with serving(folder / "out") as address:
+        yield folder / "out", Client(address, "data")
+
+
+def test_folders_scenes_curves_and_results(place: tuple[Path, Client]) -> None:
+    _, client = place
+    rows = json.loads(client.get("/data/list"))["rows"]
+    assert {(row["folder"], row["kind"]) for row in rows} == {("run/data", "data"), ("run", "run")}
+    scenes = json.loads(client.get("/data/scenes?folder=run/data"))
+    assert [row["state"] for row in scenes] == ["rendered", "rendered", "failed"]
+    assert scenes[2]["reason"] == "out of memory"
+    shown = json.loads(client.get(f"/data/scene?folder=run/data&id={scenes[0]['id']}"))
+    assert shown["picture"].startswith("data:image/jpeg") and shown["radiance"] > 0
+    curves = json.loads(client.get("/data/curves?folder=run"))
+    assert curves["lcnet"]["loss"] == [[1, 2.0], [2, 1.0]]
+    (section,) = json.loads(client.get("/data/sections?folder=run"))
+    assert client.get(f"/data/picture?folder=run&section={section['name']}&file=000.png").startswith(b"\x89PNG")
+
+
+def test_a_scene_under_the_lamp(place: tuple[Path, Client]) -> None:
+    _, client = place
+    (scene, *_) = json.loads(client.get("/data/scenes?folder=run/data"))
+    job = client.wait(client.post(f"/data/start?folder=run/data&id={scene['id']}"))
+    about = job["result"]
+    assert job["state"] == "done" and len(about["lights"]) == scene["lights"]
+    assert len(client.get("/data/files/basis.bin")) == len(about["lights"]) * about["width"] * about["height"] * 3
+
+
+@pytest.mark.parametrize("folder", ["..", "../secret", "/etc", "run/../../secret", "none"])
+def test_nothing_outside_the_folder(place: tuple[Path, Client], folder: str) -> None:
+    _, client = place
+    for path in ("scenes", "curves", "sections"):
+        assert client.send("GET", f"/data/{path}?folder={folder}")[0] == 400
+    assert client.send("GET", "/data/picture?folder=run&section=..&file=../data/manifest.jsonl")[0] == 404
+    assert client.send("GET", "/data/scene?folder=run/data&id=../../x")[0] == 400

@@ -1,0 +1,173 @@
+"""The room "Photographs" over HTTP: limits, refusals, whose is what, and the way from files to a ZIP."""
+
+import io
+import json
+import os
+import struct
+import time
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import photo_folders as folders
+import pytest
+from app_server import Client, serving
+from PIL import Image
+from sdps_scenes import hemisphere_lights
+
+LIGHTS = hemisphere_lights(12, np.random.default_rng(0))
+LIMITS = {"files": 20, "bytes": 4_000_000, "pixels": 200_000}
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory):
+    pytest.importorskip("starlette", reason="needs pip install sdps[app]")
+    pytest.importorskip("uvicorn", reason="needs pip install sdps[app]")
+    with serving(tmp_path_factory.mktemp("root"), **LIMITS) as place:
+        yield place
+
+
+@pytest.fixture(scope="module")
+def hills(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    images, mask = folders.matte(LIGHTS, size=40)
+    return folders.write_folder(tmp_path_factory.mktemp("hills"), images, mask, bits=8)
+
+
+def message(answer: tuple[int, bytes], status: int = 400) -> str:
+    assert answer[0] == status, answer
+    return json.loads(answer[1])["message"]
+
+
+def archive(**files: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as opened:
+        for name, data in files.items():
+            opened.writestr(name, data)
+    return buffer.getvalue()
+
+
+def test_from_files_to_a_zip(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+    checked = client.wait(client.post(f"{path}/start/check"))
+    assert checked["state"] == "done", checked
+    assert len(checked["result"]["files"]) == len(LIGHTS)
+    assert checked["result"]["methods"][0]["name"] == "auto"
+    job = client.wait(client.post(f"{path}/start/infer", {"method": "factorisation"}))
+    assert job["state"] == "done", job
+    view = job["result"]
+    basis = client.get(f"{path}/files/runs/1/view/basis.bin")
+    assert len(basis) == view["width"] * view["height"] * 14
+    pixel = json.loads(client.get(f"{path}/runs/1/pixel?row=36&column=36"))
+    assert len(pixel["observed"]) == len(pixel["model"]) == len(LIGHTS)
+    assert message(client.send("GET", f"{path}/runs/1/pixel?row=9999&column=0"))
+    with zipfile.ZipFile(io.BytesIO(client.get(f"{path}/runs/1/download"))) as opened:
+        assert {"normal.npy", "mesh.ply", "report.html", "result.json", "relit/grazing.png"} <= set(opened.namelist())
+
+
+def test_a_painted_mask_is_used(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+    with Image.open(hills / "mask.png") as image:
+        mask = np.zeros(image.size[::-1], np.uint8)
+    mask[30:42, 30:42] = 255
+    buffer = io.BytesIO()
+    Image.fromarray(mask).save(buffer, "png")
+    assert client.send("PUT", f"{path}/mask", buffer.getvalue())[0] == 200
+    result = client.wait(client.post(f"{path}/start/check"))["result"]
+    assert (result["mask"], result["pixels"]) == ("painted", 144)
+    assert client.send("PUT", f"{path}/mask", b"")[0] == 200
+    assert client.wait(client.post(f"{path}/start/check"))["result"]["mask"] == "file"
+
+
+def test_bad_photographs_end_in_the_line_of_the_command(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set()
+    client.send("PUT", f"{path}/uploads/a.png", (hills / "1.png").read_bytes())
+    job = client.wait(client.post(f"{path}/start/check"))
+    assert job["state"] == "failed"
+    assert "only one picture, a.png" in job["message"]
+    assert "/tmp" not in job["message"] and "\n" not in job["message"]
+
+
+def test_uploads_are_limited(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set()
+    small = (hills / "1.png").read_bytes()
+    assert "cannot be used here" in message(client.send("PUT", f"{path}/uploads/a.exe", small))
+    assert "no picture" in message(client.send("PUT", f"{path}/uploads/a.png", b"nothing"))
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)  # a small file of 3.6 billion pixels
+    chunk = b"IHDR" + header
+    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    assert "a.png" in message(client.send("PUT", f"{path}/uploads/a.png", bomb))
+    assert "too large" in message(client.send("PUT", f"{path}/uploads/a.txt", bytes(LIMITS["bytes"] + 1)))
+    for number in range(LIMITS["files"]):
+        assert client.send("PUT", f"{path}/uploads/{number}.png", small)[0] == 200
+    assert "more than 20 files" in message(client.send("PUT", f"{path}/uploads/more.png", small))
+
+
+def test_archives_leave_nothing_outside_and_do_not_explode(address: str, hills: Path) -> None:
+    client = Client(address)
+    path, small = client.new_set(), (hills / "1.png").read_bytes()
+    evil = archive(**{"../../../evil.png": small, "a/b/two.png": small, ".hidden.png": small, "x.sh": b"rm"})
+    assert client.send("PUT", f"{path}/uploads/some.zip", evil)[0] == 200
+    assert not [item for item in Path("/tmp").glob("evil.png")]
+    path = client.new_set()
+    bomb = archive(**{"a.png": bytes(50_000_000)})
+    assert len(bomb) < 100_000
+    assert "too many bytes" in message(client.send("PUT", f"{path}/uploads/bomb.zip", bomb))
+    many = archive(**{f"{number}.png": small for number in range(30)})
+    assert "more than 20 files" in message(client.send("PUT", f"{client.new_set()}/uploads/many.zip", many))
+    assert "cannot be unpacked" in message(client.send("PUT", f"{client.new_set()}/uploads/no.zip", b"PK no"))
+
+
+def test_what_is_one_visitors_is_nobody_elses(address: str, hills: Path) -> None:
+    one, other = Client(address), Client(address)
+    path = one.new_set(hills)
+    job = one.post(f"{path}/start/check")
+    assert other.send("GET", f"/jobs/{job['id']}")[0] == 404
+    assert other.send("POST", f"/jobs/{job['id']}/cancel")[0] == 404
+    assert other.send("GET", f"{path}/files/photos/1.png")[0] == 400
+    assert one.send("GET", f"{path}/files/photos/1.png")[0] == 200
+    for outside in ("%2e%2e/", "..%2f", "photos/..%2f..%2f", "%2fetc/passwd"):
+        assert one.send("GET", f"{path}/files/{outside}")[0] in (400, 404)
+    one.wait(job)
+
+
+def test_foreign_pages_and_names_are_refused(address: str) -> None:
+    client = Client(address)
+    client.origin = "http://elsewhere.example"
+    assert "must come from this page" in message(client.send("POST", "/photographs/sets"), 403)
+    assert message(client.send("GET", "/photographs", Host="elsewhere.example"), 403)
+    client.origin = address
+    assert client.post("/photographs/sets")
+
+
+def test_cancel_ends_a_job_and_the_next_one_runs(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+    job = client.post(f"{path}/start/infer", {"method": "sdps-plus"})
+    waiting = client.post(f"{path}/start/infer", {"method": "sdps-plus"})
+    while json.loads(client.get(f"/jobs/{job['id']}"))["state"] == "queued":
+        time.sleep(0.02)
+    assert client.post(f"/jobs/{waiting['id']}/cancel")["state"] == "cancelled"
+    assert client.post(f"/jobs/{job['id']}/cancel")["state"] == "cancelled"
+    assert client.wait(client.post(f"{path}/start/check"))["state"] == "done"
+
+
+def test_names_are_escaped(address: str) -> None:
+    status, page = Client(address).send("GET", "/%3Cscript%3E")
+    assert status == 404 and b"<script>" not in page
+
+
+def test_sessions_end(tmp_path: Path) -> None:
+    from pipelines.app.work.sessions import Sessions
+
+    sessions = Sessions()
+    first, second = sessions.create(), sessions.create()
+    second.used = first.used + 1
+    assert sessions.expire(idle=1e9, most=1) == [first.token]
+    assert not first.folder.exists() and second.folder.exists() and sessions.find(first.token) is None
+    sessions.close()
+    assert not sessions.folder.exists() and os.path.isdir(sessions.folder.parent)
