@@ -2,7 +2,7 @@
 
     python docs/scripts/refinement_study.py --out out/refinement
     python docs/scripts/refinement_study.py --out out/refinement --images 8
-    python docs/scripts/refinement_study.py --out out/refinement --fit
+    python docs/scripts/refinement_study.py --out out/refinement --every 3 --images 0 8 16 32 --fit
 
 48 scenes of shapes that no network was trained on, 96 lights; of every other scene only the 19 to 38 lights within 50
 degrees of the camera. Random intensities. The start is `sdps-plus` with nothing given, or `psfcn` with the true lights
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Render, start, refine, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--images", type=int, default=0, help="of each scene (default: all)")
+    parser.add_argument("--images", type=int, nargs="+", default=[0], help="of each scene (default: all)")
     parser.add_argument("--lights", action="store_true", help="lights are given")
     parser.add_argument("--light-error", type=float, default=0.0, help="degrees; intensities are off by 1 %% a degree")
     parser.add_argument("--merltest", type=Path, help="folder with the scenes of eval-merltest")
@@ -71,12 +71,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--fit", action="store_true", help="print the constants of sdps/refinement/trust.py")
     args = parser.parse_args(argv)
     folder = args.merltest or _rendered(args.out / "scenes")
-    tag = f"{'merltest' if args.merltest else 'dev'}-{args.images or 'all'}{'-given' if args.lights else ''}"
-    tag += f"-{args.light_error:g}" if args.light_error else ""
-    results = []
     specs = list(enumerate(read_manifest(folder)))[:: args.every]
-    for number, spec in tqdm(specs, unit="scene", disable=None):
-        scene = Scene(folder, spec, not args.merltest and number % 2 == 1, args.images, args.merltest is not None)
+    results = []
+    for (number, spec), images in tqdm([(spec, images) for images in args.images for spec in specs], disable=None):
+        tag = f"{'merltest' if args.merltest else 'dev'}-{images or 'all'}{'-given' if args.lights else ''}"
+        tag += f"-{args.light_error:g}" if args.light_error else ""
+        scene = Scene(folder, spec, not args.merltest and number % 2 == 1, images, args.merltest is not None)
         results.append((scene, *_refined(scene, args.out / tag, args.lights, args.light_error)))
     for line in _fit(results) if args.fit else _table(results):
         sys.stdout.write(f"{line}\n")

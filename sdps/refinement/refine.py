@@ -23,6 +23,7 @@ from sdps.refinement.image_model import LOBES, SHAPES, State, difference, factor
 from sdps.refinement.refined import Refined
 
 _FEWEST = 4
+_OF_PIXELS = frozenset({"normals", "log_albedo", "log_strength"})
 _SHARPEST, _BROADEST = 300.0, 10.0
 _START_HEIGHT = -4.0
 _LIT_SHARE = 0.1
@@ -91,12 +92,12 @@ def refine(
     values = _gathered(scene)
     problem = _problem(values, scene.mask, stride, gains)
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
-    free = set(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
+    free = frozenset(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
     fine = config.fine_iterations if stride > 1 else 0
     with progress_bar(None, total=config.iterations + fine, desc="refine", unit="iteration") as bar:
         after = _advance(bar, config.iterations + fine)
         state = solve(
-            problem, _start(problem, begun, lights, gains), free=frozenset(free), iterations=config.iterations,
+            problem, _start(problem, begun, lights, gains), free=free, iterations=config.iterations,
             boost=config.boost, weights=Weights(), after=after,
         )  # fmt: skip
         if stride > 1:
@@ -104,9 +105,8 @@ def refine(
         if fine:
             weights = Weights(curl=(config.fine_curl, config.fine_curl))
             state = solve(
-                problem, state, free=frozenset({"normals", "log_albedo", "log_strength"}), iterations=fine,
-                boost=config.fine_boost, weights=weights, after=after,
-            )  # fmt: skip
+                problem, state, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights, after=after
+            )
     return _result(scene, problem, state)
 
 

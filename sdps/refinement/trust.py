@@ -22,11 +22,13 @@ _WINDOW = 5  # pixels that a residual is averaged over
 _BEST, _LEAST = 0.008, 0.001  # the residual of a perfect model, and the least above it that is told apart
 _UPRIGHT, _STILL, _FAINT = 0.1, 0.3, 0.003
 
-NORMAL = (5.478, 0.684, -0.558, 0.074, -0.243, 0.263)
-"""Of log degrees per pixel: constant, misfit, images, residual of the pixel, its n_z, how far its normal has moved."""
-LIGHT = (5.395, 0.601, -0.558, 0.039, 0.180)
-"""Of log degrees per light: constant, misfit, images, residual of the image, how far the light has moved."""
-START = (0.439, 0.086, 0.988)
+NORMAL = (4.200, 0.569, -0.441, -0.128, 0.085, -0.367, 0.315)
+"""Of log degrees per pixel: constant, misfit, images, the lights' spread, residual of the pixel, its n_z, how far its
+normal has moved."""
+LIGHT = (5.173, 0.652, -0.466, -0.093, 0.033, 0.036)
+"""Of log degrees per light: constant, misfit, images, the lights' spread, residual of its image, how far it has moved.
+"""
+START = (0.348, 0.067, 0.992)
 """Of the start's log mean degrees: constant, misfit, how far the normals have moved."""
 
 
@@ -70,21 +72,23 @@ def trust(found: Refined, mask: np.ndarray, normals: np.ndarray, lights: np.ndar
 def features(
     found: Refined, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what `NORMAL` (P, 6), `LIGHT` (L, 5) and `START` (3,) are multiplied with; arguments as of `trust`."""
+    """Return what `NORMAL` (P, 7), `LIGHT` (L, 6) and `START` (3,) are multiplied with; arguments as of `trust`."""
     pixels, images = int(mask.sum()), len(lights)
     residual = float(found.pixel_residual[mask].mean())
     misfit, count = np.log(max(residual - _BEST, _LEAST)), np.log(images)
+    spread = 0.5 * np.log(max(found.light_directions.var(axis=0).sum(), _LEAST))
     share = ndimage.uniform_filter(mask.astype(np.float32), _WINDOW)[mask]
     around = ndimage.uniform_filter(np.where(mask, found.pixel_residual, 0.0), _WINDOW)[mask] / share
     turned = angle_degrees(found.normals[mask], normals[mask])
     of_normals = np.stack([
-        np.ones(pixels), np.full(pixels, misfit), np.full(pixels, count), np.log((around + _FAINT) / residual),
-        np.log(np.maximum(found.normals[mask][:, 2], _UPRIGHT)), np.log(turned + _STILL),
+        np.ones(pixels), np.full(pixels, misfit), np.full(pixels, count), np.full(pixels, spread),
+        np.log((around + _FAINT) / residual), np.log(np.maximum(found.normals[mask][:, 2], _UPRIGHT)),
+        np.log(turned + _STILL),
     ], axis=1)  # fmt: skip
     shifted = angle_degrees(found.light_directions, lights)
     of_lights = np.stack([
-        np.ones(images), np.full(images, misfit), np.full(images, count), np.log(found.image_residual / residual),
-        np.log(shifted + _STILL),
+        np.ones(images), np.full(images, misfit), np.full(images, count), np.full(images, spread),
+        np.log(found.image_residual / residual), np.log(shifted + _STILL),
     ], axis=1)  # fmt: skip
     return of_normals, of_lights, np.array([1.0, misfit, np.log(turned.mean() + _STILL)])
 

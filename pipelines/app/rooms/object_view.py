@@ -96,8 +96,9 @@ def shading(
 
 def _reflectance(result: "Inference") -> tuple[np.ndarray, np.ndarray, dict[str, list[float]]]:
     """Return albedo (H, W, 3), strength of highlights (H, W) and lobes; grey and matt where no lights were found."""
-    refined = result.estimate.diagnostics.get("refined")
-    if refined is not None:
+    found = result.estimate.diagnostics
+    refined = found.get("refined")
+    if refined is not None and not found["trust"].doubt:
         lobes = {name: getattr(refined, name).astype(float).tolist() for name in ("amplitudes", "sharpness", "body")}
         return refined.albedo, refined.strength, lobes
     albedo = result.albedo
