@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from pipelines.bench import bench_data
@@ -40,6 +41,7 @@ class BenchConfig:
         mirror: Mirror-like material, whose highlights get samples of their own.
         textured: Textured material with a relief.
         layered: Texture with fitted materials in its regions.
+        composition: Composition, enlarged until it covers as much of the frame as the shape.
         size: Image side in pixels.
         lights: Number of lights.
         spp: Camera samples per pixel.
@@ -56,6 +58,7 @@ class BenchConfig:
     mirror: str = "chrome"
     textured: str = "procedural:tiles:5"
     layered: str = "procedural:wood:5:blue-acrylic+gold-metallic-paint"
+    composition: str = "composition:15"
     size: int = 128
     lights: int = 64
     spp: int = 64
@@ -82,6 +85,8 @@ LABELS = {
     "near lights, perspective": "all lights at once, near ones, perspective camera",
     "textured": "all lights at once, a textured material",
     "layered": "all lights at once, fitted materials in a texture",
+    "composition": "all lights at once, a composition, two materials by object",
+    "composition, 3 bounces": "the same with three bounces, as presets have it",
     "twice the lights": "all lights at once, twice as many",
     "twice the size": "all lights at once, twice the image side",
     "path": "Mitsuba `path`, one light after another",
@@ -100,6 +105,8 @@ RATIOS = {
     "near and perspective / plain": ("near lights, perspective", "one material", 0, ""),
     "textured / plain material": ("textured", "one material", 0, "at most 1.5"),
     "layered / plain material": ("layered", "one material", 0, "at most 1.5"),
+    "composition / plain": ("composition", "one material", 0, "at most 1.5"),
+    "composition of 3 bounces / plain": ("composition, 3 bounces", "one material", 0, "at most 1.5"),
 }
 
 
@@ -151,9 +158,13 @@ def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], 
 
     pinhole = replace(view, camera_distance=_CAMERA * config.scale)
     near = np.linspace(*_NEAR, config.lights) * config.scale
+    heap, framed = _composition(config)
+    dealt, heaped = pack([f"parts:0:{config.material}+{config.second}"], heap), scene.build(heap)
 
-    def all_lights(surfaces: Any = one, count: int = config.lights, seen: View = view, **changes: Any) -> None:
-        truth, images = many_lights.render(built, seen, surfaces, lights[:count], **settings | changes)
+    def all_lights(
+        surfaces: Any = one, count: int = config.lights, seen: View = view, hit: Any = built, **changes: Any
+    ) -> None:
+        truth, images = many_lights.render(hit, seen, surfaces, lights[:count], **settings | changes)
         means = [float(image[0].mean()) for _, image in images]
         if surfaces is one and seen is view and not changes and count == config.lights:
             found["coverage"], found["mean"] = float(truth.coverage.mean()), means[0]
@@ -173,9 +184,25 @@ def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], 
         "near lights, perspective": lambda: all_lights(seen=pinhole, distances=near),
         "textured": lambda: all_lights(textured),
         "layered": lambda: all_lights(layered),
+        "composition": lambda: all_lights(dealt, seen=framed, hit=heaped),
+        "composition, 3 bounces": lambda: all_lights(dealt, seen=framed, hit=heaped, bounces=3),
         "twice the lights": lambda: all_lights(count=2 * config.lights),
         "twice the size": lambda: all_lights(size=2 * config.size),
     }
+
+
+def _composition(config: BenchConfig) -> tuple[Any, View]:
+    """Return the composition and a view of it from above in which it covers as much as the shape does."""
+    from render import shapes
+    from render.planning.framing import measure
+
+    mesh, low, high = shapes.load(config.composition), 0.1, 4.0
+    wanted = measure(shapes.load(config.shape), View(scale=config.scale)).foreground
+    view = View(rotation=tuple(Rotation.from_euler("x", 40, degrees=True).as_matrix().ravel()))
+    for _ in range(12):
+        view = replace(view, scale=(low + high) / 2)
+        low, high = (low, view.scale) if measure(mesh, view).foreground > wanted else (view.scale, high)
+    return mesh, view
 
 
 def _lights(config: BenchConfig, count: int) -> np.ndarray:

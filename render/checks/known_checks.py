@@ -53,6 +53,7 @@ CONTENT = (
     Check("lights", ERROR, "unit directions above the horizon", "check where the directions come from",
           shard_checks.lights),
     Check("weights", ERROR, "material weights in [0, 1], sum 1", _AGAIN, shard_checks.material_weights),
+    Check("objects", ERROR, "an object in every pixel of the mask", _AGAIN, shard_checks.objects),
     Check("black", ERROR, "no image black though its light faces the object", _AGAIN, light_checks.black_images),
     Check("shading", ERROR, "intensity rises with n.l as the frame says",
           "check the signs of normals and lights (x right, y up, z to the camera) and the order of the lights",

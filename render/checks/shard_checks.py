@@ -111,12 +111,16 @@ def facing_normals(shard: Shard, limits: Limits) -> Complaints:
 
 
 def mask_area(shard: Shard, limits: Limits) -> Complaints:
-    """The mask covers a share of the frame within bounds, and is where at least half the samples hit."""
+    """The mask covers a share of the frame within bounds, and is where at least half the samples hit.
+
+    A composition may fill the frame: its ground goes on where an object would end.
+    """
     area = float(shard.mask.mean())
-    if not limits.min_area <= area <= limits.max_area:
-        severity = max(limits.min_area - area, area - limits.max_area)
+    most = limits.max_area if shard.objects is None else 1.0
+    if not limits.min_area <= area <= most:
+        severity = max(limits.min_area - area, area - most)
         yield (
-            f"the mask covers {area:.1%} of the frame (limits {limits.min_area:.0%} to {limits.max_area:.0%})",
+            f"the mask covers {area:.1%} of the frame (limits {limits.min_area:.0%} to {most:.0%})",
             severity,
         )
     if shard.coverage.min() < 0 or shard.coverage.max() > 1:
@@ -202,6 +206,15 @@ def lights(shard: Shard, limits: Limits) -> Complaints:
             yield f"a light's position lies off its direction by {error:.3g} (limit {limits.unit_error:g})", error
     if len(below):
         yield f"{len(below)} lights are below the horizon (the first is number {below[0]})", float(len(below))
+
+
+def objects(shard: Shard, limits: Limits) -> Complaints:
+    """Compositions: every pixel of the mask shows an object, and none outside does."""
+    if shard.objects is None:
+        return
+    different = float(((shard.objects > 0) != shard.mask).mean())
+    if different:
+        yield f"mask and objects disagree on {different:.1%} of the pixels", different
 
 
 def material_weights(shard: Shard, limits: Limits) -> Complaints:

@@ -38,6 +38,7 @@ class GroundTruth:
     coverage: np.ndarray  # (H, W) float32
     weights: tuple  # per surface (M, H, W) float32, weights of its materials, or None for a single material
     turned: tuple  # per surface (H, W, 3) float32, normals with its relief, or None where it has none
+    objects: np.ndarray | None = None  # (H, W) uint32, 1 + number of the object, 0 outside; None where there is one
 
     def normals_of(self, number: int) -> np.ndarray:
         """Return the normals (H, W, 3) float32 that a surface shows."""
@@ -142,4 +143,13 @@ def _ground_truth(passes: list[Paths], size: int, spp: int) -> GroundTruth:
             None if sums[0] is None else unit(sum(sums))
             for sums in zip(*(paths.turned_sums for paths in passes), strict=True)
         ),
+        objects=_objects(passes, mask, size),
     )
+
+
+def _objects(passes: list[Paths], mask: np.ndarray, size: int) -> np.ndarray | None:
+    """Return the object that most samples of each pixel hit, of equal ones the first."""
+    found = [paths.object_hits for paths in passes if paths.object_hits is not None]
+    if not found:
+        return None
+    return np.where(mask, 1 + np.sum(found, axis=0).argmax(1), 0).reshape(size, size).astype(np.uint32)

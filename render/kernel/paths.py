@@ -17,6 +17,7 @@ from render.kernel.visibility import probe_count, probed_visibility, visibility
 from render.materials.kernels.packed import PackedSurfaces
 from render.materials.kernels.textures.cover import Place
 from render.records.manifest import View
+from render.shapes.geometry.mesh import TriangleMesh
 
 mi = variant.load()
 
@@ -32,6 +33,7 @@ class Vertices:
     position: Any  # Point3f (N)
     normal: Any  # Vector3f (N), shading normal
     wi: Any  # Vector3f (N, or 1 at an orthographic camera's hits), to the previous vertex
+    prim: Any  # UInt32 (N), triangle
     sample: Any  # UInt32 (N), number of the camera sample
     bitmask: Any  # UInt32 (ceil(L / 32) * N)
     throughput: tuple  # K Color3f (N, or 1 at the camera hits): f cos / density along the path so far
@@ -64,6 +66,7 @@ class Paths:
         depth_sum: (P,) float64, sum of z of the hits, in half image widths.
         weight_sums: Per surface (M, P) float64, sum of the weights of its materials over the hits, or None.
         turned_sums: Per surface (P, 3) float64, as `normal_sum` with its relief, or None.
+        object_hits: (P, O) uint32, samples per pixel that hit each object of a composition, or None.
     """
 
     depths: tuple[Vertices, ...]
@@ -79,6 +82,7 @@ class Paths:
     depth_sum: np.ndarray
     weight_sums: tuple
     turned_sums: tuple
+    object_hits: np.ndarray | None
 
     @property
     def directions(self) -> Any:
@@ -127,7 +131,7 @@ def trace(
             seen = visibility(*rays, coherent=depth == 0)
         centre, spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and halves else (None, None)
         covers = surfaces.at(Place(mi.Vector3f(position), normal, prim, uv), wi)  # weights, turned normals
-        lit = position, normal, wi, sample, seen, throughput
+        lit = position, normal, wi, prim, sample, seen, throughput
         depths.append(Vertices(len(kept), *lit, *covers, centre, spread, *segments))
         if depth < bounces:
             ray, factors = _bounce(depths[-1], facet, surfaces, seed, depth + 1, first, spp)
@@ -136,7 +140,7 @@ def trace(
     if halves and depths:
         glints = highlights.find(scene, camera, emitters, halves, len(lights), surfaces, spp, seed, first)
     shared = emitters, parallel, halves, len(lights), size, spp
-    return Paths(tuple(depths), glints, *shared, *_sums(depths, camera, surfaces))
+    return Paths(tuple(depths), glints, *shared, *_sums(depths, camera, surfaces, scene.mesh, spp))
 
 
 def take(kind: type, source: Any, index: Any) -> Any:
@@ -244,8 +248,8 @@ def _segments(sample: Any, spp: int, pixel_count: int) -> tuple:
     return pixels, start, length
 
 
-def _sums(depths: list[Vertices], camera: Camera, surfaces: PackedSurfaces) -> tuple:
-    """Sum hits, camera-frame normals, depths and material weights of the first vertices per pixel."""
+def _sums(depths: list[Vertices], camera: Camera, surfaces: PackedSurfaces, mesh: TriangleMesh, spp: int) -> tuple:
+    """Sum hits, camera-frame normals, depths, material weights and objects of the first vertices per pixel."""
     pixel_count = camera.size**2
     hits, normals, depth = np.zeros(pixel_count, np.uint32), np.zeros((pixel_count, 3)), np.zeros(pixel_count)
     sums: list = []
@@ -266,7 +270,15 @@ def _sums(depths: list[Vertices], camera: Camera, surfaces: PackedSurfaces) -> t
             turned.append(None if relief is None else np.zeros((pixel_count, 3)))
             if relief is not None:
                 turned[-1][pixels] = np.stack(_pixel_sums(first, list(camera.rotation @ relief)), axis=1)
-    return hits, normals, depth, tuple(sums), tuple(turned)
+    objects = None if mesh.objects is None or not depths else _object_hits(mesh.objects, depths[0], spp, pixel_count)
+    return hits, normals, depth, tuple(sums), tuple(turned), objects
+
+
+def _object_hits(objects: np.ndarray, vertices: Vertices, spp: int, pixel_count: int) -> np.ndarray:
+    """Count the samples of each pixel that hit each object, (P, O)."""
+    count = int(objects.max()) + 1
+    cells = (np.array(vertices.sample, np.int64) // spp) * count + objects[np.array(vertices.prim)]
+    return np.bincount(cells, minlength=pixel_count * count).reshape(pixel_count, count).astype(np.uint32)
 
 
 def _pixel_sums(vertices: Vertices, values: Sequence) -> list[np.ndarray]:

@@ -21,7 +21,7 @@ PATTERNS = {
     "stripes": "warped bands, sharp edges",
     "noise": "smooth random regions that blend into each other",
     "gradient": "a slow change from one material to the next along a direction",
-    "parts": "the separate pieces of a mesh, or large regions of one that is in one piece",
+    "parts": "the objects of a composition, the separate pieces of a mesh, or large regions of one in one piece",
 }
 MOST_COMPONENTS = 8
 

@@ -5,14 +5,15 @@ from dataclasses import dataclass, field
 from render.materials.surfaces import MOST_COMPONENTS, PATTERNS
 from render.planning import light_sets
 from render.planning.mesh_family import MeshFamily
-from render.records.manifest import OWN_MESHES
+from render.records.manifest import COMPOSITION, OWN_MESHES
 from render.shared.config import check_fields
 from render.shared.errors import InputError, unknown
 
-UPRIGHT = ("sculpture", "bunny")  # families that stand; others have no up
+UPRIGHT = ("sculpture", "bunny", COMPOSITION)  # families that stand; others have no up
 LARGEST_SCALE = 10.0  # of a view
 PERSPECTIVE = "perspective"
-CAMERAS = ("orthographic", PERSPECTIVE)
+MIXED = "mixed"  # each view one of the two
+CAMERAS = ("orthographic", PERSPECTIVE, MIXED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +45,14 @@ class DataConfig:
             `near_light_distance`, in the directions that `lights` gives from the object's centre, where their
             irradiance is pi.
         near_light_distance: Range of these distances, in half image widths, drawn uniformly in 1 / distance.
-        camera: `orthographic`, or `perspective` for all views.
+        camera: `orthographic` or `perspective` for all views, or `mixed`: half of the views each, drawn at random.
         camera_distance: Range of the distance of a perspective camera from the plane of the object's centre, in half
             image widths, drawn as that of lights. The field of view is 2 atan(1 / distance): 28 to 11 degrees.
         size: Image side in pixels, a multiple of 4.
         spp: Camera samples per pixel.
         bounces: Interreflection bounces.
+        composition_bounces: The same for compositions, whose objects light each other.
+        composition_materials: Fewest and most materials of a composition, each on objects of its own; from 1 to 8.
         scale: Range of the radius of the bounding sphere of blobs, in half image widths.
         upright_scale: The same for standing shapes, which fill less of their bounding sphere.
         offset: Largest image-plane offset of the object, in half image widths, per unit of scale above 0.5.
@@ -81,6 +84,8 @@ class DataConfig:
     size: int = 128
     spp: int = 128
     bounces: int = 2
+    composition_bounces: int = 3
+    composition_materials: tuple[int, int] = (2, 5)
     scale: tuple[float, float] = (0.75, 1.25)
     upright_scale: tuple[float, float] = (0.95, 2.0)
     offset: float = 0.25
@@ -93,8 +98,9 @@ class DataConfig:
         check_fields(self, "not negative", "seed")
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 from 16 up, got {self.size}")
-        if not 0 <= self.bounces <= 16:
-            raise InputError(f"bounces must be in 0..16, got {self.bounces}")
+        for name in ("bounces", "composition_bounces"):
+            if not 0 <= getattr(self, name) <= 16:
+                raise InputError(f"{name} must be in 0..16, got {getattr(self, name)}")
         if not 0 <= self.validation <= 0.5:
             raise InputError(f"validation must be in [0, 0.5], got {self.validation}")
         if self.lights not in light_sets.DISTRIBUTIONS:
@@ -120,6 +126,11 @@ class DataConfig:
         low, high = self.mixture
         if not 2 <= low <= high <= MOST_COMPONENTS:
             raise InputError(f"mixture must be two rising numbers in 2..{MOST_COMPONENTS}, got {low}, {high}")
+        low, high = self.composition_materials
+        if not 1 <= low <= high <= MOST_COMPONENTS:
+            raise InputError(
+                f"composition_materials must be two rising numbers in 1..{MOST_COMPONENTS}, got {low}, {high}"
+            )
         for name, weight in self.material_weights.items():
             if not 0 <= weight <= 100:
                 raise InputError(f"material_weights.{name} must be in [0, 100], got {weight}")
@@ -146,11 +157,11 @@ class DataConfig:
             raise InputError(f"near_lights must be in [0, 1], got {self.near_lights}")
         if self.camera not in CAMERAS:
             raise unknown("value for camera:", self.camera, CAMERAS)
-        if self.camera == PERSPECTIVE and self.tiles > 1:
+        if self.camera != "orthographic" and self.tiles > 1:
             raise InputError("tiles: parts of an image need camera: orthographic; set tiles to 1")
         sizes = {family: (self.upright_scale if self.stands(family) else self.scale)[1] for family in self.families}
         largest = max(size * self.tiles_of(family) for family, size in sizes.items())
-        used = {"near_light_distance": self.near_lights > 0, "camera_distance": self.camera == PERSPECTIVE}
+        used = {"near_light_distance": self.near_lights > 0, "camera_distance": self.camera != "orthographic"}
         for name, is_used in used.items():
             low, high = getattr(self, name)
             if not 0 < low <= high:

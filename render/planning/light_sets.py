@@ -58,6 +58,16 @@ def _around_axis(z: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
+def mixed(count: int, rng: np.random.Generator) -> np.ndarray:  # (count, 3)
+    """Draw one of the distributions by the shares of `MIXED`, then the lights from it."""
+    name = str(rng.choice(list(MIXED), p=list(MIXED.values())))
+    return DISTRIBUTIONS[name](count, rng)
+
+
+MIXED = {
+    "grid": 0.35, "azimuth-elevation": 0.2, "near-uniform": 0.15, "rings": 0.1, "dome": 0.1, "hand-held": 0.1,
+}  # fmt: skip
+"""Shares of `mixed`: a third are narrow grids before the object, as those of DiLiGenT."""
 DISTRIBUTIONS = {
     "azimuth-elevation": azimuth_elevation,
     "hemisphere": hemisphere,
@@ -68,6 +78,7 @@ DISTRIBUTIONS = {
     "dome": arrangements.dome,
     "hand-held": arrangements.hand_held,
     "stage": arrangements.stage,
+    "mixed": mixed,
 }
 
 

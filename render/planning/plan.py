@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from render.materials import library, surfaces
 from render.materials.textures import textured
 from render.planning import light_sets
-from render.planning.data_config import PERSPECTIVE, DataConfig
+from render.planning.data_config import MIXED, PERSPECTIVE, DataConfig
 from render.planning.mesh_family import choose
-from render.records.manifest import OWN_MESHES, SceneSpec, View
+from render.records.manifest import COMPOSITION, OWN_MESHES, SceneSpec, View
 from render.shared.errors import InputError, unknown
 from render.shared.progress import progress_bar
 from render.shared.seeds import derived_seed, generator
@@ -45,9 +45,14 @@ def plan(config: DataConfig, processes: int = 1) -> list[SceneSpec]:
     from render.shapes.registry import FAMILIES
 
     pool = material_pool(config.materials)
-    most = max(config.materials_per_view, config.mixture[1] if config.spatially_varying else 1)
+    wanted = {"materials_per_view": config.materials_per_view}
+    if config.spatially_varying:
+        wanted["mixture"] = config.mixture[1]
+    if config.families.get(COMPOSITION):
+        wanted["composition_materials"] = config.composition_materials[1]
+    most = max(wanted.values())
     if most > len(pool):
-        name = "materials_per_view" if most == config.materials_per_view else "mixture"
+        name = next(key for key, value in wanted.items() if value == most)
         raise InputError(f"{name} is {most}, but there are {len(pool)} materials")
     weights = material_weights(config, pool)
     if weights is not None and np.count_nonzero(weights) < most:
@@ -207,7 +212,8 @@ def _views(config: DataConfig, family: str, number: int, shape: str) -> list[Vie
 def _seen(config: DataConfig, keys: tuple[Any, ...], rng: np.random.Generator) -> View:
     """Draw a pose, and the camera's distance where it is perspective."""
     pose = random_view(config, keys[0], rng)
-    if config.camera != PERSPECTIVE:
+    halves = generator(config.seed, *keys, "cameras")
+    if config.camera != PERSPECTIVE and not (config.camera == MIXED and halves.random() < 0.5):
         return pose
     (distance,) = _distances(config.camera_distance, 1, generator(config.seed, *keys, "camera"))
     return replace(pose, camera_distance=distance)
@@ -265,7 +271,7 @@ def _plan_view(
         "lights": tuple(tuple(round(float(c), 6) for c in row) for row in directions),
         "size": config.size,
         "spp": config.spp,
-        "bounces": config.bounces,
+        "bounces": config.composition_bounces if family == COMPOSITION else config.bounces,
         "light_distances": _near(config, keys),
     }
     name = f"{family}-{number:05d}-v{view}"
@@ -273,23 +279,35 @@ def _plan_view(
 
 
 def _surface(config: DataConfig, keys: tuple[Any, ...], materials: _Materials, first: int) -> str:
-    """Name the surface of a scene: material `first` alone, or mixed with others by a seeded pattern."""
+    """Name the surface of a scene: material `first` alone, or mixed with others by a seeded pattern.
+
+    The objects of a composition have materials of their own, unless the first one is textured and covers them all.
+    """
     rng, pool = generator(config.seed, *keys), materials.pool
-    if rng.random() >= config.spatially_varying or textured.is_textured(pool[first]):
+    composed = keys[0] == COMPOSITION
+    if (not composed and rng.random() >= config.spatially_varying) or textured.is_textured(pool[first]):
         return pool[first]
-    count = int(rng.integers(config.mixture[0], config.mixture[1] + 1))
+    fewest, most = config.composition_materials if composed else config.mixture
+    count = int(rng.integers(fewest, most + 1))
     drawn = rng.permutation(len(pool)) if materials.weights is None else materials.order(rng, count)
     others = [k for k in drawn if k != first and not textured.is_textured(pool[k])][: count - 1]
     if not others:
         return pool[first]
     names = "+".join(pool[index] for index in (first, *others))
-    pattern = config.patterns[int(rng.integers(len(config.patterns)))]
+    pattern = "parts" if composed else config.patterns[int(rng.integers(len(config.patterns)))]
     return f"{pattern}:{int(rng.integers(2**31))}:{names}"
 
 
 def random_view(config: DataConfig, family: str, rng: np.random.Generator) -> View:
-    """Draw a pose: any rotation for blobs; any yaw, but limited pitch and roll, for shapes that stand."""
-    if config.stands(family):
+    """Draw a pose: any rotation for blobs; any yaw, but limited pitch and roll, for shapes that stand.
+
+    Compositions are seen from their open side, and from above.
+    """
+    if family == COMPOSITION:
+        angles = [rng.uniform(-50, 50), rng.uniform(12, 75), rng.uniform(-15, 15)]
+        rotation = Rotation.from_euler("yxz", angles, degrees=True)
+        scale = float(np.exp(rng.uniform(*np.log(config.upright_scale))))
+    elif config.stands(family):
         # Turned about its own axis first, then tipped towards the camera (positive: seen from above), then rolled.
         yaw, pitch, roll = rng.uniform(-180, 180), rng.uniform(-30, 55), rng.uniform(-15, 15)
         rotation = Rotation.from_euler("yxz", [yaw, pitch, roll], degrees=True)
@@ -299,7 +317,7 @@ def random_view(config: DataConfig, family: str, rng: np.random.Generator) -> Vi
         scale = float(rng.uniform(*config.scale))
     reach = config.offset * max(scale - 0.5, 0.0)
     # Standing shapes are tall and thin: move along their height, or most of the frame is empty.
-    spread = np.array([0.4, 1.6]) if config.stands(family) else np.ones(2)
+    spread = np.array([0.4, 1.6]) if config.stands(family) and family != COMPOSITION else np.ones(2)
     offset = rng.uniform(-reach, reach, 2) * spread
     return View(
         rotation=tuple(round(float(value), 9) for value in rotation.as_matrix().ravel()),

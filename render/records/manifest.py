@@ -17,6 +17,7 @@ from render.shared.files import read_jsonl, read_whole_lines, write_jsonl
 MANIFEST = "manifest.jsonl"
 FAILED = "failed.jsonl"
 OWN_MESHES = "meshes"  # family of shapes that are files of the user's own
+COMPOSITION = "composition"  # family of shapes that are several objects in one scene
 _LATER = ("light_distances",)
 
 

@@ -2,7 +2,8 @@
 
 A shard is one multi-part OpenEXR file (ZIP, lossless) per scene. Part `gt` (float32) holds
 `normal.X/Y/Z` (camera frame, zero outside the mask), `Z` (depth), `mask` (0 or 1) and `coverage`
-(share of a pixel's samples that hit the object); a part `materials` (float32) of spatially-varying scenes holds the
+(share of a pixel's samples that hit the object), and of compositions `object` (uint32, which of the objects most
+samples hit, from 1, zero outside the mask); a part `materials` (float32) of spatially-varying scenes holds the
 weights `w0`, `w1`, ... of the materials its header names; parts `L000`, `L001`, ... (float16) hold the linear
 RGB radiance under one light of irradiance pi, with its direction, and the position of a near one, in the part's header.
 
@@ -51,6 +52,8 @@ class Shard:
         materials: Names of the M materials; empty for a scene of one material.
         light_positions: (L, 3) float32, camera frame, half image widths, of near lights: points with irradiance pi at
             the object's centre, falling with the inverse square of the distance. None: distant lights.
+        objects: (H, W) uint32, which object of a composition each pixel shows, from 1; 0 outside the mask. None for a
+            scene of one object.
         provenance: File-level header attributes (schema, seed, versions, names), all text or numbers.
     """
 
@@ -64,6 +67,7 @@ class Shard:
     weights: np.ndarray | None = None
     materials: tuple[str, ...] = ()
     light_positions: np.ndarray | None = None
+    objects: np.ndarray | None = None
     provenance: dict[str, str | int | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -80,6 +84,8 @@ class Shard:
             expected["weights"] = ((len(self.materials), height, width), np.float32)
         if self.light_positions is not None:
             expected["light_positions"] = ((count, 3), np.float32)
+        if self.objects is not None:
+            expected["objects"] = ((height, width), np.uint32)
         for name, (shape, dtype) in expected.items():
             array = np.asarray(getattr(self, name))
             if array.shape != shape or array.dtype != dtype:
@@ -151,6 +157,8 @@ def write_shard(path: str | Path, shard: Shard) -> None:
         "mask": shard.mask.astype(np.float32),
         "coverage": shard.coverage,
     }
+    if shard.objects is not None:
+        ground_truth["object"] = shard.objects
     parts = [("gt", attributes, ground_truth)]
     if shard.weights is not None:
         channels = {f"w{number}": weight for number, weight in enumerate(shard.weights)}
@@ -220,6 +228,7 @@ def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
                 if any("ps:light_pos" in part.header for part in lit)
                 else None
             ),
+            objects=truth.get("object"),
             provenance={
                 key[3:]: value for key, value in header.items() if key.startswith("ps:") and key not in _OWN_ATTRIBUTES
             },

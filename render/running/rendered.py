@@ -32,6 +32,8 @@ class RenderedView:
         mask: (H, W) bool, pixels of which at least half the samples hit the object.
         coverage: (H, W) float32 in [0, 1], share of samples that hit the object.
         weights: (M, H, W) float32, share of each of M materials in a pixel of the mask; None for a single material.
+        objects: (H, W) uint32, which object of a composition each pixel shows, from 1, 0 outside the mask; None for a
+            single object.
     """
 
     scene: SceneSpec
@@ -41,6 +43,7 @@ class RenderedView:
     mask: np.ndarray
     coverage: np.ndarray
     weights: np.ndarray | None = None
+    objects: np.ndarray | None = None
 
     @property
     def light_directions(self) -> np.ndarray:
@@ -73,7 +76,7 @@ class RenderedView:
             scene_id=scene.id, images=to_half(self.images), normals=self.normals, depth=self.depth, mask=self.mask,
             coverage=self.coverage, light_directions=self.light_directions, weights=self.weights,
             materials=surface_names.split(scene.material)[1] if self.weights is not None else (),
-            light_positions=self.light_positions,
+            light_positions=self.light_positions, objects=self.objects,
             provenance=_describe(scene),
         )  # fmt: skip
 
@@ -113,6 +116,7 @@ def rendered_views(
             truth.mask,
             truth.coverage,
             truth.weights[number],
+            truth.objects,
         )
         for number, stack in images
     )

@@ -7,8 +7,8 @@ from pathlib import Path
 import trimesh
 from threadpoolctl import threadpool_limits
 
-from render.records.manifest import OWN_MESHES
-from render.shapes import blobby, own_meshes, primitives
+from render.records.manifest import COMPOSITION, OWN_MESHES
+from render.shapes import blobby, compositions, own_meshes, primitives
 from render.shapes.geometry.mesh import TriangleMesh, load_mesh
 from render.shapes.sculpture import family as sculpture
 from render.shared.errors import InputError, unknown
@@ -28,6 +28,7 @@ FAMILIES = {
     "bunny": Family(primitives.bunny, False, "Stanford bunny, fetched once"),
     "blobby": Family(blobby.blobby, True, "smooth lumpy blobs, one per seed"),
     "sculpture": Family(sculpture.sculpture, True, "figures, drapery, busts, animals, vessels, rocks and knots"),
+    COMPOSITION: Family(compositions.composition, True, "objects in heaps, bowls, niches, before walls; hollow ones"),
 }
 
 

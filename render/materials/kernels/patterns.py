@@ -124,14 +124,17 @@ class Evaluator:
 
 
 def part_labels(mesh: TriangleMesh, pattern: Pattern) -> np.ndarray:  # (F,) uint32
-    """Assign a material to every triangle: whole connected pieces, or regions around points far from each other.
+    """Assign a material to every triangle: whole objects of a composition, whole connected pieces of another mesh, or
+    regions around points far from each other.
 
-    Pieces are dealt out in turn, largest first, so that every material is seen where there are pieces enough.
+    Objects and pieces are dealt out in turn, largest first, so that every material is seen where there are enough.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     rng = generator(pattern.seed, "pattern", "parts")
+    if mesh.objects is not None:
+        return _dealt(mesh.objects.astype(np.int64), pattern.count, rng)
     faces = mesh.faces.astype(np.int64)
     _, weld = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)
     welded = weld.ravel()[faces]  # vertices split for their normals still join their pieces
@@ -139,11 +142,8 @@ def part_labels(mesh: TriangleMesh, pattern: Pattern) -> np.ndarray:  # (F,) uin
     graph = coo_matrix((np.ones(len(pairs), np.int8), pairs.T), shape=(welded.max() + 1,) * 2)
     _, piece = connected_components(graph, directed=False)
     piece = piece[welded[:, 0]]
-    names, sizes = np.unique(piece, return_counts=True)
-    if len(names) >= pattern.count:
-        rank = np.empty(names.max() + 1, np.int64)
-        rank[names[np.argsort(-sizes, kind="stable")]] = np.arange(len(names))
-        return ((rank[piece] + int(rng.integers(pattern.count))) % pattern.count).astype(np.uint32)
+    if piece.max() + 1 >= pattern.count:
+        return _dealt(piece, pattern.count, rng)
     centroids = mesh.vertices[faces].mean(1)
     regions = pattern.count * int(rng.integers(1, 3))
     seeds = [int(rng.integers(len(centroids)))]
@@ -153,6 +153,14 @@ def part_labels(mesh: TriangleMesh, pattern: Pattern) -> np.ndarray:  # (F,) uin
         seeds.append(int(nearest.argmax()))
     distance = ((centroids[:, None] - centroids[seeds]) ** 2).sum(2)
     return (distance.argmin(1) % pattern.count).astype(np.uint32)
+
+
+def _dealt(piece: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:  # (F,) uint32
+    """Deal materials to pieces numbered from 0, of which each face (F,) has one."""
+    names, sizes = np.unique(piece, return_counts=True)
+    rank = np.empty(names.max() + 1, np.int64)
+    rank[names[np.argsort(-sizes, kind="stable")]] = np.arange(len(names))
+    return ((rank[piece] + int(rng.integers(count))) % count).astype(np.uint32)
 
 
 def _unit(rng: np.random.Generator) -> np.ndarray:  # (3,)

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ class TriangleMesh:
         faces: Vertex indices, counter-clockwise seen from outside, (F, 3) uint32.
         normals: Unit outward normals, (V, 3) float32.
         uv: Texture coordinates of the corners of each face, (F, 3, 2) float32, v up; None for a mesh without.
+        objects: Number of the object that each face belongs to, (F,) uint32, from 0; None for a single object.
 
     Raises:
         InputError: at construction: wrong shapes, no faces, non-finite values, an index out of range,
@@ -34,6 +36,7 @@ class TriangleMesh:
     faces: np.ndarray
     normals: np.ndarray
     uv: np.ndarray | None = None
+    objects: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name, dtype in (("vertices", np.float32), ("normals", np.float32)):
@@ -63,6 +66,11 @@ class TriangleMesh:
             if uv.shape != (len(faces), 3, 2) or not np.isfinite(uv).all():
                 raise InputError(f"mesh uv: expected finite values of shape ({len(faces)}, 3, 2), got {uv.shape}")
             object.__setattr__(self, "uv", uv)
+        if self.objects is not None:
+            objects = np.ascontiguousarray(self.objects, dtype=np.uint32)
+            if objects.shape != (len(faces),):
+                raise InputError(f"mesh objects: expected a number for each of {len(faces)} faces, got {objects.shape}")
+            object.__setattr__(self, "objects", objects)
 
     def normalised(self) -> "TriangleMesh":
         """Centre the mesh on its bounding sphere and scale it so that the farthest vertex is at radius 1."""
@@ -86,6 +94,18 @@ class TriangleMesh:
         """Rotate, scale and move the mesh into the camera frame (units: half image widths)."""
         turned = self.rotated(view.matrix())
         return replace(turned, vertices=turned.vertices * view.scale + np.array([*view.offset, 0.0]))
+
+
+def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """Return meshes as one, in which each is an object of its own; texture coordinates are left out."""
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces.astype(np.int64) + start for mesh, start in zip(meshes, first[:-1], strict=True)]
+    return TriangleMesh(
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        faces=np.concatenate(faces),
+        normals=np.concatenate([mesh.normals for mesh in meshes]),
+        objects=np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]),
+    )
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

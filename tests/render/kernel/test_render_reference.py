@@ -100,7 +100,10 @@ CASES = [
     Case("sculpture:4", "procedural:noise:3", 2),
     Case("bowl", "procedural:print:4:gold-metallic-paint+lambertian:0.8", 2),
     Case("bowl", "maps:rough", 2),
+    Case("composition:8", "parts:0:lambertian:0.9+gold-metallic-paint", 3),
+    Case("composition:0", "parts:1:lambertian:0.9+white-acrylic", 2, near=NEAR),
 ]
+load = cache(shapes.load)
 
 
 @pytest.fixture(scope="module")
@@ -128,8 +131,11 @@ def parts(case: Case) -> tuple:
     rng = generator(7, "reference", case.seed)
     if case.shape == "bowl":
         rotation, mesh = Rotation.from_euler("yx", rng.uniform(-35, 35, 2), degrees=True), support.bowl()
+    elif case.shape.startswith("composition"):  # from its open side and from above
+        angles = [rng.uniform(-30, 30), rng.uniform(15, 50)]
+        rotation, mesh = Rotation.from_euler("yx", angles, degrees=True), load(case.shape)
     else:
-        rotation, mesh = Rotation.from_euler("yx", rng.uniform(-60, 60, 2), degrees=True), shapes.load(case.shape)
+        rotation, mesh = Rotation.from_euler("yx", rng.uniform(-60, 60, 2), degrees=True), load(case.shape)
     scale = float(rng.uniform(0.9, 1.3))
     view = View(rotation=tuple(rotation.as_matrix().ravel()), scale=scale, camera_distance=case.camera)
     return mesh, view, light_sets.draw("near-uniform", 3, rng).astype(np.float32)
@@ -330,6 +336,26 @@ def test_notices_a_missing_map(part, material, monkeypatch):
         lambda look, cosine: prepare(look._replace(**{part: constant + look.metallic * 0}), cosine),
     )
     assert p_value(ours(MAPS, name), truth) < 1e-4
+
+
+COMPOSED = next(case for case in CASES if case.shape.startswith("composition"))
+
+
+@pytest.mark.parametrize("mutation", ["an object moved", "materials exchanged", "two bounces dropped"])
+def test_notices_what_is_wrong_with_a_composition(mutation):
+    mesh, view, directions = parts(COMPOSED)
+    settings = {"bounces": 1} if mutation == "two bounces dropped" else {}
+    assert mesh.objects is not None
+    if mutation == "an object moved":
+        moved = np.zeros_like(mesh.vertices)
+        moved[np.unique(mesh.faces[mesh.objects == 1])] = (0.04, 0, 0)
+        mesh = replace(mesh, vertices=mesh.vertices + moved)
+    name = COMPOSED.material
+    if mutation == "materials exchanged":
+        first, second = name.removeprefix("parts:0:").split("+")
+        name = f"parts:0:{second}+{first}"
+    changed = ours(COMPOSED, name, scene_parts=(mesh, view, directions), **settings)
+    assert p_value(changed, expected(COMPOSED, COMPOSED.material)) < 1e-4
 
 
 def test_surfaces_with_relief_share_rays_with_others():

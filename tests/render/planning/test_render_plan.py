@@ -42,6 +42,19 @@ def test_adding_scenes_leaves_the_others_alone(change):
         assert after[name] == replace(scene, **changed)
 
 
+def test_mixed_cameras_and_lights_take_every_kind():
+    config = replace(SMALL, families={"blobby": 40}, views=1, camera="mixed", lights="mixed", light_count=32)
+    scenes = by_id(plan(config)).values()
+    distances = [scene.view.camera_distance for scene in scenes]
+    assert 0.3 < np.mean([distance is not None for distance in distances]) < 0.7
+    assert all(4.0 <= distance <= 10.0 for distance in distances if distance is not None)
+    furthest = np.degrees([np.arccos(scene.light_directions()[:, 2].min()) for scene in scenes])
+    assert 0.15 < (furthest < 46).mean() < 0.6 and (furthest > 70).any()  # narrow grids, and wide ones
+    plain = by_id(plan(replace(config, camera="orthographic")))
+    for scene in scenes:
+        assert replace(scene.view, camera_distance=None) == plain[scene.id].view
+
+
 def test_near_lights_and_perspective_leave_all_else_alone():
     before = by_id(plan(SMALL))
     config = replace(SMALL, near_lights=0.5, near_light_distance=(2.0, 5.0), camera="perspective")
