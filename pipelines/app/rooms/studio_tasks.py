@@ -177,15 +177,12 @@ def wanted(place: Path, **asked: Any) -> dict[str, Any]:
         InputError: a name that is none, or a number out of range.
     """
     shape, material = str(asked.get("shape", "")), str(asked.get("material", ""))
-    uploads = place.parent / UPLOADS
-    if (uploads / shape).is_file() and shape:
-        shape = str(uploads / Path(shape).name)
-    elif not _SHAPE.fullmatch(shape):
+    loaded = {path.name: str(path) for path in (place.parent / UPLOADS).glob("*")}
+    if shape not in loaded and not _SHAPE.fullmatch(shape):
         raise InputError(f"shape {shape[:60]!r}: choose sphere, bunny, blobby:<seed>, sculpture:<seed> or load a mesh")
-    if (uploads / material).is_file() and material:
-        material = str(uploads / Path(material).name)
-    elif not _MATERIAL.fullmatch(material) or _FILES.search(material):
+    if material not in loaded and (not _MATERIAL.fullmatch(material) or _FILES.search(material)):
         raise InputError(f"material {material[:60]!r}: give a name, lambertian:<albedo> or a pattern, or load a file")
+    shape, material = loaded.get(shape, shape), loaded.get(material, material)
     try:
         turn = [float(asked.get(name, 0.0)) for name in ("yaw", "pitch", "roll")]
         bounces, size = int(asked.get("bounces", 1)), int(asked.get("size", 256))

@@ -47,15 +47,22 @@ export async function follow(job, box, title) {
   box.setAttribute("role", "status");
   box.replaceChildren(element("div", { class: "row" }, text, cancel), bar, left);
   box.hidden = false;
-  for (;;) {
-    if (job.state === "queued") text.textContent = job.before ? `${title}: waiting for ${job.before} job${job.before > 1 ? "s" : ""}` : `${title}: starting`;
-    else text.textContent = `${title}: ${STAGES[job.stage] ?? job.stage}`;
-    bar.value = job.share;
-    left.textContent = job.left === null ? "" : `about ${seconds(job.left)} left`;
-    if (job.state === "done") { box.hidden = true; return job.result; }
-    if (job.state === "cancelled") { box.replaceChildren("Cancelled."); return null; }
-    if (job.state === "failed") throw new Error(job.message);
-    await new Promise((resolve) => setTimeout(resolve, 250));
-    job = await ask(`/jobs/${job.id}`);
+  // Nobody waits for a job whose page is gone. A short one that runs may end: to stop it would cost a new worker.
+  const leave = () => { if (job.state === "queued" || job.task === "infer") navigator.sendBeacon(`/jobs/${job.id}/cancel`); };
+  addEventListener("pagehide", leave);
+  try { return await waited(); } finally { removeEventListener("pagehide", leave); }
+
+  async function waited() {
+    for (;;) {
+      if (job.state === "queued") text.textContent = job.before ? `${title}: waiting for ${job.before} job${job.before > 1 ? "s" : ""}` : `${title}: starting`;
+      else text.textContent = `${title}: ${STAGES[job.stage] ?? job.stage}`;
+      bar.value = job.share;
+      left.textContent = job.left === null ? "" : `about ${seconds(job.left)} left`;
+      if (job.state === "done") { box.hidden = true; return job.result; }
+      if (job.state === "cancelled") { box.replaceChildren("Cancelled."); return null; }
+      if (job.state === "failed") throw new Error(job.message);
+      await new Promise((resolve) => setTimeout(resolve, 250));
+      job = await ask(`/jobs/${job.id}`);
+    }
   }
 }

@@ -134,7 +134,7 @@ async function show(run) {
   state.run = run;
   $("results").hidden = false;
   $("runs").replaceChildren(...state.runs.map((other) => {
-    const button = element("button", { type: "button", "aria-pressed": other === run }, `${other.number}. ${other.method}`);
+    const button = element("button", { type: "button", "aria-pressed": String(other === run) }, `${other.number}. ${other.method}`);
     button.addEventListener("click", () => show(other));
     return button;
   }));

@@ -95,9 +95,9 @@ class Jobs:
         elapsed = time.monotonic() - job.began if job.began else 0.0
         known = job.state == RUNNING and job.share > 0.03 and elapsed > 1.0
         return {
-            "id": job.id, "state": job.state, "stage": job.stage, "share": round(job.share, 4), "before": before,
-            "left": round(elapsed * (1 - job.share) / job.share, 1) if known else None, "message": job.message,
-            "result": job.result, "seconds": round(elapsed, 1),
+            "id": job.id, "task": job.task, "state": job.state, "stage": job.stage, "share": round(job.share, 4),
+            "before": before, "left": round(elapsed * (1 - job.share) / job.share, 1) if known else None,
+            "message": job.message, "result": job.result, "seconds": round(elapsed, 1),
         }  # fmt: skip
 
     def cancel(self, job: Job) -> None:

@@ -81,7 +81,7 @@ def test_photographs(page, address: str, tmp_path: Path) -> None:
     page.locator("#sphere circle.light").nth(11).wait_for(state="attached")
     page.locator(".hover").focus()
     page.keyboard.press("ArrowDown")
-    page.locator("#chart polyline").wait_for()
+    page.locator("#chart polyline").wait_for(state="attached")  # flat where the mask was taken away
     before = page.locator("#relit").screenshot()
     page.locator("#relit-light input").first.fill("150")
     page.wait_for_timeout(200)
