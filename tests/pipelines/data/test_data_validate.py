@@ -65,6 +65,23 @@ def test_sound_shards_have_no_finding(material):
     assert check_shard(sphere_shard(material), Limits()) == []
 
 
+def test_relief_is_in_the_normals_and_not_in_the_depth():
+    shard = sphere_shard(MATERIALS[0])
+    flat = replace(shard, depth=shard.depth * np.float32(0.7))
+    assert found(flat) == {"depth"}
+    rough = replace(flat, provenance=flat.provenance | {"material": "procedural:weave:3"})
+    assert found(rough) == set()
+    assert found(replace(rough, depth=-rough.depth)) == {"depth"}
+
+
+def test_compositions_fill_the_frame_and_have_an_object_everywhere():
+    shard = sphere_shard(MATERIALS[0])
+    named = replace(shard, objects=shard.mask.astype(np.uint32))
+    assert found(named) == set() and found(named, max_area=0.01, min_area=0.0) == set()
+    assert found(shard, max_area=0.01, min_area=0.0) == {"mask"}
+    assert found(replace(named, objects=named.objects * 0)) == {"objects"}
+
+
 CORRUPTIONS = {
     "nan image": (lambda s: images_of(s, spoil(s.images, np.nan)), "values"),
     "infinite depth": (lambda s: replace(s, depth=spoil(s.depth, np.inf)), "values"),
