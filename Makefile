@@ -20,6 +20,10 @@ METHOD ?=
 METHODS ?=
 FIGURES ?=
 PHOTOS ?=
+SEED ?= 0
+INPUTS ?= 100000
+MINUTES ?= 120
+KILLS ?= 100
 
 VENV := .venv
 SDPS := $(VENV)/bin/sdps
@@ -30,7 +34,7 @@ APP_READY := $(VENV)/.app-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup app doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow test-gpu lint bench bench-train bench-classical bench-infer bench-surface docs clean
+	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow test-gpu fuzz faults lint bench bench-train bench-classical bench-infer bench-surface docs clean
 .DEFAULT_GOAL := help
 
 help:
@@ -45,6 +49,8 @@ help:
 	@echo "make ship | shipped-results [DATA=DiLiGenT's folder]   trained weights into the package; their tables"
 	@echo "make infer PHOTOS=folder [METHOD=pf14 RUNS=trained]   normals, lights, meshes and a page from photographs"
 	@echo "make data-plan | data-status | data-validate | data-preview | data-card   PRESET=... OUT=folder"
+	@echo "make fuzz INPUTS=100000 MINUTES=120 SEED=0   mutated files into every reader; a stopped run goes on"
+	@echo "make faults KILLS=100   kill -9, SIGTERM and full disks during render, export, train, evaluate, infer"
 	@echo "make regenerate   SHAPES=bunny MATERIALS=chrome,lambertian:0.5 LIGHTS=merltest OUT=folder [MITSUBA=1]"
 
 $(READY): pyproject.toml constraints.txt
@@ -153,6 +159,16 @@ test-slow: $(ASSETS_READY)
 
 test-gpu: $(ASSETS_READY)
 	$(VENV)/bin/python -m pytest -m gpu
+
+# Mutated files into every reader, in child processes; stopped, it goes on where it was.
+fuzz: OUT = out/fuzz
+fuzz: $(ASSETS_READY)
+	$(VENV)/bin/python tests/fuzz/fuzz_run.py --out $(OUT) --seed $(SEED) --inputs $(INPUTS) --minutes $(MINUTES)
+
+# kill -9, SIGTERM and full disks at random moments of long commands, KILLS times each; results are compared.
+faults: OUT = out/faults
+faults: $(ASSETS_READY)
+	$(VENV)/bin/python tests/faults/fault_run.py --out $(OUT) --seed $(SEED) --kills $(KILLS)
 
 lint: $(READY)
 	$(VENV)/bin/ruff check --no-cache .

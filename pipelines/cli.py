@@ -157,6 +157,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a list closed early, e.g. `sdps materials | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:  # a name that is too long, a folder that may not be read, a disk that vanished
+        if error.filename is None:
+            raise
+        name = os.fsdecode(error.filename) if isinstance(error.filename, bytes) else error.filename
+        sys.stderr.write(f"sdps: {InputError(f'{name}: {error.strerror}; name another file or folder')}\n")
+        return 2
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ scenes and ways are evaluated. The plan is kept in the output folder, so that a 
 """
 
 import argparse
-import json
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -17,7 +16,7 @@ from pipelines.shared import presets
 from pipelines.shared.presets import Preset
 from render.shared.config import build, to_plain
 from render.shared.errors import InputError
-from render.shared.files import read_text, write_json
+from render.shared.files import read_json, write_json
 
 if TYPE_CHECKING:
     from sdps.training.training_config import NormalTraining
@@ -156,8 +155,8 @@ def planned(preset: Preset, out: Path) -> Plan:
     path = out / PLAN
     if path.is_file():
         try:
-            return build(Plan, json.loads(read_text(path)))
-        except (json.JSONDecodeError, InputError) as error:
+            return build(Plan, read_json(path, "delete it"))
+        except InputError as error:
             raise InputError(f"{path}: not a plan of `sdps demo` ({error}); delete it") from error
     plan = make_plan(preset, {name: images_per_second(preset, name) for name in NEEDS})
     write_json(path, to_plain(asdict(plan)))

@@ -17,6 +17,7 @@ import numpy as np
 
 from pipelines.benchmarks.stacks import Images, photographed
 from pipelines.evaluate.evaluation import TestObject
+from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import read_text
 from render.shared.images import read_image, to_unit
@@ -224,10 +225,8 @@ def packed_images(path: Path, count: int) -> Images:
     Raises:
         InputError: damaged, or another number of images than of lights.
     """
-    try:
+    with decoding(path, "an array", "convert the images again"):
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: damaged or not an array ({error}); convert the images again") from error
     if array.ndim != 3 or array.shape[2] != 3 * count:
         raise InputError(f"{path}: is {array.shape}; want height x width x {3 * count}, RGB of {count} lights in turn")
     names = [f"{path}, image {number}" for number in range(count)]

@@ -8,17 +8,19 @@ strengths fitted there differ by under 5 %. The directions in lights.txt are up 
 sphere; the grey sphere sides with the chrome one (2.0 degrees on average against 3.2).
 """
 
+import io
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from scipy import ndimage
 
 from pipelines.benchmarks.stacks import Images, Stack, photographed
 from pipelines.evaluate.evaluation import TestObject
 from render.exchange.ingest import crop_box
+from render.shared.decoding import check_picture, decoding
 from render.shared.errors import InputError
-from render.shared.files import read_text
+from render.shared.files import read_bytes, read_text
 
 SPHERES = ("chrome", "gray")
 """Folders that calibrate the lights and are no objects."""
@@ -148,10 +150,7 @@ def _read_set(folder: Path, name: str) -> tuple[Images, np.ndarray]:
 
 def _read(path: Path) -> np.ndarray:  # (H, W, 3) float32
     """Read an 8-bit picture as linear values from 0 to 1."""
-    try:
-        with Image.open(path) as picture:
-            return np.asarray(picture.convert("RGB"), np.float32) / 255.0
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except (UnidentifiedImageError, OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as a picture; copy it again") from error
+    data = read_bytes(path)
+    with decoding(path, "a picture"), Image.open(io.BytesIO(data)) as picture:
+        check_picture(path, picture, data)
+        return np.asarray(picture.convert("RGB"), np.float32) / 255.0

@@ -6,12 +6,10 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import yaml
-
 from render.checks.known_checks import CHECKS, ERROR, NOTE, WARNING
 from render.checks.shard_checks import Limits
 from render.checks.validate import REPORT, Validation, to_report, validate, write_report
-from render.shared.config import build
+from render.shared.config import build, parse_yaml
 from render.shared.errors import InputError
 
 SHOWN = 5  # worst offenders per check
@@ -44,10 +42,7 @@ def _override(text: str) -> tuple[str, object]:
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise InputError(f"--set {text}: expected LIMIT=VALUE, e.g. min_area=0.05")
-    try:
-        return name.strip(), yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise InputError(f"--set {text}: {value!r} is not a value") from error
+    return name.strip(), parse_yaml(value, f"--set {text}")
 
 
 def summary(result: Validation) -> Iterator[str]:

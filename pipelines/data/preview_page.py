@@ -1,6 +1,5 @@
 """The page of `sdps data preview`: from counts, measures and pictures to one HTML file."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from render.planning.composition import Composition, light_directions
 from render.records.manifest import SceneSpec
 from render.shared.config import read_yaml
 from render.shared.errors import InputError
-from render.shared.files import read_jsonl, read_text
+from render.shared.files import read_json, read_jsonl
 from render.shared.templates import fill
 
 QUALITIES = (85, 70, 50)  # JPEG, the first that fits the budget
@@ -66,7 +65,7 @@ def _config(folder: Path) -> dict[str, Any]:
 def _validation(folder: Path) -> dict[str, Any]:
     """Return what the last validation found; empty if there was none."""
     try:
-        report = json.loads(read_text(folder / "validation.json"))
+        report = read_json(folder / "validation.json", "validate the folder again")
         found = {key: int(report[key]) for key in ("checked", "errors", "warnings")}
         return found | {"time": str(report["time"])[:10], "sound": bool(report.get("sound"))}
     except (InputError, ValueError, KeyError, TypeError):

@@ -1,6 +1,5 @@
 """The self-test of `sdps infer`: render a bunny, save it as photographs, and compare what is found with the truth."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ from pipelines.shared.presets import Preset, TestConfig
 from pipelines.shared.scenes import test_scenes
 from pipelines.shared.text_tables import number
 from render.records.shards import read_shard
-from render.shared.files import read_text, write_json
+from render.shared.files import read_json, write_json
 
 if TYPE_CHECKING:
     from sdps.api import Inference
@@ -54,7 +53,7 @@ def compare(folder: Path, result: "Inference", out: Path) -> str:
     """
     from sdps.core.metrics import direction_mae, intensity_error, normal_mae
 
-    stored = json.loads(read_text(folder / TRUTH / "lights.json"))
+    stored = read_json(folder / TRUTH / "lights.json", "make the photographs again")
     shard = read_shard(folder / TRUTH / stored["shard"])
     scores = {"normals, degrees": normal_mae(result.normals, shard.normals, shard.mask)}
     if len(result.light_directions):

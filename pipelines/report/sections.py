@@ -4,7 +4,6 @@ An evaluation writes its section into `<out>/report/<name>/`: `section.json` and
 the sections under a folder into one self-contained page.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from PIL import Image
 
 from render.shared.config import build, to_plain
 from render.shared.errors import InputError
-from render.shared.files import atomic_folder, read_text, write_json
+from render.shared.files import atomic_folder, is_plain_name, read_json, write_json
 
 FOLDER = "report"
 _FILE = "section.json"
@@ -55,6 +54,10 @@ class Picture:
     caption: str
     file: str
     wide: bool = False
+
+    def __post_init__(self) -> None:
+        if not is_plain_name(self.file):
+            raise InputError(f"file: {self.file!r} is not the name of a picture in the section's folder")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +156,9 @@ def read_sections(out: Path) -> list[tuple[Path, Section]]:
 
 
 def _read(path: Path) -> Section:
+    again = "run the evaluation that wrote it again"
+    values = read_json(path, again)
     try:
-        return build(Section, json.loads(read_text(path)))
-    except (InputError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: {error}; run the evaluation that wrote it again") from error
+        return build(Section, values)
+    except InputError as error:
+        raise InputError(f"{path}: {error}; {again}") from error

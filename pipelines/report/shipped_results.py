@@ -5,7 +5,6 @@ holds no models of its own, so that every learned row is a shipped one. `make sh
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 from render.records.shards import file_hash
 from render.shared.errors import InputError
-from render.shared.files import read_text, write_text
+from render.shared.files import read_json, read_text, write_text
 from render.shared.templates import fill
 from sdps.methods import pretrained
 
@@ -75,10 +74,7 @@ def results_text(out: Path) -> str:
 def _read(path: Path, remedy: str) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"{path}: no such results; {remedy}")
-    try:
-        return json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: damaged ({error}); delete it and {remedy}") from error
+    return read_json(path, f"delete it and {remedy}")
 
 
 def _measured(table: Table) -> Table:

@@ -6,12 +6,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from pipelines.shared.stream_config import StreamConfig
 from render.planning import light_sets
 from render.planning.plan import DataConfig
-from render.shared.config import build, check_fields, read_yaml, to_yaml
+from render.shared.config import build, check_fields, parse_yaml, read_yaml, to_yaml
 from render.shared.errors import InputError, unknown
 from render.shared.files import write_text
 from render.shared.imaging.sensor import SensorModel
@@ -147,10 +145,7 @@ def _apply(values: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     if not equals or not key:
         raise InputError(f"--set {override}: expected section.field=value")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InputError(f"--set {override}: {text!r} is not a YAML value") from error
+    value = parse_yaml(text, f"--set {override}")
     *sections, last = key.strip().split(".")
     for section in sections:
         values = values.setdefault(section, {})

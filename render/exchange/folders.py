@@ -1,11 +1,10 @@
 """Folders of an exported tree: whole or absent, and marked as ours."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from render.shared.errors import InputError
-from render.shared.files import read_text, write_json
+from render.shared.files import read_json, write_json
 
 RECORD = "export.json"
 MARKER = "scene.json"
@@ -35,10 +34,7 @@ def read_record(path: Path) -> dict[str, Any]:
     Raises:
         InputError: not a JSON object.
     """
-    try:
-        value = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: is not JSON ({error.msg}); delete the folder and export it again") from error
+    value = read_json(path, "delete the folder and export it again")
     if not isinstance(value, dict):
         raise InputError(f"{path}: is not a record of an export; delete the folder and export it again")
     return value

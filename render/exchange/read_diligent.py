@@ -1,10 +1,10 @@
 """Reading DiLiGenT folders (Shi et al. 2016)."""
 
+import math
 from pathlib import Path
 
 import numpy as np
-from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
+from scipy.io import loadmat, whosmat
 
 from render.exchange.foreign_samples import (
     Note,
@@ -16,6 +16,7 @@ from render.exchange.foreign_samples import (
     refuse_several,
     size_text,
 )
+from render.shared.decoding import check_unpacked, decoding
 from render.shared.errors import InputError
 from render.shared.files import read_text
 from render.shared.images import decode_normals, read_image
@@ -108,10 +109,9 @@ def _diligent_truth(folder: Path) -> Truth:
 
 def _read_mat(path: Path) -> np.ndarray:
     """Read the array `Normal_gt`."""
-    try:
+    with decoding(path, "a MATLAB file of version 7 or below", "save it with -v7"):
+        check_unpacked(path, sum(8 * math.prod(shape) for _, shape, _ in whosmat(path)), "its variables")
         content = loadmat(path)
-    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError, EOFError) as error:
-        raise InputError(f"{path}: not a MATLAB file of version 7 or below ({error}); save it with -v7") from error
     if "Normal_gt" not in content:
         keys = ", ".join(sorted(key for key in content if not key.startswith("__")))
         raise InputError(f"{path}: no variable Normal_gt (it has: {keys or 'none'}); save the normals under that name")

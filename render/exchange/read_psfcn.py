@@ -44,7 +44,7 @@ def psfcn_sources(tree: str | Path, note: Note | None = None) -> list[Source]:
 
 def _psfcn_source(root: Path, entry: str, split: str, listed: Path) -> Source:
     """Read the list of lights of one sample, named by an entry of the list `listed`."""
-    if entry.count("/") != 1 or not all(entry.split("/")):
+    if entry.count("/") != 1 or {"", ".", ".."} & set(entry.split("/")):
         raise InputError(f"{listed}: {entry!r} is not '<shape>/<material>' with exactly one '/'; write it so")
     shape, material = entry.split("/")
     folder = root / "Images" / shape / material

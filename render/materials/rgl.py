@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from render.materials import model
+from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, read_bytes
 
@@ -121,10 +122,8 @@ def read_fields(path: str | Path) -> dict[str, np.ndarray]:
     data = read_bytes(path)
     if data[: len(_MAGIC)] != _MAGIC:
         raise InputError(f"{path}: not an RGL material (it does not begin with 'tensor_file'); {_REMEDY}")
-    try:
+    with decoding(path, "an RGL material: its table of fields is wrong or cut short", _REMEDY):
         return _parse(data)
-    except (struct.error, UnicodeDecodeError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: its table of fields is damaged or cut short ({error}); {_REMEDY}") from error
 
 
 def _parse(data: bytes) -> dict[str, np.ndarray]:

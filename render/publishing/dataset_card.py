@@ -1,6 +1,5 @@
 """The dataset card: one Markdown page, from what a data folder holds, with front matter as Hugging Face reads it."""
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from render.records.manifest import MANIFEST, SceneSpec
 from render.records.shards import file_hash
 from render.shared.config import read_yaml, to_yaml
 from render.shared.errors import InputError
-from render.shared.files import atomic_path, read_text
+from render.shared.files import atomic_path, read_json
 from render.shared.progress import progress_bar
 from render.shared.templates import fill
 
@@ -134,7 +133,7 @@ def _provenance(folder: Path, rendered: Mapping[str, str], config: Mapping[str, 
 def _validation(folder: Path) -> dict[str, Any]:
     """Return what the last validation found, and whether it was of another manifest; empty if there was none."""
     try:
-        report = json.loads(read_text(folder / "validation.json"))
+        report = read_json(folder / "validation.json", "validate the folder again")
         found: dict[str, Any] = {key: int(report[key]) for key in ("checked", "planned", "errors", "warnings")}
         checks = [check for check in report["checks"] if check["findings"]]
         return found | {

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
@@ -12,12 +13,13 @@ import numpy as np
 
 from render.shared.config import build, to_plain
 from render.shared.errors import InputError
-from render.shared.files import read_jsonl, read_whole_lines, write_jsonl
+from render.shared.files import is_plain_name, read_jsonl, read_whole_lines, write_jsonl
 
 MANIFEST = "manifest.jsonl"
 FAILED = "failed.jsonl"
 OWN_MESHES = "meshes"  # family of shapes that are files of the user's own
 COMPOSITION = "composition"  # family of shapes that are several objects in one scene
+LARGEST = 16384  # pixels along a side
 _LATER = ("light_distances",)
 
 
@@ -90,6 +92,13 @@ class SceneSpec:
     light_distances: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        if not is_plain_name(self.id):
+            raise InputError(f"id: {self.id!r} is no name of a file; use letters, digits, '-', '_' and '.'")
+        if min(self.seed, self.bounces, self.spp) < 0 or min(self.resolution) < 1 or max(self.resolution) > LARGEST:
+            raise InputError(
+                f"scene {self.id}: wants seed, bounces and spp from 0 and a size from 1 to {LARGEST}, "
+                f"got seed {self.seed}, bounces {self.bounces}, spp {self.spp}, size {self.size}"
+            )
         if not self.light_distances:
             return
         if len(self.lights) not in (0, len(self.light_distances)):  # a reader adds the lights last
@@ -188,7 +197,7 @@ def read_events(path: Path) -> Iterator[dict[str, Any]]:
     """
     # Of a line torn by a crash, the shard is found by its hash, the failure happens again.
     for row in read_whole_lines(path):
-        if isinstance(row, dict) and {"id", "time"} <= row.keys():
+        if isinstance(row, dict) and isinstance(row.get("id"), str) and isinstance(row.get("time"), str):
             yield row
 
 
@@ -217,9 +226,21 @@ def _scenes(path: Path) -> Iterator[SceneSpec]:
 def _scene(row: Any, where: str) -> SceneSpec:
     """Build a scene from a line; its lights, which are most of it, are not read number by number if all are sound."""
     lights: Any = row.get("lights") if isinstance(row, dict) else None
-    if not _is_vectors(lights):
+    if _is_vectors(lights):
+        scene = replace(_built(row | {"lights": ()}, where), lights=tuple(map(tuple, lights)))
+    else:
+        scene = _built(row, where)
+    if not all(map(math.isfinite, chain.from_iterable(scene.lights))):
+        raise InputError(f"{where}.lights: a direction is not finite; plan the data again")
+    return scene
+
+
+def _built(row: Any, where: str) -> SceneSpec:
+    """Build a scene; complaints name the line."""
+    try:
         return build(SceneSpec, row, where)
-    return replace(build(SceneSpec, row | {"lights": ()}, where), lights=tuple(map(tuple, lights)))
+    except InputError as error:
+        raise InputError(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
 
 
 def _is_vectors(value: Any) -> bool:

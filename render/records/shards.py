@@ -13,7 +13,6 @@ a reader that refuses whatever differs from the digest or the manifest.
 """
 
 import hashlib
-import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +22,7 @@ import numpy as np
 import OpenEXR
 
 from render.records.manifest import SceneSpec
+from render.shared.decoding import exr_parts
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, read_bytes
 
@@ -269,10 +269,7 @@ def _read_sealed(path: str | Path) -> bytes:
 def _read_parts(path: str | Path) -> list[OpenEXR.Part]:
     """Return the parts of a file whose digest is right."""
     _read_sealed(path)
-    try:
-        return OpenEXR.File(os.fspath(path)).parts
-    except (RuntimeError, ValueError, OSError) as error:
-        raise InputError(f"{path}: damaged EXR ({error}); delete the file and render it again") from error
+    return exr_parts(path, "delete the file and render it again")
 
 
 def _compare(path: str | Path, shard: Shard, scene: SceneSpec) -> None:

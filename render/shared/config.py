@@ -4,6 +4,7 @@ An unknown key or a value of the wrong type is an `InputError` naming the dotted
 """
 
 import dataclasses
+import reprlib
 import types
 import typing
 from collections.abc import Mapping
@@ -18,6 +19,10 @@ from render.shared.files import read_text
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 200, 200
+"""Spells values of files in messages; references within YAML can make a short file spell terabytes."""
 
 T = TypeVar("T", bound="DataclassInstance")
 _BOUNDS = {
@@ -54,15 +59,31 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: missing file, YAML syntax (with its line), or another top level.
     """
-    try:
-        value = yaml.safe_load(read_text(path))
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" line {mark.line + 1}" if mark else ""
-        raise InputError(f"{path}:{where} is not valid YAML ({getattr(error, 'problem', error)})") from error
+    value = parse_yaml(read_text(path), str(path))
     if not isinstance(value, dict):
         raise InputError(f"{path}: expected a mapping of fields at the top level, got {type(value).__name__}")
     return value
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """Parse YAML of plain values; no tag of it makes an object.
+
+    Args:
+        text: The YAML.
+        where: What messages begin with: the file, or the flag.
+
+    Raises:
+        InputError: not YAML, with its line.
+    """
+    try:
+        return yaml.safe_load(text)
+    # The library lets through what its conversions raise: ValueError of dates, KeyError of `!!bool maybe`, and
+    # RecursionError of lists in lists.
+    except Exception as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" line {mark.line + 1}" if mark else ""
+        reason = getattr(error, "problem", None) or str(error) or type(error).__name__
+        raise InputError(f"{where}:{line} is not valid YAML ({reason}); correct it there") from error
 
 
 def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:
@@ -120,6 +141,10 @@ def to_yaml(value: Any) -> str:
     return yaml.safe_dump(to_plain(value), sort_keys=False, width=120)
 
 
+def _short(value: Any) -> str:
+    return value if isinstance(value, str) else _SHORT.repr(value)
+
+
 def _convert(hint: Any, value: Any, name: str) -> Any:
     """Convert one value to the annotated type `hint`, or raise an InputError naming the field."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
@@ -129,17 +154,17 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
         return _convert_union(inner, value, name)
     if origin is typing.Literal:
         if value not in inner:
-            raise unknown(f"value for {name}:", str(value), [str(choice) for choice in inner])
+            raise unknown(f"value for {name}:", _short(value), [str(choice) for choice in inner])
         return value
     if origin is tuple:
         items = value if isinstance(value, list | tuple) else [value]
         kinds = inner if Ellipsis not in inner else (inner[0],) * len(items)
         if len(kinds) != len(items):
-            raise InputError(f"{name}: expected {len(kinds)} values, got {value!r}")
+            raise InputError(f"{name}: expected {len(kinds)} values, got {_SHORT.repr(value)}")
         return tuple(_convert(kind, item, name) for kind, item in zip(kinds, items, strict=True))
     if origin is dict:
         if not isinstance(value, Mapping):
-            raise InputError(f"{name}: expected a mapping, got {value!r}")
+            raise InputError(f"{name}: expected a mapping, got {_SHORT.repr(value)}")
         return {str(key): _convert(inner[1], item, f"{name}.{key}") for key, item in value.items()}
     return _scalar(hint, value, name)
 
@@ -170,4 +195,4 @@ def _scalar(hint: Any, value: Any, name: str) -> Any:
         with suppress(ValueError, OverflowError):
             if hint is not int or float(value) == int(float(value)):
                 return hint(float(value)) if hint is int else hint(value)
-    raise InputError(f"{name}: expected {hint.__name__}, got {value!r}")
+    raise InputError(f"{name}: expected {hint.__name__}, got {_SHORT.repr(value)}")

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -10,6 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from render.shared.errors import InputError
+
+_PLAIN_NAME = re.compile(r"(?!\.)[^/\\\0-\x1f\x7f]{1,200}")
+
+
+def is_plain_name(name: str) -> bool:
+    """Tell whether a name from a file can be that of a file in a given folder, and of nothing outside it."""
+    return _PLAIN_NAME.fullmatch(name) is not None
 
 
 def cache_folder() -> Path:
@@ -36,8 +44,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         with _writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
-            with open(temporary, "rb") as handle:
-                os.fsync(handle.fileno())
+            _flush(temporary)
             os.replace(temporary, path)
     finally:
         with suppress(OSError):
@@ -60,12 +67,21 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
                 shutil.rmtree(stale, ignore_errors=True)
             temporary.mkdir()
             yield temporary
+            for file in temporary.rglob("*"):
+                if file.is_file():
+                    _flush(file)
             if path.exists():
                 os.replace(path, old)
             os.replace(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
+
+
+def _flush(path: Path) -> None:
+    """Bring a file to the disk, or a loss of power after the renaming could leave an empty one under its name."""
+    with open(path, "rb") as handle:
+        os.fsync(handle.fileno())
 
 
 @contextmanager
@@ -113,6 +129,31 @@ def write_jsonl(path: str | Path, rows: list[dict[str, Any]]) -> None:
     write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
 
 
+def parse_json(text: str) -> Any:
+    """Parse JSON, with one kind of error: numbers of thousands of digits and lists in lists without end have others.
+
+    Raises:
+        ValueError: not JSON.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
+def read_json(path: str | Path, remedy: str) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        InputError: the file is missing, or is not JSON.
+    """
+    text = read_text(path)
+    try:
+        return parse_json(text)
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON ({error}); {remedy}") from error
+
+
 def read_jsonl(path: str | Path) -> list[dict[str, Any]]:
     """Read one JSON object per line.
 
@@ -122,9 +163,10 @@ def read_jsonl(path: str | Path) -> list[dict[str, Any]]:
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path}: line {number} is not JSON ({error.msg}); plan the data again") from error
+            rows.append(parse_json(line))
+        except ValueError as error:
+            reason = getattr(error, "msg", error)
+            raise InputError(f"{path}: line {number} is not JSON ({reason}); plan the data again") from error
     return rows
 
 
@@ -142,8 +184,8 @@ def read_whole_lines(path: Path) -> Iterator[Any]:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     for line in text.splitlines():
         try:
-            yield json.loads(line)
-        except json.JSONDecodeError:
+            yield parse_json(line)
+        except ValueError:
             continue
 
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from render.shared.decoding import check_picture, decoding
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
 
@@ -36,12 +37,11 @@ def read_image(path: str | Path, *, channels: int | None = 3) -> np.ndarray:
         InputError: missing, damaged, another number of channels, or neither 8 nor 16 bits.
     """
     data = read_bytes(path, "no such picture; copy it there or drop it from the list that names it")
-    try:
+    with decoding(path, "a picture"):
         with Image.open(io.BytesIO(data)) as picture:
+            check_picture(path, picture, data)
             picture.verify()
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, SyntaxError, ValueError, cv2.error) as error:
-        raise InputError(f"{path}: damaged or not a picture ({error}); copy it again") from error
     if pixels is None:
         raise InputError(f"{path}: damaged or not a picture; copy it again")
     if pixels.dtype not in _TYPES.values():

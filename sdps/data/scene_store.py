@@ -10,6 +10,7 @@ import numpy as np
 
 from render.records.manifest import FAILED, SceneSpec, read_failed, read_manifest
 from render.records.shards import read_shard
+from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
 
@@ -91,12 +92,10 @@ class SceneStore:
             _save(truth, np.concatenate(layers, axis=-1, dtype=np.float32))
             _save(images, packed.values)
             return stored
-        try:
+        with decoding(images, "an entry of the cache", f"delete {images.parent}"):
             ground = np.load(truth)  # (H, W, 5)
             packed = PackedImages(np.load(images, mmap_mode="r"), ground[..., 4] > 0.5)
             return StoredScene(packed, ground[..., :3], ground[..., 3] > 0.5)
-        except (OSError, ValueError) as error:
-            raise InputError(f"{images}: damaged cache entry ({error}); delete {images.parent}") from error
 
 
 def finished_scenes(folder: Path, split: str, *, skip_missing: bool = False) -> list[SceneSpec]:

@@ -4,7 +4,6 @@ Neither file can execute code when loaded, and neither is ever half-written.
 """
 
 import json
-import pickle
 import struct
 from dataclasses import dataclass
 from functools import cache
@@ -12,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save
 from torch import nn
 
 from render.shared.config import build
+from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, source_digest
 from sdps.data.augment import Augmentation
@@ -101,12 +101,9 @@ def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedM
     """
     if not Path(path).is_file():
         raise InputError(f"{path}: no such weights file; train one or give another path")
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path}: truncated or not a safetensors file ({error}); copy or train it again") from error
+    with decoding(path, "a safetensors file", "copy or train it again"), safe_open(path, framework="pt") as file:
+        header = file.metadata() or {}
+        tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (not a dict)
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: not written by this project (no {FORMAT!r} header); train the network again")
     name, options, metadata = _described(path, header)
@@ -116,6 +113,9 @@ def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedM
             f"{path}: holds {name!r}, a model for {registry.entry(name).role!r}; one for {' or '.join(roles)} is "
             "needed here; swap the files"
         )
+    damaged = next((key for key, tensor in tensors.items() if not torch.isfinite(tensor).all()), None)
+    if damaged is not None:
+        raise InputError(f"{path}: {damaged} has values that are infinite or NaN; copy or train it again")
     network = registry.create(name, **options)
     try:
         network.load_state_dict(tensors)
@@ -149,7 +149,8 @@ def load_state(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: truncated or foreign file.
     """
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError) as error:
-        raise InputError(f"{path}: truncated or not a checkpoint; delete it to start this run afresh") from error
+    with decoding(path, "a checkpoint", "delete it to start this run afresh"):
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict):
+            raise TypeError(f"it holds a {type(state).__name__}")
+        return state

@@ -3,7 +3,6 @@
 Directions here: x right, y up, z to the camera, unit, from the surface to the light.
 """
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from render.shared.errors import InputError, unknown
-from render.shared.files import read_text, write_json
+from render.shared.files import parse_json, read_text, write_json
 from sdps.photos.doubts import Doubts
 
 FRAME = "x right, y up, z to the camera"
@@ -127,7 +126,7 @@ def parse_frame(frame: str) -> tuple[int, int, int]:
 def _read_json(path: Path) -> tuple[list[str], np.ndarray]:
     """Read lights.json as names and rows (N, 4) or (N, 6)."""
     try:
-        content = json.loads(read_text(path))
+        content = parse_json(read_text(path))
         frame = content["frame"]
         names = [str(image["file"]) for image in content["images"]]
         rows = [

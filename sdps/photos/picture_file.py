@@ -15,10 +15,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import OpenEXR
 import tifffile
 from PIL import Image
 
+from render.shared.decoding import check_picture, check_unpacked, decoding, exr_parts
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
 from sdps.photos.response import profile_exponent
@@ -78,14 +78,8 @@ def decode(path: Path) -> Picture:
     if kind is None:
         raise InputError(f"{path}: pictures of this kind are not read; convert it to 16-bit TIFF or PNG")
     data = read_bytes(path, "no such picture; copy it there or drop it from the list that names it")
-    with _quiet():
-        try:
-            return {"PNG": _png, "TIFF": _tiff, "JPEG": _jpeg, "EXR": _exr}[kind](path, data)
-        except InputError:
-            raise
-        except Exception as error:  # the decoders raise whatever they like on damaged bytes
-            reason = (str(error).strip().splitlines() or ["unreadable"])[0]
-            raise InputError(f"{path}: damaged or not a {kind} ({reason}); copy it again or leave it out") from error
+    with _quiet(), decoding(path, f"a {kind}", "copy it again or leave it out"):
+        return {"PNG": _png, "TIFF": _tiff, "JPEG": _jpeg, "EXR": _exr}[kind](path, data)
 
 
 def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
@@ -111,6 +105,7 @@ def _quiet() -> Iterator[None]:
 
 def _png(path: Path, data: bytes) -> Picture:
     with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
+        check_picture(path, picture, data)
         profile, exif = picture.info.get("icc_profile"), Image.Exif()
         exif.load(picture.info.get("exif", b""))  # not getexif(), which decodes the pixels
         picture.verify()  # its checksums; libpng would print
@@ -120,6 +115,7 @@ def _png(path: Path, data: bytes) -> Picture:
 def _tiff(path: Path, data: bytes | bytearray) -> Picture:
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         page: Any = file.pages[0]  # a TiffPage; only later ones may be frames
+        check_unpacked(path, page.nbytes, "its pixels")
         tags, order = page.tags, file.byteorder
         profile = bytes(tags[_PROFILE].value) if _PROFILE in tags else None
         orientation = int(tags[_ORIENTATION].value) if _ORIENTATION in tags else 1
@@ -146,6 +142,7 @@ def _by_opencv(path: Path, data: bytes | bytearray, kind: str, profile: bytes | 
 
 def _jpeg(path: Path, data: bytes) -> Picture:
     with Image.open(io.BytesIO(data), formats=["JPEG", "MPO"]) as picture:
+        check_picture(path, picture, data)
         profile, orientation = picture.info.get("icc_profile"), picture.getexif().get(_ORIENTATION, 1)
         pixels = np.asarray(picture.convert("RGB"))
     return Picture(
@@ -154,8 +151,7 @@ def _jpeg(path: Path, data: bytes) -> Picture:
 
 
 def _exr(path: Path, data: bytes) -> Picture:
-    with OpenEXR.File(str(path)) as file:
-        channels = {name: channel.pixels for name, channel in file.channels().items()}
+    channels = {name: channel.pixels for name, channel in exr_parts(path)[0].channels.items()}
     colour = [name for name in channels if name.split(".")[-1] in ("RGB", "RGBA")]
     grey = [name for name in channels if name.split(".")[-1] in ("Y", "YA")]
     name = next((name for name in ("RGB", "RGBA", "Y", "YA") if name in channels), None)

@@ -1,6 +1,5 @@
 """Learning curves of a run, or of several over each other, from their `metrics.jsonl`."""
 
-import json
 import math
 from collections.abc import Mapping
 from functools import partial
@@ -13,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from render.shared.errors import InputError, unknown
-from render.shared.files import atomic_path, read_text
+from render.shared.files import atomic_path, parse_json, read_text
 
 Rows = list[dict[str, float]]
 
@@ -45,11 +44,11 @@ def read_metrics(path: str | Path) -> Rows:
     lines = read_text(path).splitlines()
     for number, line in enumerate(lines, start=1):
         try:
-            row = json.loads(line)
-        except json.JSONDecodeError as error:
+            row = parse_json(line)
+        except ValueError as error:
             if number == len(lines):  # the run is being written, or was killed at it
                 break
-            raise InputError(f"{path}: line {number} is not JSON ({error.msg}); train this run again") from error
+            raise InputError(f"{path}: line {number} is not JSON ({error}); train this run again") from error
         if not isinstance(row, dict) or not isinstance(row.get("step"), int):
             raise InputError(f"{path}: line {number} has no step, so it is no metrics; train this run again")
         rows.append({key: value for key, value in row.items() if isinstance(value, int | float)})

@@ -12,8 +12,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
 from render.records.shards import file_hash
 from render.shared.config import read_yaml
@@ -116,10 +114,9 @@ def _repeat(weights: Path, model: TrainedModel) -> dict[str, Any]:
 
 def _plain(file: Path) -> dict[str, Any]:
     try:
-        values = yaml.safe_load(read_text(file))
-    except (InputError, yaml.YAMLError):
+        return read_yaml(file)
+    except InputError:
         return {}
-    return values if isinstance(values, dict) else {}
 
 
 def _front_matter(model: TrainedModel, name: str, scores: Mapping[str, float], *, pretrained: bool) -> dict[str, Any]:

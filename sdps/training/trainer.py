@@ -22,6 +22,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from render.records.manifest import read_manifest
 from render.shared.config import to_plain
+from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 from sdps.core.interrupts import StopRequest, stop_on_signal
@@ -211,6 +212,7 @@ class Trainer:
         """Step from which on, precision and processor: what the run was computed in, part by part."""
         self.best = math.inf
         self.learning_rate = config.learning_rate
+        self.saved: int | None = None  # step of the checkpoint on disk
         self.finished_metrics: dict[str, float] | None = None
         self._earlier_seconds, self._started = 0.0, time.perf_counter()
 
@@ -252,7 +254,7 @@ class Trainer:
         # One transfer a step: a GPU is waited for once.
         totals = self.team.mean(dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True)))
         if not math.isfinite(totals["loss"]):
-            raise InputError(f"the loss became {totals['loss']} at step {self.step + 1}; lower learning_rate")
+            raise self._diverged(f"the loss became {totals['loss']} at step {self.step + 1}")
         if config.clip_gradient:
             norm = torch.nn.utils.clip_grad_norm_(self.stage.network.parameters(), config.clip_gradient)
             totals["gradient_norm"] = float(norm)
@@ -294,8 +296,26 @@ class Trainer:
         """Return the network that is validated and saved: the trained one, or its moving average."""
         return self.stage.network if self.average is None else self.average.module
 
+    def _diverged(self, what: str) -> InputError:
+        """Build the error that ends a run which has left the numbers, and say what is left of it."""
+        path = self.folder / CHECKPOINT
+        kept = "nothing was saved before"
+        if self.saved is not None:
+            kept = f"the last good state, of step {self.saved}, stays in {path}"
+        return InputError(f"{what}; {kept}; lower learning_rate and choose another --out")
+
+    def _require_finite(self) -> None:
+        """Refuse to write weights that a gradient has made infinite or NaN while the loss before it was finite."""
+        if not all(bool(torch.isfinite(weight).all()) for weight in self._kept().state_dict().values()):
+            raise self._diverged(f"the weights became infinite or NaN at step {self.step}")
+
     def save(self) -> None:
-        """Write the checkpoint: weights, optimiser, random state, and place in the data."""
+        """Write the checkpoint: weights, optimiser, random state, and place in the data.
+
+        Raises:
+            InputError: weights that are not finite; the checkpoint before stays.
+        """
+        self._require_finite()
         cuda = torch.cuda.get_rng_state_all() if self.team.device.type == "cuda" else []
         state = {
             "identity": self._identity(),
@@ -311,6 +331,7 @@ class Trainer:
             "finished_metrics": self.finished_metrics,
         }
         save_state(self.folder / CHECKPOINT, state)
+        self.saved = self.step
 
     def resume(self) -> None:
         """Go on from the folder's checkpoint, if there is one.
@@ -323,17 +344,19 @@ class Trainer:
             return
         state = load_state(path)
         self._compare(path, state.get("identity", {}))
-        self.stage.network.load_state_dict(state["network"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        if self.average is not None:
-            self.average.load_state_dict(state["average"])
-        torch.set_rng_state(state["random"]["cpu"])
-        if self.team.device.type == "cuda" and state["random"]["cuda"]:
-            torch.cuda.set_rng_state_all(state["random"]["cuda"])
-        self.step, self.samples, self.best = state["step"], state["samples"], state["best"]
-        self.computed = state.get("computed", [])
-        self.finished_metrics = state["finished_metrics"]
-        self._earlier_seconds, self._started = state["seconds"], time.perf_counter()
+        with decoding(path, "a checkpoint of this run", "delete it to start this run afresh"):
+            self.stage.network.load_state_dict(state["network"])
+            self.optimiser.load_state_dict(state["optimiser"])
+            if self.average is not None:
+                self.average.load_state_dict(state["average"])
+            torch.set_rng_state(state["random"]["cpu"])
+            if self.team.device.type == "cuda" and state["random"]["cuda"]:
+                torch.cuda.set_rng_state_all(state["random"]["cuda"])
+            self.step, self.samples, self.best = state["step"], state["samples"], state["best"]
+            self.saved = self.step
+            self.computed = state.get("computed", [])
+            self.finished_metrics = state["finished_metrics"]
+            self._earlier_seconds, self._started = state["seconds"], time.perf_counter()
 
     def note_arithmetic(self) -> None:
         """Record what the following steps are computed in, and say so where the run began with something else."""
@@ -361,7 +384,8 @@ class Trainer:
                 raise InputError(f"{path}: of another run ({key} was {was!r}, now {value!r}); choose another --out")
 
     def save_weights(self, metrics: dict[str, float], suffix: str = "") -> None:
-        """Write each network with everything needed to use and to trace it."""
+        """Write each network with everything needed to use and to trace it; InputError where it is not finite."""
+        self._require_finite()
         metadata = {
             "config": to_plain(self.config),
             **self.source.identity(),

@@ -73,7 +73,7 @@ def test_overrides_reach_any_field_and_convert_types():
         ("data.size=30", "size must be a multiple of 4"),
         ("lighting.precision=bf16", "lighting.precision"),
         ("test.lights=mertest", "did you mean 'merltest'"),
-        ("data.size=[1", "not a YAML value"),
+        ("data.size=[1", "not valid YAML"),
     ],
 )
 def test_wrong_override_names_the_field(override, message):

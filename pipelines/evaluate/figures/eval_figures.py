@@ -1,7 +1,6 @@
 """`sdps eval-figures`: the paper's figures on MERL-Test, for any methods, with the published curves beside ours."""
 
 import argparse
-import json
 import logging
 import sys
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from pipelines.shared import presets
 from pipelines.shared.flags import picked, split_list
 from render.shared.config import to_plain
 from render.shared.errors import InputError
-from render.shared.files import atomic_path, read_text, write_json
+from render.shared.files import atomic_path, read_json, write_json
 from sdps.inference.inference_config import inference_config
 from sdps.methods import pretrained
 from sdps.methods.method import NONE, Method
@@ -141,8 +140,8 @@ def _earlier(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        found = json.loads(read_text(path))
-    except json.JSONDecodeError:
+        found = read_json(path, "delete it")
+    except InputError:
         _log.warning("%s: damaged; it is written anew", path)
         return {}
     return {name: found[name] for name in FIGURES if name in found} if isinstance(found, dict) else {}

@@ -11,9 +11,8 @@ import trimesh
 
 from render.records.manifest import View
 from render.shapes.geometry.strips import from_strips
+from render.shared.decoding import decoding, largest_unpacked
 from render.shared.errors import InputError
-
-LARGEST_UNPACKED = 1 << 30  # bytes of what gzip compressed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,23 +196,20 @@ def load_mesh(path: str | Path) -> TriangleMesh:
     if not path.is_file():
         raise InputError(f"{path}: no such mesh file")
     try:
-        return _read(path)
+        with decoding(path, "a mesh", "export it again"):
+            return _read(path)
     except InputError as error:
         message = str(error)
         raise error if message.startswith(str(path)) else InputError(f"{path}: {message}") from error
-    # Every format has its own parser, and each fails in its own way on a damaged file, or hands on damaged arrays.
-    except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: cannot be read as a mesh ({reason})") from error
 
 
 def _read(path: Path) -> TriangleMesh:
     """Read a mesh file; one that is compressed by gzip, as in `bunny.ply.gz`, is unpacked in memory."""
     if path.suffix.lower() == ".gz":
         with gzip.open(path) as file:
-            unpacked = file.read(LARGEST_UNPACKED + 1)
-        if len(unpacked) > LARGEST_UNPACKED:
-            raise InputError(f"{path}: unpacks to more than {LARGEST_UNPACKED >> 20:,} MiB; unpack it by hand")
+            unpacked = file.read(largest_unpacked(path) + 1)
+        if len(unpacked) > largest_unpacked(path):
+            raise InputError(f"{path}: unpacks to more than a file of this size can hold; unpack it by hand")
         scene = trimesh.load_scene(io.BytesIO(unpacked), file_type=Path(path.stem).suffix[1:].lower(), process=False)
     else:
         scene = trimesh.load_scene(path, process=False)

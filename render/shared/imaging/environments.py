@@ -7,13 +7,14 @@ behind the object. So it is what somebody sees who stands at the object and look
 places maps alike.
 """
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
-import OpenEXR
 
+from render.shared.decoding import check_unpacked, decoding, exr_parts
 from render.shared.errors import InputError, unknown
 from render.shared.files import read_bytes
 from render.shared.seeds import generator
@@ -174,14 +175,16 @@ def _read(path: Path) -> np.ndarray:
     """Read an .hdr (Radiance) or .exr picture as (H, W, 3)."""
     data = read_bytes(path, "no such environment map; give an .hdr or .exr file, or a built-in name")
     if path.suffix.lower() == ".hdr":
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data[:2] == b"#?" else None
+        size = re.search(rb"-Y ([0-9]{1,9}) \+X ([0-9]{1,9})", data[:4096]) if data[:2] == b"#?" else None
+        pixels = None
+        with decoding(path, "a Radiance picture", "save it as .hdr or .exr again"):
+            if size:
+                check_unpacked(path, 12 * int(size[1]) * int(size[2]), "its pixels")
+                pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if pixels is None or pixels.ndim != 3:
             raise InputError(f"{path}: damaged or no Radiance picture; save it as .hdr or .exr again")
         return pixels[..., ::-1]
-    try:
-        channels = OpenEXR.File(str(path)).parts[0].channels
-    except (RuntimeError, ValueError, OSError, IndexError) as error:
-        raise InputError(f"{path}: damaged or no EXR picture ({error}); save it as .hdr or .exr again") from error
+    channels = exr_parts(path, "save it as .hdr or .exr again")[0].channels
     joined = next((channels[name].pixels for name in ("RGB", "RGBA") if name in channels), None)
     if joined is not None:
         return joined[..., :3]

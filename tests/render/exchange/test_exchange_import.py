@@ -233,7 +233,7 @@ def mat(**content: object):
         (lambda root: cv2.imwrite(str(root / OBJECT / "002.png"), np.zeros((8, 9, 3), np.uint16)),
          r"002\.png: is 8x9, the mask or normal map is 24x24"),
         (lambda root: cv2.imwrite(str(root / OBJECT / "002.png"), np.zeros((SIZE, SIZE), np.uint16)), "1 channel"),
-        (write(f"{OBJECT}/Normal_gt.mat", "hello"), r"Normal_gt\.mat: not a MATLAB file"),
+        (write(f"{OBJECT}/Normal_gt.mat", "hello"), r"Normal_gt\.mat: damaged or not a MATLAB file"),
         (mat(normals=np.zeros((SIZE, SIZE, 3))), r"no variable Normal_gt \(it has: normals\)"),
         (mat(Normal_gt=np.zeros((SIZE, SIZE))), r"want height x width x 3"),
         (write(f"{OBJECT}/scene.json", '{"exposure": -1}'), r"scene\.json: exposure must be a positive number"),

@@ -190,6 +190,6 @@ def test_models_differ(tmp_path: Path, model: str, fact: str) -> None:
 
 def test_foreign_weights_are_refused(tmp_path: Path) -> None:
     (tmp_path / "own.safetensors").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="truncated or not a safetensors file"):
+    with pytest.raises(InputError, match="damaged or not a safetensors file"):
         write_model_card(tmp_path / "MODEL_CARD.md", tmp_path / "own.safetensors")
     assert not (tmp_path / "MODEL_CARD.md").exists()

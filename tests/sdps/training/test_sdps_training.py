@@ -125,7 +125,7 @@ def test_checkpoint_of_another_run_is_refused(folder: Path, uninterrupted: tuple
     with pytest.raises(InputError, match=r"learning_rate was 0\.0005, now 0\.1"):
         train(NormalStage(replace(QUICK, learning_rate=0.1)), folder, uninterrupted[0])
     (tmp_path / CHECKPOINT).write_bytes((uninterrupted[0] / CHECKPOINT).read_bytes()[:5000])
-    with pytest.raises(InputError, match="not a checkpoint; delete it"):
+    with pytest.raises(InputError, match=r"damaged or not a checkpoint .*; delete it"):
         train(NormalStage(QUICK), folder, tmp_path)
 
 
@@ -348,7 +348,7 @@ def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path
     cases = [
         (weights, "lighting", "holds 'nenet', a model for 'normals'"),
         (cut, "normals", "truncated"),
-        (text, "normals", "truncated or not a safetensors"),
+        (text, "normals", "damaged or not a safetensors"),
         (tmp_path / "none.safetensors", "normals", "no such weights"),
         (misfit, "lighting", "do not fit"),
         (headless, "normals", "damaged header"),

@@ -84,7 +84,7 @@ def test_what_is_no_map_is_refused_in_one_line(tmp_path):
     (tmp_path / "text.hdr").write_text("no picture")
     refused("text.hdr", "no Radiance picture")
     (tmp_path / "text.exr").write_text("no picture")
-    refused("text.exr", "no EXR picture")
+    refused("text.exr", "not an EXR picture")
     refused("missing.hdr", "no such environment map")
     with pytest.raises(InputError, match="did you mean 'studio'"):
         environments.load("studi")

@@ -1,0 +1,101 @@
+"""The door through which files from outside are decoded.
+
+Whatever a library raises on damaged bytes becomes one line, and a file whose header announces more than such a file can
+sensibly hold is refused before anything is unpacked: a picture of 1 KB may claim 100,000 x 100,000 pixels.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import OpenEXR
+from PIL import Image
+
+from render.shared.errors import InputError
+
+ALWAYS = 128 << 20
+"""Bytes that any file may unpack to."""
+
+TIMES = 128
+"""How many times its own size a larger file may unpack to; photographs and meshes stay below 30."""
+
+
+@contextmanager
+def decoding(path: str | Path, what: str, remedy: str = "copy it again") -> Iterator[None]:
+    """Turn whatever goes wrong while a library decodes a file into one line.
+
+    Every library fails in its own ways on damaged bytes, and hands on damaged arrays that fail later; so this catches
+    every exception. Only decoding belongs inside.
+
+    Args:
+        path: The file.
+        what: What it should be, with its article: `a picture`.
+        remedy: What to do about it.
+
+    Raises:
+        InputError: in place of any other exception; one that is raised inside passes.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path}: damaged or not {what} ({reason[:200]}); {remedy}") from error
+
+
+def largest_unpacked(path: str | Path) -> int:
+    """Return how many bytes a file may unpack to: 128 MiB, or 128 times its size if that is more."""
+    return max(ALWAYS, TIMES * os.path.getsize(path))
+
+
+def check_unpacked(path: str | Path, size: int, what: str = "what it holds") -> None:
+    """Refuse a file that unpacks to much more than its own size.
+
+    Args:
+        path: The file.
+        size: Bytes that its header says it unpacks to.
+        what: What these are, for the message.
+
+    Raises:
+        InputError: more than `largest_unpacked`.
+    """
+    if size > largest_unpacked(path):
+        raise InputError(
+            f"{path}: its header announces {size >> 20:,} MiB for {what}, more than a file of this size can hold; "
+            "copy it again"
+        )
+
+
+def check_picture(path: str | Path, picture: Image.Image, data: bytes) -> None:
+    """Refuse a picture whose header announces more pixels than its file can hold; none of them is decoded.
+
+    Args:
+        path: The file.
+        picture: What Pillow opened.
+        data: The whole file; a PNG tells its bits per channel at byte 24, which Pillow keeps to itself.
+    """
+    wide = picture.format == "PNG" and data[24:25] == b"\x10"
+    bands = 3 if picture.mode == "P" else len(picture.getbands())
+    check_unpacked(path, picture.width * picture.height * bands * (2 if wide else 1), "its pixels")
+
+
+def exr_parts(path: str | Path, remedy: str = "copy it again") -> list[OpenEXR.Part]:
+    """Decode all parts of an OpenEXR file, after a look at their headers.
+
+    Raises:
+        InputError: missing, damaged, without a part, or of a size that such a file cannot hold.
+    """
+    with decoding(path, "an EXR picture", remedy):
+        size = 0
+        with OpenEXR.File(os.fspath(path), header_only=True) as file:
+            for part in file.parts:
+                low, high = (corner.astype(int) for corner in part.header["dataWindow"])
+                width, height = (max(int(side), 0) for side in high - low + 1)
+                size += width * height * 4 * len(part.header["channels"])
+        check_unpacked(path, size, "its pixels")
+        parts = OpenEXR.File(os.fspath(path)).parts
+        if not parts:
+            raise InputError(f"{path}: damaged or not an EXR picture (no part of it can be read); {remedy}")
+        return parts

@@ -1,0 +1,132 @@
+"""Full disks and lost power, injected at every file operation; kill -9 of real commands is slow, see `make faults`."""
+
+import builtins
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from data_folders import good_folder, scene_of, sphere_shard
+from fault_run import digests, disturbed, finished, left_over
+
+from pipelines.cli import main
+from render.records.shards import read_shard, write_shard
+from render.shared import files
+from render.shared.errors import InputError
+from render.shared.images import write_png
+from sdps.models.checkpoint import load_state, save_state
+
+
+def _folder(path: Path) -> None:
+    with files.atomic_folder(path) as temporary:
+        for number in range(3):
+            write_png(temporary / f"{number}.png", np.zeros((4, 4), np.uint8))
+
+
+WRITERS = {
+    "text": lambda path: files.write_text(path, "text"),
+    "shard": lambda path: write_shard(path, sphere_shard(count=3)),
+    "state": lambda path: save_state(path, {"step": 1}),
+    "folder": _folder,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_disk_that_fails_leaves_what_was_there(name: str, call: str, tmp_path: Path, monkeypatch) -> None:
+    target = tmp_path / f"a{'.exr' if name == 'shard' else ''}"
+    WRITERS[name](target)
+    before = digests(tmp_path, ("**/*",))
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, call, full)
+    with pytest.raises(InputError, match=r"cannot be written \(No space left on device\); free space"):
+        WRITERS[name](target)
+    monkeypatch.undo()
+    assert digests(tmp_path, ("**/*",)) == before and not left_over(tmp_path)
+
+
+class Disk:
+    """A model of a disk that loses power: what was written is on it only after `fsync`; a renaming may outrun it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.safe: set[int] = set()
+        self.torn: list[str] = []
+        real_sync, real_replace = os.fsync, os.replace
+
+        def sync(descriptor: int) -> None:
+            real_sync(descriptor)
+            self.safe.add(os.fstat(descriptor).st_ino)
+
+        def replace(source: Path, target: Path) -> None:
+            inside = [path for path in Path(source).rglob("*") if path.is_file()] if Path(source).is_dir() else [source]
+            if ".old" not in str(target):
+                self.torn += [str(path) for path in inside if os.stat(path).st_ino not in self.safe]
+            real_replace(source, target)
+
+        monkeypatch.setattr(os, "fsync", sync)
+        monkeypatch.setattr(os, "replace", replace)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_no_file_gets_its_name_before_its_bytes_are_on_the_disk(name: str, tmp_path: Path, monkeypatch) -> None:
+    disk = Disk(monkeypatch)
+    target = tmp_path / f"a{'.exr' if name == 'shard' else ''}"
+    WRITERS[name](target)
+    WRITERS[name](target)
+    assert disk.safe and not disk.torn
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_what_was_torn_is_not_accepted(share: float, tmp_path: Path) -> None:
+    """Files as a file system without order leaves them: cut short, or of full length with zeros at the end."""
+    shard = sphere_shard(count=3)
+    for name, write, read in (
+        ("a.exr", lambda path: write_shard(path, shard), lambda path: read_shard(path, scene_of(shard))),
+        ("a.pt", lambda path: save_state(path, {"weights": np.zeros(9).tolist()}), load_state),
+    ):
+        write(tmp_path / name)
+        data = (tmp_path / name).read_bytes()
+        kept = int(share * len(data))
+        for torn in (data[:kept], data[:kept] + bytes(len(data) - kept)):
+            (tmp_path / name).write_bytes(torn)
+            if name == "a.pt" and torn[: -len(data) // 10] == data[: -len(data) // 10]:
+                continue  # an archive's last bytes may matter to nobody
+            with pytest.raises(InputError, match=name):
+                read(tmp_path / name)
+
+
+def test_a_folder_that_may_not_be_written_is_one_line(tmp_path: Path, monkeypatch, capsys) -> None:
+    good_folder(tmp_path / "data")
+    real = builtins.open
+
+    def refuse(file, mode="r", *rest, **options):
+        if "w" in mode or "a" in mode:
+            raise PermissionError(errno.EROFS, "Read-only file system", str(file))
+        return real(file, mode, *rest, **options)
+
+    monkeypatch.setattr(Path, "mkdir", lambda self, *_, **__: refuse(self, "w"))
+    assert main(["data", "export", str(tmp_path / "data"), "--layout", "psfcn", "--out", str(tmp_path / "tree")]) == 2
+    said = capsys.readouterr().err
+    assert "Read-only file system" in said and "Traceback" not in said
+    assert not (tmp_path / "tree").exists()
+
+
+@pytest.mark.slow
+def test_an_export_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_path: Path) -> None:
+    import random
+
+    good_folder(tmp_path / "data")
+    trees = [tmp_path / kind / "tree" for kind in ("whole", "broken")]
+    words = [["data", "export", str(tmp_path / "data"), "--layout", "psfcn", "--out", str(tree)] for tree in trees]
+    code, seconds = finished(words[0])
+    assert code == 0
+    rng = random.Random(0)
+    for fault in ("kill -9", "SIGTERM", "full disk") * 3:
+        found = disturbed(words[1], fault, seconds, rng)
+        assert not found["hang"] and not found["traceback"], (fault, found)
+    assert finished(words[1])[0] == 0
+    assert digests(trees[0], ("**/*.*",)) == digests(trees[1], ("**/*.*",)) and not left_over(trees[1])

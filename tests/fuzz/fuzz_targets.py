@@ -1,0 +1,378 @@
+"""Every reader of the project, and a small corpus for each that is made here.
+
+A target makes a folder of sound files, of which one is mutated at a time, and reads the folder as the commands do.
+"""
+
+import gzip
+import json
+import os
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import benchmark_folders
+import cv2
+import data_folders
+import exchange_support
+import numpy as np
+import tifffile
+import trimesh
+import yaml
+from textures_support import write_maps
+
+
+class Target(NamedTuple):
+    """A reader.
+
+    Attributes:
+        make: Fills an empty folder with sound files.
+        read: Reads what is in the folder; gets the folder and the file that was mutated.
+        pattern: Files that are mutated.
+    """
+
+    make: Callable[[Path], Any]
+    read: Callable[[Path, Path], Any]
+    pattern: str = "*"
+
+
+_RNG = np.random.default_rng(0)
+_IMAGE = _RNG.uniform(0, 1, (12, 16, 3))
+
+
+# --- what is made -------------------------------------------------------------------------------------------------
+
+
+def _shards(folder: Path) -> None:
+    data_folders.write_folder(folder, [data_folders.sphere_shard(name="a", count=3)])
+
+
+def _data(folder: Path) -> None:
+    scenes = data_folders.good_folder(folder)
+    (folder / "log").mkdir()
+    line = {"bytes": 5, "seconds": 1.5, "stages": {"render": 1.0}, "time": "2026-01-01T00:00:00.000+00:00", "worker": 1}
+    rows = [{"id": scene.id, "spec": scene.digest(), **line} for scene in scenes]
+    (folder / "log" / "done-host-1-0.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    failed = rows[0] | {"seed": 1, "shape": "sphere", "material": "chrome", "reason": "it broke", "attempt": 1}
+    failed["traceback"] = "Traceback"
+    (folder / "failed.jsonl").write_text(json.dumps(failed) + "\n")
+    check = {"name": "x", "level": "error", "findings": 1, "about": "y"}
+    (folder / "validation.json").write_text(json.dumps(
+        {"checked": 4, "planned": 4, "errors": 1, "warnings": 0, "time": "2026-01-01", "sound": False,
+         "manifest_sha256": "0", "checks": [check]}
+    ))  # fmt: skip
+
+
+def _asset(name: str) -> Callable[[Path], Any]:
+    root = Path(__file__).resolve().parents[2] / "assets"
+    return lambda folder: shutil.copy(root / name, folder / f"own-{Path(name).name}")
+
+
+def _lights(folder: Path) -> None:
+    rows = np.round(data_folders.light_directions(12).astype(float), 6).tolist()
+    (folder / "rig.yaml").write_text(yaml.safe_dump({"name": "rig", "directions": rows}))
+
+
+def _merl(folder: Path) -> None:
+    (folder / "a.binary").write_bytes(struct.pack("<3i", 90, 90, 180) + bytes(8 * 400))
+
+
+def _rgl(folder: Path) -> None:
+    from render.materials import rgl
+
+    rgl.write(folder / "a_rgb.bsdf", lambda wi, wo: np.full((len(wi), 3), 0.3), slices=3, side=4)
+
+
+def _meshes(folder: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    for kind in ("ply", "obj", "stl", "glb", "off", "stl_ascii"):
+        ball.export(folder / f"ball-{kind}.{kind.split('_')[0]}", file_type=kind)
+    ball.export(folder / "ball-ascii.ply", encoding="ascii")
+    (folder / "ball.ply.gz").write_bytes(gzip.compress((folder / "ball-ply.ply").read_bytes()))
+    for name, data in trimesh.Scene(ball).export(file_type="gltf").items():
+        (folder / name).write_bytes(data)
+
+
+def _pictures(folder: Path) -> None:
+    from photo_folders import write
+
+    for name, bits in (("a8.png", 8), ("a16.png", 16), ("a8.tif", 8), ("a16.tif", 16), ("a.jpg", 8), ("a.exr", 16)):
+        write(folder / name, _IMAGE, bits)
+    tifffile.imwrite(folder / "float.tiff", _IMAGE.astype(np.float32), compression="deflate")
+    grey = np.dstack([_IMAGE, _IMAGE[..., :1]])
+    assert cv2.imwrite(str(folder / "alpha.png"), (grey * 65535).astype(np.uint16))
+
+
+def _environments(folder: Path) -> None:
+    from photo_folders import write
+
+    sky = np.repeat(_IMAGE[:8], 1, axis=1).astype(np.float32)  # 8 x 16
+    assert cv2.imwrite(str(folder / "sky.hdr"), sky)
+    write(folder / "sky.exr", sky)
+
+
+def _light_files(folder: Path) -> None:
+    from sdps.photos.light_files import write_lights
+
+    names = [f"{number}.png" for number in range(1, 7)]
+    vectors = data_folders.light_directions(6).astype(float)
+    write_lights(folder / "lights.json", names, vectors, np.ones(6))
+    (folder / "lights.txt").write_text("".join("{} {} {}\n".format(*row) for row in vectors))
+    (folder / "named.txt").write_text(
+        "".join(f"{name} {x} {y} {z} 1.0\n" for name, (x, y, z) in zip(names, vectors, strict=True))
+    )
+
+
+def _weights(folder: Path) -> None:
+    from render.shared.config import to_plain
+    from sdps.data.augment import Augmentation
+    from sdps.models import registry
+    from sdps.models.checkpoint import TrainedModel, save_state, save_weights
+
+    network = registry.create("lcnet-second")
+    metadata = {"config": {"augmentation": to_plain(Augmentation())}, "data": "0", "code": "0", "step": 1}
+    save_weights(folder / "a.safetensors", TrainedModel("lcnet-second", network, {}, metadata), half=True)
+    values = list(network.state_dict().values())[:3]
+    save_state(folder / "checkpoint.pt", {"step": 3, "network": dict(enumerate(values)), "best": None, "names": ["a"]})
+    (folder / "metrics.jsonl").write_text('{"step": 1, "loss": 0.5}\n{"step": 2, "loss": 0.4, "val_mae": 9.5}\n')
+
+
+def _psfcn(folder: Path) -> None:
+    _exported(folder, "psfcn")
+
+
+def _diligent(folder: Path) -> None:
+    benchmark_folders.write_diligent(folder / "tree", ("ball",), lights=4)
+    shutil.rmtree(folder / "tree-shards")
+
+
+def _exported(folder: Path, layout: str) -> None:
+    from pipelines import cli
+
+    exchange_support.write_folder(folder / "data", lights=3, size=12)
+    done = cli.main(["data", "export", str(folder / "data"), "--layout", layout, "--out", str(folder / "tree")])
+    assert done == 0
+    shutil.rmtree(folder / "data")
+
+
+def _records(folder: Path) -> None:
+    (folder / "export.json").write_text('{"layout": "psfcn", "bits": 16, "scenes": {}}')
+    table = {"title": "t", "header": ["a", "b"], "rows": [["x", 1.0]]}
+    section = {"name": "x", "order": 1, "title": "t", "text": "a", "tables": [table], "strips": []}
+    (folder / "report" / "x").mkdir(parents=True)
+    (folder / "report" / "x" / "section.json").write_text(json.dumps(section))
+
+
+def _cache(folder: Path) -> None:
+    from sdps.data.scene_store import SceneStore
+
+    scenes = data_folders.write_folder(folder, [data_folders.sphere_shard(name="a", count=3)])
+    SceneStore(folder, cache=True).load(scenes[0])
+
+
+def _command_lines(folder: Path) -> None:
+    """Write a line for every flag and positional of every command, which ends before anything long is begun."""
+    from pipelines.cli import COMMANDS, Group, build_parser
+
+    known = [(name,) for name, command in COMMANDS.items() if not isinstance(command, Group)]
+    known += [(name, inner) for name, group in COMMANDS.items() if isinstance(group, Group) for inner in group.commands]
+    number = 0
+    for words in known:
+        if words[0].startswith("bench") or words[0] in (
+            "noise",
+            "doctor",
+            "shapes",
+            "materials",
+        ):  # these work without any flag
+            continue
+        parser = _innermost(build_parser(words), words)
+        actions = [action for action in parser._actions if action.dest != "help"]
+        stop = ["--set", "data.size=0"] if any(action.dest == "preset" for action in actions) else []
+        for action in actions:
+            if action.nargs == 0:
+                continue
+            flag = action.option_strings[-1:]
+            missing = ["missing"] if flag and any(not other.option_strings for other in actions) else []
+            line = json.dumps([*words, *stop, *missing, *flag, "value"])
+            (folder / f"{number:03d}-{words[-1]}.argv").write_text(line)
+            number += 1
+
+
+def _innermost(parser: Any, words: tuple[str, ...]) -> Any:
+    import argparse
+
+    for word in words:
+        (children,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+        parser = children.choices[word]
+    return parser
+
+
+# --- how it is read -----------------------------------------------------------------------------------------------
+
+
+def _read_shard(folder: Path, path: Path) -> None:
+    from render.records.manifest import read_manifest
+    from render.records.shards import is_whole, read_shard
+
+    scene = data_folders.scene_of(data_folders.sphere_shard(name="a", count=3))
+    if path.suffix == ".exr":
+        is_whole(path, scene)
+        read_shard(path)
+        read_shard(path, scene)
+    else:
+        read_manifest(folder)
+
+
+def _read_data(folder: Path, path: Path) -> None:
+    from pipelines import cli
+
+    for words in (["status"], ["card"], ["preview"], ["validate"]) if path.suffix != ".exr" else (["validate"],):
+        _command(cli.main, ["data", *words, str(folder)])
+    for made in ("DATASET_CARD.md", "croissant.json", "preview"):
+        shutil.rmtree(folder / made, ignore_errors=True)
+
+
+def _command(main: Callable[[list[str]], int], words: list[str]) -> None:
+    """Run a command in this process; what it prints as an error is checked by the caller."""
+    code = main(words)
+    assert code in (0, 1, 2), code
+
+
+def _read_preset(folder: Path, path: Path) -> None:
+    from pipelines.shared import presets
+    from render.planning.plan import plan
+
+    preset = presets.load(str(path))
+    if sum(preset.data.families.values()) < 10 and preset.data.views < 3 and preset.data.light_count < 100:
+        plan(preset.data)
+
+
+def _read_lights(folder: Path, path: Path) -> None:
+    from render.planning import light_sets
+
+    light_sets.load(str(path))
+
+
+def _read_material(folder: Path, path: Path) -> None:
+    from render.materials import library
+
+    library.load(str(path))
+
+
+def _read_maps(folder: Path, path: Path) -> None:
+    from render.materials.textures import map_folder
+
+    map_folder.read(folder)
+
+
+def _read_mesh(folder: Path, path: Path) -> None:
+    from render.shapes.geometry.mesh import load_mesh
+
+    load_mesh(folder / "model.gltf" if path.suffix in (".bin", ".gltf") else path)
+
+
+def _read_picture(folder: Path, path: Path) -> None:
+    from sdps.photos.masks import read_mask
+    from sdps.photos.measures import _camera_settings
+    from sdps.photos.picture_file import decode
+
+    decode(path)
+    _camera_settings(path)
+    read_mask(path, (12, 16))
+
+
+def _read_foreign_picture(folder: Path, path: Path) -> None:
+    from pipelines.benchmarks.psm_photos import _read
+    from render.shared.images import read_image
+
+    (_read if path.suffix in (".jpg", ".tga") else read_image)(path)
+
+
+def _read_environment(folder: Path, path: Path) -> None:
+    from render.shared.imaging import environments
+
+    environments.load(str(path))
+
+
+def _read_light_file(folder: Path, path: Path) -> None:
+    from sdps.photos.light_files import read_intensities, read_lights
+
+    files = [f"{number}.png" for number in range(1, 7)]
+    read_lights(path, files)
+    if path.suffix == ".txt":
+        read_intensities(path, files)
+
+
+def _read_weights(folder: Path, path: Path) -> None:
+    from sdps.models.checkpoint import load_state, load_weights
+    from sdps.publishing.learning_curves import read_metrics
+
+    {".pt": load_state, ".jsonl": read_metrics}.get(path.suffix, load_weights)(path)
+
+
+def _read_tree(folder: Path, path: Path) -> None:
+    from pipelines import cli
+
+    layout = "diligent" if (folder / "tree" / "pmsData").exists() else "psfcn"
+    words = ["data", "import", str(folder / "tree"), "--layout", layout, "--out", str(folder.parent / "imported")]
+    _command(cli.main, words)
+    shutil.rmtree(folder.parent / "imported", ignore_errors=True)
+
+
+def _read_records(folder: Path, path: Path) -> None:
+    from pipelines.report.sections import read_sections
+    from render.exchange.folders import read_record
+
+    if path.name == "section.json":
+        read_sections(folder)
+    else:
+        read_record(path)
+
+
+def _read_cache(folder: Path, path: Path) -> None:
+    from sdps.data.scene_store import SceneStore
+
+    SceneStore(folder, cache=True).load(data_folders.scene_of(data_folders.sphere_shard(name="a", count=3)))
+
+
+def _read_command_line(folder: Path, path: Path) -> None:
+    from pipelines import cli
+
+    place = folder / "here"
+    place.mkdir(exist_ok=True)
+    before = Path.cwd()
+    os.chdir(place)
+    try:
+        _command(cli.main, json.loads(path.read_bytes()))
+    except SystemExit as error:
+        assert error.code in (0, 1, 2), error.code
+    finally:
+        os.chdir(before)
+        shutil.rmtree(place, ignore_errors=True)
+
+
+TARGETS: dict[str, Target] = {
+    "shards": Target(_shards, _read_shard, "shards/*.exr"),
+    "manifests": Target(_shards, _read_shard, "*.jsonl"),
+    "data folders": Target(_data, _read_data, "**/*.json*"),
+    "presets": Target(_asset("presets/smoke.yaml"), _read_preset),
+    "lights": Target(_lights, _read_lights),
+    "materials": Target(_asset("materials/chrome.yaml"), _read_material),
+    "MERL tables": Target(_merl, _read_material),
+    "RGL files": Target(_rgl, _read_material),
+    "PBR maps": Target(write_maps, _read_maps),
+    "meshes": Target(_meshes, _read_mesh),
+    "photographs and masks": Target(_pictures, _read_picture),
+    "pictures of other layouts": Target(_pictures, _read_foreign_picture, "*.[pj][np]g"),
+    "environment maps": Target(_environments, _read_environment),
+    "light files": Target(_light_files, _read_light_file),
+    "weights, checkpoints, curves": Target(_weights, _read_weights),
+    "PS-FCN trees": Target(_psfcn, _read_tree, "tree/**/*.*"),
+    "DiLiGenT trees": Target(_diligent, _read_tree, "tree/**/*.*"),
+    "command lines": Target(_command_lines, _read_command_line, "*.argv"),
+    "records": Target(_records, _read_records, "**/*.json"),
+    "training cache": Target(_cache, _read_cache, "**/*.npy"),
+}
+SLOW = ("data folders", "PS-FCN trees", "DiLiGenT trees")
+"""Targets of which an input takes a tenth of a second or more: they get fewer."""

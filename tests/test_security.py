@@ -1,0 +1,124 @@
+"""No code runs from a file, no name from a file leads out of a folder, and no text from a file is markup on a page."""
+
+import ast
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from data_folders import scene_of, sphere_shard, write_folder
+
+from pipelines.cli import main
+from pipelines.report.sections import Picture, Section, SectionWriter
+from render.exchange.names import legal_name, object_places, view_places
+from render.records.manifest import read_manifest
+from render.shared.config import parse_yaml
+from render.shared.errors import InputError
+from sdps.models.checkpoint import load_state
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = [path for package in ("render", "sdps", "pipelines") for path in sorted((ROOT / package).rglob("*.py"))]
+HOSTILE = ("../../x", "/tmp/x", "..", ".x", "a/b", "a\\b", "a\0b", "a\nb", "", "x" * 300)
+MARKUP = '<script>alert(1)</script><img src=x onerror="alert(1)">'
+
+
+class Ran:
+    """Pickles as a call that would leave a file behind."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nothing_that_runs_code_from_data_is_called(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = {alias.name for alias in node.names} | {getattr(node, "module", None)}
+            assert not names & {"pickle", "marshal", "shelve", "dill", "joblib", "cloudpickle"}, node.lineno
+        if not isinstance(node, ast.Call):
+            continue
+        called, keywords = ast.unparse(node.func), {word.arg: ast.unparse(word.value) for word in node.keywords}
+        assert called not in ("eval", "exec", "compile", "__import__", "os.system", "os.popen"), node.lineno
+        assert keywords.get("shell", "False") == keywords.get("allow_pickle", "False") == "False", node.lineno
+        if called == "torch.load":
+            assert keywords.get("weights_only") == "True", node.lineno
+        if called in ("yaml.load", "yaml.load_all"):
+            assert "SafeLoader" in keywords.get("Loader", ""), node.lineno
+        assert called not in ("yaml.unsafe_load", "yaml.full_load"), node.lineno
+        assert not called.endswith((".extractall", "unpack_archive")), "archives are read member by member"
+
+
+def test_neither_checkpoints_nor_yaml_run_code(tmp_path: Path) -> None:
+    ran = tmp_path / "ran"
+    torch.save({"step": Ran(ran)}, tmp_path / "checkpoint.pt")
+    with pytest.raises(InputError, match=r"checkpoint.pt: damaged or not a checkpoint .*delete it"):
+        load_state(tmp_path / "checkpoint.pt")
+    with pytest.raises(InputError, match=r"x\.yaml: line 1 is not valid YAML"):
+        parse_yaml(f"!!python/object/apply:os.mkdir [{ran}]", "x.yaml")
+    assert not ran.exists()
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_manifest_names_no_file_outside_its_folder(name: str, tmp_path: Path) -> None:
+    shard = sphere_shard(count=3)
+    write_folder(tmp_path, [shard])
+    line = (tmp_path / "manifest.jsonl").read_text()
+    assert line.count('"id": "a"') == 1
+    (tmp_path / "manifest.jsonl").write_text(line.replace('"id": "a"', f'"id": {json.dumps(name)}'))
+    with pytest.raises(InputError, match=r"manifest.jsonl: line 1.*id: .* is no name of a file"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_exported_places_stay_in_the_tree(name: str) -> None:
+    scene = scene_of(sphere_shard(count=3), shape=name or "x", material=name or "x")
+    for place in (*object_places([scene]).values(), *view_places([scene]).values()):
+        assert all(re.fullmatch(r"[A-Za-z0-9-]*", part) for part in place)
+    assert re.fullmatch(r"[A-Za-z0-9-]{1,80}", legal_name(name))
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_report_embeds_no_file_from_elsewhere(name: str) -> None:
+    with pytest.raises(InputError, match="is not the name of a picture"):
+        Picture(caption="x", file=name)
+
+
+@pytest.mark.parametrize("entry", ["../x", "x/..", "./x", "/x", "x/"])
+def test_an_imported_list_names_no_sample_outside_its_tree(entry: str, tmp_path: Path, capsys) -> None:
+    (tmp_path / "tree").mkdir()
+    (tmp_path / "tree" / "train_mtrl.txt").write_text(f"{entry}\n")
+    assert main(["data", "import", str(tmp_path / "tree"), "--layout", "psfcn", "--out", str(tmp_path / "out")]) != 0
+    assert "is not '<shape>/<material>'" in "".join(capsys.readouterr())
+
+
+def test_no_page_or_card_takes_names_for_markup(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Scene, shape and material names, reasons of failures and names in sections, through every page there is."""
+    shard = sphere_shard(name="<b>a", count=4)
+    shard = replace(shard, provenance=shard.provenance | {"material": MARKUP, "mitsuba": MARKUP})
+    write_folder(tmp_path, [shard], [scene_of(shard, shape=MARKUP, material=MARKUP)])
+    failed = json.dumps({"id": "<b>a", "time": "2026", "reason": MARKUP, "seed": 1}) + "\n"
+    (tmp_path / "failed.jsonl").write_text(failed)
+    (tmp_path / "config.yaml").write_text(f"name: '{MARKUP}'\ndescription: '{MARKUP}'\n")
+    for command in ("preview", "card"):
+        assert main(["data", command, str(tmp_path)]) == 0, capsys.readouterr().err
+    section = Section(name="x", title=MARKUP, text=MARKUP, command=MARKUP)
+    writer = SectionWriter(section)
+    writer.strip(MARKUP, [(MARKUP, np.zeros((8, 8, 3), np.uint8))])
+    writer.write(tmp_path)
+    assert main(["report", str(tmp_path)]) == 0
+    pages = [path for path in tmp_path.rglob("*") if path.suffix in (".html", ".md")]
+    assert {path.name for path in pages} >= {"preview.html", "report.html"} and len(pages) >= 3
+    for path in pages:
+        shown = re.sub(r"```.*?```|`[^`\n]*`|\A---\n.*?\n---\n", "", path.read_text(), flags=re.DOTALL)
+        shown = shown if path.suffix == ".md" else path.read_text()
+        assert "<script" not in shown and "<img src=x" not in shown and "<b>a" not in shown, path.name
+
+
+def test_the_test_of_sources_sees_what_it_should() -> None:
+    assert len(SOURCES) > 200
