@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import signal
 import sys
 import threading
 import webbrowser
@@ -55,6 +56,7 @@ def main(args: argparse.Namespace) -> int:
     sys.stdout.flush()
     if not args.no_browser:
         threading.Timer(1.0, webbrowser.open, [address]).start()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that what follows is also done then
     try:
         uvicorn.Server(config).run(sockets=[socket])
     except KeyboardInterrupt:
