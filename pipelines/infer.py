@@ -206,11 +206,11 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
     if len(result.light_directions):
         gains = result.gains
         gains = gains if gains.ndim == 1 else gains.mean(1)
-        body = tuple(
+        body: tuple[tuple[str, ...], ...] = tuple(
             (name, *(f"{value:.3f}" for value in direction), f"{gain / gains.mean():.3f}")
             for name, direction, gain in zip(result.photos.files, result.light_directions, gains, strict=True)
         )
-        header = ("photograph", "x", "y", "z", "intensity / mean")
+        header: tuple[str, ...] = ("photograph", "x", "y", "z", "intensity / mean")
         if "refined" in facts:
             expected = facts["refined"]["expected_light_error_degrees"]
             body = tuple((*row, f"{expected[row[0]]:.1f}°") for row in body)

@@ -107,7 +107,8 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
     Args:
         place: The set's folder.
         number: Of the run.
-        method, refine, anyway, discontinuities: As of `sdps.infer`.
+        refine: Refine where `sdps.infer` does by default.
+        method, anyway, discontinuities: As of `sdps.infer`.
         options: As of `check`.
 
     Returns:
@@ -126,7 +127,9 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
         stage("reading")
         photos = _load(folder, anyway=anyway, **options)
         stage("lights")
-        result = sdps.infer(photos, method, refine=refine, anyway=anyway, discontinuities=discontinuities)
+        result = sdps.infer(
+            photos, method, refine=None if refine else False, anyway=anyway, discontinuities=discontinuities
+        )
         stage("surface")
         (run / "view").mkdir(parents=True, exist_ok=True)
         shown = object_view.write(result, run / "view")
