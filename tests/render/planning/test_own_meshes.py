@@ -86,7 +86,7 @@ def test_no_usable_file_is_one_line(folder, tmp_path):
     with pytest.raises(InputError, match="holds no mesh file"):
         plan(config(tmp_path / "empty", 1))
     (tmp_path / "empty" / "broken.ply").write_text("nonsense")
-    with pytest.raises(InputError, match=r"none of 1 mesh files can be used; the first one: .*broken.ply: cannot"):
+    with pytest.raises(InputError, match=r"none of 1 mesh files can be used; the first one: .*broken.ply: damaged"):
         plan(config(tmp_path / "empty", 1))
 
 
