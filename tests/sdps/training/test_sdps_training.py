@@ -347,7 +347,7 @@ def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path
     save_weights(foreign, TrainedModel("nenet2", create("nenet"), {}, {"config": {"augmentation": {}}}))
     cases = [
         (weights, "lighting", "holds 'nenet', a model for 'normals'"),
-        (cut, "normals", "truncated"),
+        (cut, "normals", "damaged or not a safetensors"),
         (text, "normals", "damaged or not a safetensors"),
         (tmp_path / "none.safetensors", "normals", "no such weights"),
         (misfit, "lighting", "do not fit"),
