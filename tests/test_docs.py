@@ -82,7 +82,8 @@ def flags() -> set[str]:
     """Return the flags of all commands together; those made of a configuration's fields stand in the promised ones."""
     code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "pipelines").rglob("*.py"))
     code += (ROOT / "tests" / "support" / "interface.json").read_text(encoding="utf-8")
-    return {*re.findall(r'"(--[a-z][a-z-]*)"', code), "--help"}
+    either = re.findall(r'"--([a-z][a-z-]*)",\s*action=argparse.BooleanOptionalAction', code)
+    return {*re.findall(r'"(--[a-z][a-z-]*)"', code), *(f"--no-{name}" for name in either), "--help"}
 
 
 def resolves(dotted: str) -> bool:

@@ -130,9 +130,21 @@ def _add_vertices(image: Any, paths: Paths, vertices: Vertices, surfaces: Packed
         wi = frame.to_local(take(mi.Vector3f, vertices.wi, at))
         here = None if weights is None else tuple(take(mi.Float, weight, at) for weight in weights)
         value = surfaces.eval(number, wi, frame.to_local(direction), here)
+        value = dr.select(_carrier_faces(vertices, number, at, direction), value, 0)
         return (take(mi.Color3f, throughput, at) * value * weigh(at, normal) * strength,)
 
     _accumulate([image], vertices, lanes, reflect)
+
+
+def _carrier_faces(vertices: Vertices, number: int, at: Any, direction: Any) -> Any:
+    """Tell whether the surface that carries a relief faces the light.
+
+    The bitmask does not: a sample that follows its pixel's probes may face away (`probed_visibility`). Without a
+    relief the material is black there by itself.
+    """
+    if vertices.turned[number] is None:
+        return mi.Bool(True)
+    return dr.dot(dr.gather(mi.Vector3f, mi.Vector3f(vertices.normal), at), direction) > 0
 
 
 def _add_camera_hits(
@@ -158,7 +170,8 @@ def _add_camera_hits(
         entry = bsdf.half_cell(sin2_h, dr.dot(normal, half))
         azimuth = bsdf.azimuth(cos_i, cos_o, sin2_h, cos_d)
         shadow = bsdf.shadow_cell(cos_o)
-        lit = dr.select((cos_i > 0) & (cos_o > 0), cos_o, 0)
+        faces = _carrier_faces(vertices, numbers[0], at, direction)
+        lit = dr.select((cos_i > 0) & (cos_o > 0) & faces, cos_o, 0)
         values = []
         for parts, weigh in zip(materials, weighs, strict=True):
             total = mi.Color3f(0)

@@ -122,7 +122,7 @@ def test_bad_folders_are_one_line(photos: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(photos, copy)
     (copy / "hill" / "hill.3.tga").write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"hill\.3\.tga: cannot be read"):
+    with pytest.raises(InputError, match=r"hill\.3\.tga: damaged or not a picture"):
         psm_photos.read_photos(copy, "hill", LIGHTS).load().opened()
     (copy / "hill" / "hill.3.tga").unlink()
     with pytest.raises(InputError, match="without gaps"):

@@ -101,7 +101,7 @@ def test_sphere_normals_are_exact():
 
 
 def test_families_are_described():
-    assert set(shapes.families()) == {"sphere", "bunny", "blobby:<seed>", "sculpture:<seed>"}
+    assert set(shapes.families()) == {"sphere", "bunny", "blobby:<seed>", "sculpture:<seed>", "composition:<seed>"}
 
 
 @pytest.mark.parametrize(
