@@ -21,6 +21,7 @@ METHODS ?=
 FIGURES ?=
 PHOTOS ?=
 SEED ?= 0
+WORKERS ?= 2
 INPUTS ?= 100000
 MINUTES ?= 120
 KILLS ?= 100
@@ -152,7 +153,7 @@ demo: $(ASSETS_READY)
 	$(SDPS) demo --preset $(PRESET) --out $(OUT) --materials '$(MATERIALS)' --lights '$(LIGHTS)' $(SETTINGS)
 
 test: $(ASSETS_READY)
-	$(VENV)/bin/python -m pytest -m "not slow and not gpu"
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow and not gpu"
 
 test-slow: $(ASSETS_READY)
 	$(VENV)/bin/python -m pytest -m "slow and not gpu"
