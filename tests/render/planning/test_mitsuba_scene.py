@@ -183,7 +183,7 @@ def test_mirrors_reflect_as_much_light(tmp_path):
 
 
 def picture(path):
-    """Read a picture without Mitsuba, whose reader's threads may be gone in a long-lived process: it then waits forever."""
+    """Read a picture without Mitsuba, whose reader can wait forever in a long-lived process: its threads are gone."""
     return exr_parts(path)[0].channels["RGB"].pixels
 
 
