@@ -153,7 +153,7 @@ demo: $(ASSETS_READY)
 	$(SDPS) demo --preset $(PRESET) --out $(OUT) --materials '$(MATERIALS)' --lights '$(LIGHTS)' $(SETTINGS)
 
 test: $(ASSETS_READY)
-	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow and not gpu"
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow and not gpu"
 
 test-slow: $(ASSETS_READY)
 	$(VENV)/bin/python -m pytest -m "slow and not gpu"

@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from render.shared.errors import InputError
     from sdps.api import available_methods, estimate, infer, train
     from sdps.core.estimate import Estimate
+    from sdps.core.integration import integrate
     from sdps.core.metrics import score
     from sdps.inference.estimator import load_estimator
     from sdps.inference.inference_config import InferenceConfig
     from sdps.photos.reading import load
     from sdps.surface.inferred import Inference
-    from sdps.surface.integration import integrate
     from sdps.surface.meshing import mesh, write_mesh
     from sdps.surface.relight import relit
 else:
@@ -35,7 +35,7 @@ else:
             "sdps.inference.inference_config": ("InferenceConfig",),
             "sdps.surface.inferred": ("Inference",),
             "sdps.photos.reading": ("load",),
-            "sdps.surface.integration": ("integrate",),
+            "sdps.core.integration": ("integrate",),
             "sdps.surface.meshing": ("mesh", "write_mesh"),
             "sdps.surface.relight": ("relit",),
         },

@@ -15,8 +15,8 @@ from PIL import Image, ImageDraw, ImageFont
 from render.records.manifest import read_manifest
 from render.records.shards import read_shard
 from render.shared.images import read_image
+from sdps.core.integration import integrate
 from sdps.photos.response import display
-from sdps.surface.integration import integrate
 from sdps.surface.views import turned
 
 WIDTH, SIDE, TOP, MARGIN = 1200, 234, 34, 14

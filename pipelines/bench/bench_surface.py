@@ -23,8 +23,8 @@ from render.records.shards import Shard, read_shard
 from render.shared.files import write_json
 from render.shared.progress import progress_bar
 from sdps.classical import registry
+from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import normal_mae
-from sdps.surface.integration import Depth, integrate
 from sdps.surface.meshing import mesh, write_mesh
 from sdps.surface.relight import fit_albedo, lit, relit, residuals
 from sdps.surface.views import strip

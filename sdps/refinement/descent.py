@@ -26,6 +26,8 @@ RATES = {
 }
 """Learning rates of Adam, by part of the state, before `boost`."""
 _LEAST_RATE = 0.02
+_TRIED_EVERY, _TRIED, _WHITEST = 20, 0.05, 0.95
+"""Iterations after which other albedos of the brightest parts are tried, by how much they differ, and the largest."""
 _FITS, _MISFITS = 0.01, 0.03
 """A data term of a model that fits, and one of a model that does not; start and end of the trust in the start."""
 
@@ -63,11 +65,26 @@ class Problem(NamedTuple):
         mask: (H, W) bool, P true pixels.
         images: (P, 3, L) float32, divided by their mean.
         kept: (P, L) float32, 0 for observations that count for nothing.
+        mean: What the images were divided by.
+        bounced: (P, 3, L) float32, light that other parts of the object throw on a pixel, as it would be under lights
+            of intensity 1 if the brightest parts reflected everything; None where it is left out.
+        twice: How much brighter it would be by what bounces again.
     """
 
     mask: np.ndarray
     images: Tensor
     kept: Tensor
+    mean: float = 1.0
+    bounced: Tensor | None = None
+    twice: float = 0.0
+
+    def direct(self, made: Factors, whiteness: float) -> Tensor:  # (P, 3, L)
+        """Return the images without the light that bounced, if the brightest parts have this albedo."""
+        if self.bounced is None:
+            return self.images
+        share = whiteness + self.twice * whiteness**2
+        found = torch.addcmul(self.images, self.bounced, made.log_intensities.detach().exp().T, value=-share)
+        return found.clamp_min_(0.0)
 
 
 def solve(
@@ -94,9 +111,9 @@ def solve(
     Raises:
         InputError: the loss is no longer a number.
     """
-    beside = neighbours(problem.mask)
-    state = State(*(part.clone().requires_grad_(name in free) for name, part in zip(State._fields, state, strict=True)))
-    groups = [{"params": [getattr(state, name)], "base": rate} for name, rate in RATES.items() if name in free]
+    beside, moving = neighbours(problem.mask), free & RATES.keys()
+    state = State(**{name: part.clone().requires_grad_(name in moving) for name, part in state._asdict().items()})
+    groups = [{"params": [getattr(state, name)], "base": RATES[name]} for name in RATES if name in moving]
     adam = torch.optim.Adam(groups)
     start, begun = normalize(state.directions.detach(), dim=-1), normalize(state.normals.detach(), dim=-1)
     for number in range(iterations):
@@ -105,7 +122,9 @@ def solve(
             group["lr"] = group["base"] * boost * max((1.0 + math.cos(math.pi * part)) / 2.0, _LEAST_RATE)
         adam.zero_grad(set_to_none=True)
         made = factors(state)
-        loss = data_term(made, problem.images, problem.kept)
+        if number % _TRIED_EVERY == 0:
+            images = _whitened(problem, state, made, "whiteness" in free)
+        loss = data_term(made, images, problem.kept)
         misfit = min(max((float(loss.detach()) - _FITS) / (_MISFITS - _FITS), 0.0), 1.0)
         loss = loss + weights.near * misfit * (1.0 - (made.normals * begun).sum(dim=1)).mean()
         loss = loss + _priors(state, made, beside, weights, part)
@@ -120,6 +139,19 @@ def solve(
             raise InputError("refinement failed: the images hold values that are no numbers")
         after()
     return State(*(part.detach() for part in state))
+
+
+@torch.no_grad()
+def _whitened(problem: Problem, state: State, made: Factors, free: bool) -> Tensor:
+    """Return the images without bounced light; move the albedo of the brightest parts to where they fit better."""
+    if problem.bounced is None:
+        return problem.images
+    now = float(state.whiteness)
+    tried = {min(max(now + step, 0.0), _WHITEST) for step in (-_TRIED, 0.0, _TRIED)} if free else {now}
+    shown = {white: problem.direct(made, white) for white in sorted(tried)}
+    best = min(shown, key=lambda white: float(data_term(made, shown[white], problem.kept)))
+    state.whiteness.fill_(best)
+    return shown[best]
 
 
 def _priors(

@@ -3,6 +3,7 @@
 `sdps.refinement.image_model.difference` is the same term written down plainly in torch; the tests hold both together.
 """
 
+import os
 from typing import Any
 
 import numba
@@ -23,6 +24,9 @@ from sdps.refinement.image_model import (
     SHAPES,
     Factors,
 )  # fmt: skip
+
+# Threads that wait shall sleep: spinning, two of them took up to thirty times as long beside other busy processes.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 BLOCKS = 64
 """Parts the pixels are cut into. Sums are taken part by part, so results do not depend on the number of threads."""

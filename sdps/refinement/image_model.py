@@ -11,8 +11,9 @@ Pixel p, image i, channel c; n unit normal, l unit direction to the light, v = (
     r_pic = w_pic sqrt((q_pic - y_pic)^2 / (sigma_pic^2 + 0.05) + 1e-4)                 robust difference
     sigma_pic = (rho_pc D_pi + S_pi) max(n_p . l_i, 0.05)                               constant in the gradient
 
-with I divided by its mean over the object, and e by its own mean. w is 0 where a pixel is black although it is lit
-elsewhere (`shadowed`), 0.15 where it is darker than the model explains by half of sigma (a cast shadow), else 1.
+with I divided by its mean over the object, after light that other parts of it throw there is taken off, and e by its
+own mean. w is 0 where a pixel is black although it is lit elsewhere (`shadowed`) or a cast shadow was traced
+(`transport`), 0.15 where it is darker than the model explains by half of sigma (perhaps another shadow), else 1.
 """
 
 from typing import NamedTuple
@@ -48,6 +49,7 @@ class State(NamedTuple):
         log_sharpness: (K,) logarithm of kappa.
         directions: (L, 3) from the surface to the light, towards unit length.
         log_intensities: (L, 3).
+        whiteness: () albedo of the brightest parts, which tells how much light they throw on others.
     """
 
     normals: Tensor
@@ -58,6 +60,7 @@ class State(NamedTuple):
     log_sharpness: Tensor
     directions: Tensor
     log_intensities: Tensor
+    whiteness: Tensor
 
 
 class Factors(NamedTuple):

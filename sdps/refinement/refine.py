@@ -7,6 +7,7 @@ What was measured: docs/studies/refinement.md.
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,12 @@ from torch import Tensor
 from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
+from sdps.core.integration import integrate
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.image_model import LOBES, SHAPES, State, difference, factors, shadowed
 from sdps.refinement.refined import Refined
+from sdps.refinement.transport import trace
 
 _FEWEST = 4
 _OF_PIXELS = frozenset({"normals", "log_albedo", "log_strength"})
@@ -28,6 +31,7 @@ _SHARPEST, _BROADEST = 300.0, 10.0
 _START_HEIGHT = -4.0
 _LIT_SHARE = 0.1
 _LEAST_ALBEDO = 1e-3
+_BRIGHTEST, _WHITENESS = 0.95, 0.3  # quantile of the brightest parts, and the albedo they begin with
 _PART = 4096  # pixels worked on at once where arrays of all images are made
 CACHE_BYTES = 2**30
 """Pixels gathered from the images are kept in memory up to so much, beyond it in a file of the temporary folder."""
@@ -40,6 +44,8 @@ class RefineConfig:
     Attributes:
         coarse_pixels: Pixels of the coarse grid, about.
         iterations: On the coarse grid, with everything free.
+        bounces: How often light is followed from one part of the object to another; 0 leaves that and shadows out.
+        iterations_before: On the coarse grid for the surface that shadows and such light are traced on.
         boost: What the coarse grid's learning rates are multiplied by.
         fine_iterations: On every pixel, with the lights as the coarse grid found them.
         fine_boost: The same on every pixel.
@@ -48,6 +54,8 @@ class RefineConfig:
 
     coarse_pixels: int = 2800
     iterations: int = 1000
+    bounces: int = 2
+    iterations_before: int = 500
     boost: float = 4.0
     fine_iterations: int = 120
     fine_boost: float = 8.0
@@ -55,7 +63,7 @@ class RefineConfig:
 
     def __post_init__(self) -> None:
         check_fields(self, "positive", "coarse_pixels", "iterations", "boost", "fine_boost", "fine_curl")
-        check_fields(self, "not negative", "fine_iterations")
+        check_fields(self, "not negative", "bounces", "iterations_before", "fine_iterations")
 
 
 def refine(
@@ -94,19 +102,20 @@ def refine(
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
     free = frozenset(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
     fine = config.fine_iterations if stride > 1 else 0
-    with progress_bar(None, total=config.iterations + fine, desc="refine", unit="iteration") as bar:
-        after = _advance(bar, config.iterations + fine)
-        state = solve(
-            problem, _start(problem, begun, lights, gains), free=free, iterations=config.iterations,
-            boost=config.boost, weights=Weights(), after=after,
-        )  # fmt: skip
+    before = config.iterations_before if config.bounces else 0
+    total = before + config.iterations + fine
+    with progress_bar(None, total=total, desc="refine", unit="iteration") as bar:
+        move = partial(solve, free=free, boost=config.boost, weights=Weights(), after=_advance(bar, total))
+        start = _start(problem, begun, lights, gains)
+        if before:
+            problem = _traced(problem, move(problem, start, iterations=before), config.bounces)
+            start = start._replace(log_albedo=_log_albedo(problem, start))
+        state = move(problem, start, iterations=config.iterations)
         if stride > 1:
-            problem, state = _finer(values, scene.mask, problem.mask, stride, state)
+            problem, state = _finer(values, scene.mask, problem, stride, state)
         if fine:
             weights = Weights(curl=(config.fine_curl, config.fine_curl))
-            state = solve(
-                problem, state, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights, after=after
-            )
+            state = move(problem, state, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
     return _result(scene, problem, state)
 
 
@@ -158,7 +167,7 @@ def _problem(values: np.ndarray, mask: np.ndarray, stride: int, intensities: np.
     kept = torch.from_numpy(_room((len(values), values.shape[2])))
     for part in _parts(len(values)):
         kept[part] = (~shadowed(gathered[part] * shares)).float()
-    return Problem(mask[::stride, ::stride], gathered, kept)
+    return Problem(mask[::stride, ::stride], gathered, kept, mean)
 
 
 def _room(shape: tuple[int, ...]) -> np.ndarray:
@@ -185,6 +194,7 @@ def _start(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensitie
         log_sharpness=torch.linspace(np.log(_SHARPEST), np.log(_BROADEST), LOBES),
         directions=torch.from_numpy(np.array(lights, np.float32)),
         log_intensities=torch.from_numpy(np.log(np.maximum(intensities, 1e-6)).astype(np.float32)),
+        whiteness=torch.tensor(_WHITENESS),
     )
     state.normals[:, 2].clamp_min_(1e-3)
     return state._replace(log_albedo=_log_albedo(problem, state))
@@ -203,12 +213,33 @@ def _log_albedo(problem: Problem, state: State) -> Tensor:  # (P, 3)
     return found.nan_to_num(_LEAST_ALBEDO).clamp_min(_LEAST_ALBEDO).log()
 
 
-def _finer(
-    values: np.ndarray, mask: np.ndarray, coarse: np.ndarray, stride: int, state: State
-) -> tuple[Problem, State]:
+def _traced(problem: Problem, state: State, bounces: int) -> Problem:
+    """Return the problem without observations in cast shadows, and with the light between parts of the object."""
+    made = factors(state)
+    normals, lights, albedo = (part.numpy() for part in (made.normals, made.directions, made.albedo))
+    laid = np.zeros((*problem.mask.shape, 3))
+    laid[problem.mask] = normals
+    heights = integrate(laid, problem.mask, discontinuities=True).z
+    found = trace(heights, problem.mask, normals, lights)
+    brightest = float(np.quantile(albedo, _BRIGHTEST))
+    first, more = (found.bounced(normals, albedo / brightest, lights, count) for count in (1, bounces))
+    twice = float(more.sum() / max(first.sum(), 1e-9)) - 1.0
+    first *= brightest
+    kept = problem.kept * torch.from_numpy(found.lit)
+    return problem._replace(kept=kept, bounced=torch.from_numpy(first), twice=twice)
+
+
+def _finer(values: np.ndarray, mask: np.ndarray, coarse: Problem, stride: int, state: State) -> tuple[Problem, State]:
     """Return every pixel, and the state there: interpolated between the coarse pixels, with an albedo of its own."""
-    problem = _problem(values, mask, 1, factors(state).log_intensities.exp().numpy())
-    up = _interpolation(coarse, mask, stride)
+    made = factors(state)
+    problem = _problem(values, mask, 1, made.log_intensities.exp().numpy())
+    up = _interpolation(coarse.mask, mask, stride)
+    if coarse.bounced is not None:
+        share = (coarse.images - coarse.direct(made, float(state.whiteness))) * (coarse.mean / problem.mean)
+        for number in range(values.shape[2]):
+            problem.images[:, :, number].sub_(up(share[:, :, number].numpy())).clamp_min_(0.0)
+            lit = up(coarse.kept[:, number : number + 1].numpy())[:, 0] > 0.5
+            problem.kept[:, number].mul_(lit)
     normals = up(state.normals.numpy())
     state = state._replace(
         normals=normals / normals.norm(dim=1, keepdim=True), log_strength=up(state.log_strength.numpy()[:, None])[:, 0]
@@ -240,10 +271,11 @@ def _result(scene: ObjectImages, problem: Problem, state: State) -> Refined:
         image[scene.rows, scene.columns][problem.mask] = values.numpy()
         return image
 
+    images = problem.direct(made, float(state.whiteness))
     by_pixel, by_image = torch.empty(len(problem.images)), torch.zeros(len(scene))
     for part in _parts(len(by_pixel)):
         some = made._replace(normals=made.normals[part], albedo=made.albedo[part], strength=made.strength[part])
-        gaps = difference(some, problem.images[part], problem.kept[part] == 0.0)
+        gaps = difference(some, images[part], problem.kept[part] == 0.0)
         by_pixel[part] = gaps.mean(dim=(1, 2))
         by_image += gaps.mean(dim=1).sum(dim=0)
     return Refined(

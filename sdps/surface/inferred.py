@@ -16,11 +16,11 @@ from render.shared.errors import InputError
 from render.shared.files import atomic_path, write_json
 from render.shared.images import quantise, write_png
 from sdps.core.estimate import Estimate
+from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
-from sdps.surface.integration import Depth, integrate
 from sdps.surface.meshing import mesh, write_mesh
 from sdps.surface.relight import Residuals, fit_albedo, relit, residuals
 
@@ -38,7 +38,7 @@ class Inference:
         estimate: Normals, lights, and what else the method says.
         findings: What the checks said beforehand.
         files: The weights used, by name.
-        discontinuities: Depth may jump (`sdps.surface.integration.integrate`).
+        discontinuities: Depth may jump (`sdps.core.integration.integrate`).
         seconds: Time the method took.
     """
 

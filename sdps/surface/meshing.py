@@ -12,8 +12,8 @@ from trimesh.visual.color import ColorVisuals
 
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_path
+from sdps.core.integration import Depth
 from sdps.photos.response import to_linear
-from sdps.surface.integration import Depth
 
 FORMATS = (".ply", ".obj", ".glb")
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from render.shared.errors import InputError
-from sdps.surface.integration import Depth, checked_normals
+from sdps.core.integration import Depth, checked_normals
 
 if TYPE_CHECKING:
     from sdps.inference.image_source import ImageSource

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from render.shared.errors import InputError
-from sdps.surface.integration import Depth
+from sdps.core.integration import Depth
 
 _LIGHT = (-0.35, 0.45, 0.82)  # in the viewer's frame
 _CLAY = 0.85

@@ -7,8 +7,8 @@ from scipy.sparse.linalg import spsolve
 from surface_scenes import balls, from_slopes, grid, sphere, waves
 
 from render.shared.errors import InputError
-from sdps.surface.integration import Depth, integrate
-from sdps.surface.laplacian import laplacian, multigrid, solve
+from sdps.core.integration import Depth, integrate
+from sdps.core.laplacian import laplacian, multigrid, solve
 
 
 def errors(depth: Depth, truth: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from trimesh.exchange.obj import load_obj
 from trimesh.exchange.ply import load_ply
 
 from render.shared.errors import InputError
-from sdps.surface.integration import integrate
+from sdps.core.integration import integrate
 from sdps.surface.meshing import FORMATS, mesh, unit_scale, write_mesh
 
 READERS = {".ply": load_ply, ".obj": load_obj, ".glb": load_glb}

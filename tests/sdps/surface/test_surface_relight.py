@@ -13,7 +13,7 @@ from pipelines.bench import bench_surface
 from pipelines.cli import main
 from render.records.shards import Shard
 from render.shared.errors import InputError
-from sdps.surface.integration import integrate
+from sdps.core.integration import integrate
 from sdps.surface.relight import fit_albedo, lit, relit, residuals
 from sdps.surface.views import depth_normals, strip, turned
 

@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from render.shared.errors import InputError
-from sdps.surface.laplacian import laplacian, multigrid, solve
+from sdps.core.laplacian import laplacian, multigrid, solve
 
 STEEPEST = 0.03
 """Least n_z that is believed, so that slopes stop at 33. Half a pixel inside the rim of a sphere of radius R pixels,

@@ -1,0 +1,140 @@
+"""Shadows and light between the parts of an object, traced over the surface that its normals integrate to.
+
+The surface is a height field z(x, y) over the pixels, seen from above; what lies under it is taken to be solid. Pixel
+p, image i; n unit normal, l unit direction to the light, V whether two points see each other, A a pixel's area on the
+surface:
+
+    lit_pi  = 1 where the way from p towards l_i stays above the surface
+    F_pq    = V_pq max(n_p . w, 0) max(-n_q . w, 0) A_q / (pi r^2)          w, r direction and distance from p to q
+    B       = rho E + rho F (rho E) + ...,   E_pi = lit_pi max(n_p . l_i, 0)   radiosity, Lambertian; light pi
+    bounced = B - rho E
+
+(Goral et al., Modeling the interaction of light between diffuse surfaces, SIGGRAPH 1984). The renderer traces the same
+on meshes of any shape (`render.kernel`); tests compare both.
+"""
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+_OFFSET = 0.3
+"""Rays run so many pixels above the surface, since its slopes are not exact."""
+_LEAST_COSINE = np.float32(0.02)
+_LEAST_PACE = np.float32(1e-4)
+_BESIDE = np.float32(1.44)  # squared distance of neighbours, which do not see each other
+_STEEPEST = 0.15  # n_z, for the areas
+_ONE = np.float32(1.0)
+
+
+class Transport(NamedTuple):
+    """How light travels over a surface of P pixels under L lights.
+
+    Attributes:
+        lit: (P, L) bool, whether the pixel sees the light; also true where it faces away.
+        factors: (P, P) float32, F; rows sum to at most 1.
+    """
+
+    lit: np.ndarray
+    factors: np.ndarray
+
+    def bounced(self, normals: np.ndarray, albedo: np.ndarray, lights: np.ndarray, bounces: int = 2) -> np.ndarray:
+        """Return the radiance (P, 3, L) float32 that the surface throws on itself.
+
+        Args:
+            normals: (P, 3) unit.
+            albedo: (P, 3), of one white Lambertian 1.
+            lights: (L, 3) unit directions.
+            bounces: How often light is reflected before it is seen, beyond the first.
+        """
+        direct = np.where(self.lit, np.maximum(normals @ lights.T, 0.0), 0.0).astype(np.float32)  # (P, L)
+        found = np.empty((len(normals), 3, len(lights)), np.float32)
+        for channel in range(3):
+            rho = albedo[:, channel : channel + 1].astype(np.float32)
+            leaving = rho * direct
+            total = np.zeros_like(leaving)
+            for _ in range(bounces):
+                leaving = rho * (self.factors @ leaving)
+                total += leaving
+            found[:, channel] = total
+        return found
+
+
+def trace(heights: np.ndarray, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> Transport:
+    """Trace shadows, and which pixels see each other.
+
+    Args:
+        heights: (H, W), towards the camera, in pixels; not read outside the mask.
+        mask: (H, W) bool, P true.
+        normals: (P, 3) unit.
+        lights: (L, 3) unit directions from the surface to the light.
+    """
+    field = np.where(mask, heights, -np.inf).astype(np.float32)
+    rows, columns = (places.astype(np.float32) for places in np.nonzero(mask))
+    points = np.stack([columns, -rows, field[mask]], axis=1)
+    unit = np.ascontiguousarray(normals, np.float32)
+    above = points + np.float32(_OFFSET) * unit
+    lit = np.ones((len(points), len(lights)), np.bool_)
+    _shadows(field, above, np.ascontiguousarray(lights, np.float32), lit)
+    factors = np.zeros((len(points), len(points)), np.float32)
+    area = (1.0 / np.maximum(unit[:, 2], _STEEPEST)).astype(np.float32)
+    _form_factors(field, points, above, unit, area, factors)
+    factors /= np.maximum(factors.sum(axis=1, keepdims=True), 1.0)
+    return Transport(lit, factors)
+
+
+@numba.njit(cache=True)
+def _height(field: np.ndarray, row: Any, column: Any) -> Any:
+    """Return the height between four pixels, bilinear; -inf beside the object, where nothing is in the way."""
+    r, c = min(int(row), field.shape[0] - 2), min(int(column), field.shape[1] - 2)
+    down, right = row - r, column - c
+    upper = field[r, c] * (_ONE - right) + field[r, c + 1] * right
+    lower = field[r + 1, c] * (_ONE - right) + field[r + 1, c + 1] * right
+    return upper * (_ONE - down) + lower * down
+
+
+@numba.njit(cache=True)
+def _blocked(field: np.ndarray, start: Any, way: Any, steps: int) -> bool:
+    """Tell whether the surface rises above the `steps` - 1 places that `way` leads to from a point."""
+    x, y, z = start
+    for _ in range(1, steps):
+        x, y, z = x + way[0], y + way[1], z + way[2]
+        if -y < 0 or x < 0 or -y > field.shape[0] - 1 or x > field.shape[1] - 1:
+            return False
+        if _height(field, -y, x) > z:
+            return True
+    return False
+
+
+@numba.njit(parallel=True, cache=True)
+def _shadows(field: np.ndarray, points: np.ndarray, lights: np.ndarray, lit: np.ndarray) -> None:
+    top = field.max()
+    for p in numba.prange(len(points)):
+        start = (points[p, 0], points[p, 1], points[p, 2])
+        for i in range(len(lights)):
+            pace = max(abs(lights[i, 0]), abs(lights[i, 1]), _LEAST_PACE)  # so that a step is a pixel long
+            way = (lights[i, 0] / pace, lights[i, 1] / pace, lights[i, 2] / pace)
+            steps = field.shape[0] + field.shape[1]
+            if way[2] > 0:
+                steps = min(steps, int((top - start[2]) / way[2]) + 2)
+            lit[p, i] = not _blocked(field, start, way, steps)
+
+
+@numba.njit(parallel=True, cache=True)
+def _form_factors(
+    field: np.ndarray, points: np.ndarray, above: np.ndarray, normals: np.ndarray, area: np.ndarray, factors: np.ndarray
+) -> None:
+    for p in numba.prange(len(points)):
+        start = (above[p, 0], above[p, 1], above[p, 2])
+        for q in range(len(points)):
+            dx, dy, dz = points[q, 0] - points[p, 0], points[q, 1] - points[p, 1], points[q, 2] - points[p, 2]
+            squared = dx * dx + dy * dy + dz * dz
+            leaves = dx * normals[p, 0] + dy * normals[p, 1] + dz * normals[p, 2]
+            arrives = -(dx * normals[q, 0] + dy * normals[q, 1] + dz * normals[q, 2])
+            least = _LEAST_COSINE * np.sqrt(squared)
+            if squared < _BESIDE or leaves < least or arrives < least:
+                continue
+            steps = max(int(max(abs(dx), abs(dy))), 1)
+            tx, ty, tz = above[q, 0] - start[0], above[q, 1] - start[1], above[q, 2] - start[2]
+            if not _blocked(field, start, (tx / steps, ty / steps, tz / steps), steps):
+                factors[p, q] = leaves * arrives * area[q] / (np.pi * squared * max(squared, area[q] / np.pi))
