@@ -16,11 +16,9 @@ from types import TracebackType
 from typing import Any, TextIO
 
 from render.records.manifest import FAILED, SceneSpec, read_events, read_failed
+from render.records.mirror import LOG, SHARDS, mirror_of, shard_path
 from render.records.shards import is_whole
 from render.shared.errors import InputError
-
-LOG = "log"
-SHARDS = "shards"
 
 
 def now() -> str:
@@ -44,6 +42,11 @@ class Ledger:
         self.folder = folder
         self.path = folder / LOG / f"done-{host}-{os.getpid()}-{start}.jsonl"
         self._handle: TextIO | None = None
+
+    @property
+    def crowded(self) -> bool:
+        """Whether no further work should be handed out for now."""
+        return False
 
     def __enter__(self) -> "Ledger":
         return self
@@ -91,7 +94,9 @@ def latest(runs: Sequence[list[dict[str, Any]]]) -> dict[str, dict[str, Any]]:
 
 
 def shard_sizes(folder: Path) -> dict[str, int]:
-    """Return the bytes of every shard file by scene id, from one look at the folder."""
+    """Return the bytes of every shard file by scene id, from one look at the folder or the listing of its store."""
+    if mirror := mirror_of(folder):
+        return mirror.sizes()
     try:
         with os.scandir(folder / SHARDS) as entries:
             return {
@@ -135,7 +140,7 @@ def survey(folder: Path, scenes: Sequence[SceneSpec], *, verify: bool = False) -
             continue
         line = lines.get(scene.id, {})
         known = line.get("bytes") == size and line.get("spec") == scene.digest()
-        if (known and not verify) or is_whole(folder / scene.file, scene):
+        if (known and not verify) or is_whole(shard_path(folder, scene), scene):
             done.add(scene.id)
             if known:
                 listed[scene.id] = line
