@@ -8,11 +8,11 @@ too. So the store never lists a line without its shard, and a run killed at any 
 import json
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 from render.records.ledger import LOG, SHARDS, Ledger
 from render.records.manifest import read_events
@@ -57,6 +57,14 @@ def _file(folder: Path, id: str) -> Path:
     return folder / SHARDS / f"{id}.exr"
 
 
+class _Entry(NamedTuple):
+    """A line on its way: `done` or `failed`, and of a finished shard its sending."""
+
+    kind: str
+    line: dict[str, Any]
+    sent: Future[None] | None = None
+
+
 class UploadingLedger(Ledger):
     """A ledger whose finished shards go to a store.
 
@@ -72,7 +80,8 @@ class UploadingLedger(Ledger):
         self.run = self.path.stem.removeprefix("done-")
         self.path = mirror.folder / WAITING
         self.mirror, self.numbers = mirror, 0
-        self.queue: SimpleQueue[tuple[str, dict[str, Any]] | None] = SimpleQueue()
+        self.queue: SimpleQueue[_Entry | None] = SimpleQueue()
+        self.pool = ThreadPoolExecutor(TOGETHER, thread_name_prefix="upload")
         self.waiting = 0  # bytes finished and not sent
         self.error: Exception | None = None
         self._thread = threading.Thread(target=self._work, name="uploads", daemon=True)
@@ -91,14 +100,14 @@ class UploadingLedger(Ledger):
         self.send(line)
 
     def send(self, line: dict[str, Any]) -> None:
-        """Send a finished shard soon, and its line after it."""
+        """Send a finished shard, and its line after it."""
         self.waiting += line["bytes"]
-        self.queue.put(("done", line))
+        self.queue.put(_Entry("done", line, self.pool.submit(self._send_shard, line)))
 
     def fail(self, line: dict[str, Any]) -> None:
         """Note a failure, here and soon in the store."""
         super().fail(line)
-        self.queue.put(("failed", line))
+        self.queue.put(_Entry("failed", line))
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         super().__exit__(kind, error, trace)
@@ -117,21 +126,21 @@ class UploadingLedger(Ledger):
 
     def _work(self) -> None:
         """Send batches until the end, or until the store refuses one."""
-        with ThreadPoolExecutor(TOGETHER) as pool:
-            going = True
-            while going:
-                batch, going = self._batch()
-                try:
-                    self._send(batch, pool)
-                except Exception as error:  # told, and raised, in the main thread
-                    self.error = error
-                    return
+        going = True
+        while going and self.error is None:
+            batch, going = self._batch()
+            try:
+                self._send(batch)
+            except Exception as error:  # told, and raised, in the main thread
+                self.error = error
+                self.mirror.store.stopped.set()
+        self.pool.shutdown(cancel_futures=True)
 
-    def _batch(self) -> tuple[list[tuple[str, dict[str, Any]]], bool]:
+    def _batch(self) -> tuple[list["_Entry"], bool]:
         """Wait for some lines; also tell whether more will come."""
-        first = self.queue.get()
-        batch, end = [], time.monotonic() + PERIOD
-        entry = first
+        entry = self.queue.get()
+        batch: list[_Entry] = []
+        end = time.monotonic() + PERIOD
         while entry is not None:
             batch.append(entry)
             if len(batch) == BATCH:
@@ -142,14 +151,15 @@ class UploadingLedger(Ledger):
                 return batch, True
         return batch, False
 
-    def _send(self, batch: list[tuple[str, dict[str, Any]]], pool: ThreadPoolExecutor) -> None:
-        """Send the shards of a batch, then its lines, and remove the files."""
+    def _send(self, batch: list["_Entry"]) -> None:
+        """Wait for the shards of a batch, send its lines, and remove the files."""
         for kind in ("done", "failed"):
-            lines = [line for what, line in batch if what == kind]
+            lines = [entry.line for entry in batch if entry.kind == kind]
             if not lines:
                 continue
-            if kind == "done":
-                list(pool.map(self._send_shard, lines))
+            for entry in batch:
+                if entry.sent is not None:
+                    entry.sent.result()
             name = f"{LOG}/{kind}-{self.run}-{self.numbers:05d}.jsonl"
             text = "".join(json.dumps(line) + "\n" for line in lines)
             self.mirror.objects[name] = self.mirror.store.write(name, text.encode())

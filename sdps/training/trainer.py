@@ -245,12 +245,13 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate
         sums: dict[str, Tensor] = {}
-        for part in _parts(batch, config.accumulate):
+        for part in _parts(batch, config.batch_scenes // config.accumulate):
+            share = len(batch.seed) / len(part.seed)
             with self.arithmetic.autocast():
                 loss, terms = self._loss(part.to(self.team.device))
-            (loss / config.accumulate).backward()
+            (loss / share).backward()
             for name, value in {"loss": loss, **terms}.items():
-                sums[name] = sums.get(name, 0.0) + value.detach().double() / config.accumulate
+                sums[name] = sums.get(name, 0.0) + value.detach().double() / share
         # One transfer a step: a GPU is waited for once.
         totals = self.team.mean(dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True)))
         if not math.isfinite(totals["loss"]):
@@ -416,6 +417,6 @@ def _optimiser(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimi
     return kind(network.parameters(), **options, fused=True)
 
 
-def _parts(batch: Batch, count: int) -> list[Batch]:
-    """Split a batch into `count` equal parts."""
-    return [Batch(*tensors) for tensors in zip(*(tensor.chunk(count) for tensor in batch), strict=True)]
+def _parts(batch: Batch, scenes: int) -> list[Batch]:
+    """Split a batch into parts of so many scenes, the last of the rest: with more processes there are fewer parts."""
+    return [Batch(*tensors) for tensors in zip(*(tensor.split(scenes) for tensor in batch), strict=True)]
