@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any, Self, TextIO
 
 from render.records.manifest import FAILED, SceneSpec, read_events, read_failed
-from render.records.mirror import LOG, SHARDS, mirror_of, shard_path
+from render.records.mirror import LOG, SHARDS, Damaged, mirror_of, shard_path
 from render.records.shards import is_whole
 from render.shared.errors import InputError
 
@@ -48,7 +48,7 @@ class Ledger:
         """Whether no further work should be handed out for now."""
         return False
 
-    def __enter__(self) -> "Ledger":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -140,12 +140,20 @@ def survey(folder: Path, scenes: Sequence[SceneSpec], *, verify: bool = False) -
             continue
         line = lines.get(scene.id, {})
         known = line.get("bytes") == size and line.get("spec") == scene.digest()
-        if (known and not verify) or is_whole(shard_path(folder, scene), scene):
+        if (known and not verify) or _is_whole(folder, scene):
             done.add(scene.id)
             if known:
                 listed[scene.id] = line
     failed = {id: rows for id, rows in read_failed(folder).items() if id not in done}
     return Survey(frozenset(done), failed, listed, sum(sizes[id] for id in done))
+
+
+def _is_whole(folder: Path, scene: SceneSpec) -> bool:
+    """Hash a shard, here or in the store."""
+    try:
+        return is_whole(shard_path(folder, scene), scene)
+    except Damaged:
+        return False
 
 
 def sweep(folder: Path, pids: Collection[int | None] = (), older_than: float = 3600.0) -> None:

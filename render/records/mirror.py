@@ -29,6 +29,10 @@ _IN_USE = 60.0  # seconds for which a file of the cache is kept after it was ask
 _FAILURES = f"{LOG}/failed-"
 
 
+class Damaged(InputError):
+    """A shard in the store is not what was sent."""
+
+
 class Mirror:
     """A data folder in a store and its place on this disk.
 
@@ -55,7 +59,7 @@ class Mirror:
             if is_sealed(data):
                 break
         else:
-            raise InputError(f"{self.store.url}/{scene.file}: truncated or altered; remove it and render it again")
+            raise Damaged(f"{self.store.url}/{scene.file}: truncated or altered; remove it and render it again")
         with atomic_path(path) as temporary:
             temporary.write_bytes(data)
         self._make_room()
@@ -71,14 +75,13 @@ class Mirror:
 
     def _make_room(self) -> None:
         """Remove the files that were not used for longest, until the rest is within the limit."""
-        files = [
-            (entry.stat(), entry.path)
-            for name in (SHARDS, "cache")
-            if (self.folder / name).is_dir()
-            for entry in os.scandir(self.folder / name)
-            # Shards that are not in the store yet must stay.
-            if not entry.name.startswith(".") and (name == "cache" or f"{name}/{entry.name}" in self.objects)
-        ]
+        files = []
+        for name in (SHARDS, "cache"):
+            for entry in os.scandir(self.folder / name) if (self.folder / name).is_dir() else ():
+                # Shards that are not in the store yet must stay; another process may have removed a file meanwhile.
+                if not entry.name.startswith(".") and (name == "cache" or f"{name}/{entry.name}" in self.objects):
+                    with suppress(FileNotFoundError):
+                        files.append((entry.stat(), entry.path))
         total = sum(status.st_size for status, _ in files)
         for status, path in sorted(files, key=lambda file: file[0].st_mtime):
             if total <= self.limit or status.st_mtime > time.time() - _IN_USE:
@@ -133,7 +136,7 @@ class Mirror:
     def publish(self) -> None:
         """Send the small files that are new or changed, and remove those that are gone."""
         names = {path.name for path in self.folder.glob("*.*") if path.is_file() and not path.name.startswith(".")}
-        names -= {FAILED}  # in the store it is many objects, see `render.records.uploads`
+        names -= {FAILED}  # in the store it is many objects, see `render.records.sending`
         gone = [name for name in self.objects if "/" not in name and name not in names]
         changed = {name: data for name in names if (data := self._changed(name)) is not None}
         if self.store.read_only or not (changed or gone):
@@ -242,10 +245,22 @@ def shard_path(folder: Path, scene: SceneSpec) -> Path:
     """Return the file of a scene's shard, fetched where the folder is a mirror; it need not exist where it is not.
 
     Raises:
-        InputError: the store cannot be read, or what it holds is damaged.
+        InputError: the store cannot be read; `Damaged`: what it holds is not whole.
     """
     mirror = mirror_of(folder)
     return mirror.fetch(scene) if mirror and scene.file in mirror.objects else folder / scene.file
+
+
+def kept(folder: Path, *paths: Path) -> bool:
+    """Tell whether files made of shards are all there; in a mirror they are then kept for another minute at least."""
+    if mirror_of(folder) is None:
+        return all(path.is_file() for path in paths)
+    try:
+        for path in paths:
+            os.utime(path)
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def finished(folder: str | Path, scenes: Iterable[SceneSpec]) -> list[SceneSpec]:

@@ -22,7 +22,7 @@ from render.planning.chunks import cut, share
 from render.records.ledger import Ledger, Survey, now, survey, sweep
 from render.records.manifest import SceneSpec
 from render.records.mirror import mirror_of
-from render.records.uploads import open_ledger, send_leftovers
+from render.records.sending import open_ledger, send_leftovers
 from render.running.isolation import serve
 from render.running.messages import Begun, Done, Ended, Failed, Fatal, Message, Ready, WorkerConfig
 from render.running.process import Worker

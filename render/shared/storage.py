@@ -22,7 +22,7 @@ from render.shared.files import cache_folder
 
 WAIT = 900.0  # seconds that an operation is tried again for; $SDPS_STORAGE_WAIT
 TOGETHER = 8  # objects sent or fetched at once
-_ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}([^/].*)")  # `Path` makes one slash of two; a drive is one letter
+_ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/{1,3}([^/].*)")  # `Path` makes one slash of two; a drive is one letter
 _VERSIONS = ("ETag", "etag", "generation", "md5Hash", "mtime", "LastModified", "last_modified")
 _DRIVERS = {"botocore", "aiobotocore", "aiohttp", "google", "gcsfs", "azure", "requests", "urllib3"}
 """Packages whose errors tell of the connection or the store; errors of others are defects."""
@@ -45,7 +45,8 @@ class Stored(NamedTuple):
 def address(place: str | Path) -> str | None:
     """Return a folder's address in a store, without a slash at its end; None for a folder of this machine."""
     match = _ADDRESS.fullmatch(str(place))
-    return f"{match[1]}://{match[2].rstrip('/')}" if match else None
+    slashes = "///" if match and match[1] == "file" else "//"
+    return f"{match[1]}:{slashes}{match[2].rstrip('/')}" if match else None
 
 
 def local_copy(url: str, purpose: str) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 
 from render.records.manifest import FAILED, SceneSpec, read_failed, read_manifest
 from render.records.mirror import finished as there
-from render.records.mirror import shard_path, stored_size
+from render.records.mirror import kept, shard_path, stored_size
 from render.records.shards import read_shard
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
@@ -85,7 +85,7 @@ class SceneStore:
             return _decode(shard_path(self.folder, scene), scene)
         entry = f"{scene.id}-{_identity(self.folder, scene)}"
         images, truth = (self.folder / CACHE_FOLDER / f"{entry}.{kind}.npy" for kind in ("images", "truth"))
-        if not images.is_file():
+        if not kept(self.folder, truth, images):
             stored = _decode(shard_path(self.folder, scene), scene)
             packed = PackedImages.of(stored.images)
             # The images come last: where they are, the ground truth is.

@@ -9,7 +9,7 @@ several processes share every batch and take the steps one process would take.
 import logging
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,7 @@ def train(
     device: str | torch.device | None = None,
     loggers: Sequence[Logger] = (),
     tensorboard: bool = False,
+    on_save: Callable[[], None] | None = None,
 ) -> TrainingResult:
     """Train a stage until its budget is spent, resuming whatever `out_folder` holds.
 
@@ -87,6 +88,7 @@ def train(
         device: Torch device; CUDA when there is one, else CPU.
         loggers: Receivers of metrics beside `metrics.jsonl`.
         tensorboard: Also log to `<out_folder>/tensorboard`.
+        on_save: Called in the leading process whenever a checkpoint has been written.
 
     Raises:
         InputError: unusable data, a checkpoint of another configuration or data set, or a loss that is
@@ -94,6 +96,7 @@ def train(
     """
     with team(device) as here:
         trainer = Trainer(stage, Path(data_folder), Path(out_folder), here, source)
+        trainer.on_save = on_save
         try:
             return _train(trainer, list(loggers), tensorboard)
         finally:
@@ -213,6 +216,7 @@ class Trainer:
         self.best = math.inf
         self.learning_rate = config.learning_rate
         self.saved: int | None = None  # step of the checkpoint on disk
+        self.on_save: Callable[[], None] | None = None
         self.finished_metrics: dict[str, float] | None = None
         self._earlier_seconds, self._started = 0.0, time.perf_counter()
 
@@ -333,6 +337,8 @@ class Trainer:
         }
         save_state(self.folder / CHECKPOINT, state)
         self.saved = self.step
+        if self.on_save is not None:
+            self.on_save()
 
     def resume(self) -> None:
         """Go on from the folder's checkpoint, if there is one.

@@ -1,7 +1,7 @@
 """Render into an S3 server, and disturb it: kill -9, then a store that goes away; `python tests/faults/storage_run.py`.
 
-Each trial renders a small plan into a prefix of its own: started and killed at a random moment, started again while the
-store is away for some seconds, and started once more. Manifest and shards must be the bytes of a run into a local
+Each trial renders a small plan into a prefix of its own: started, killed once some shards are there, started again, the
+store taken away for some seconds once more shards are there, and started once more. Manifest and shards must be the bytes of a run into a local
 folder, every scene must have one ledger line, and nothing may be left on this disk. Prints a line per trial.
 """
 
@@ -26,23 +26,33 @@ from object_store import BUCKET, ObjectStore, object_store  # noqa: E402
 def start(store: ObjectStore, out: str, cache: Path) -> "subprocess.Popen[bytes]":
     """Start rendering."""
     environment = os.environ | store.environment | {"PYTHONPATH": str(ROOT), "SDPS_CACHE": str(cache)}
+    words = ["render-data", *SMALL, "--set", "data.views=8", "--workers", "1", "--out", out]
     return subprocess.Popen(
-        [sys.executable, "-m", "pipelines.cli", "render-data", *SMALL, "--set", "data.views=8", "--workers", "1", "--out", out], cwd=ROOT,
-        env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        [sys.executable, "-m", "pipelines.cli", *words], cwd=ROOT, env=environment, stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
     )  # fmt: skip
 
 
-def trial(store: ObjectStore, folder: Path, number: int, seconds: float, away: float) -> dict[str, object]:
+def until(store: ObjectStore, prefix: str, count: int, process: "subprocess.Popen[bytes]") -> None:
+    """Wait until so many shards are in the store, or the process has ended."""
+    while process.poll() is None:
+        page = store.client().list_objects_v2(Bucket=BUCKET, Prefix=f"{prefix}/data/shards/")
+        if page["KeyCount"] >= count:
+            return
+        time.sleep(0.05)
+
+
+def trial(store: ObjectStore, folder: Path, number: int, away: float) -> dict[str, object]:
     """Kill, take the store away, let it end; return what came of it."""
     rng, prefix = random.Random(number), f"run{number}"
     out, cache = f"s3://{BUCKET}/{prefix}", folder / f"cache{number}"
     first = start(store, out, cache)
-    time.sleep(rng.uniform(0.3, 1.0) * seconds)
+    until(store, prefix, rng.randrange(40), first)
     first.send_signal(signal.SIGKILL)
     first.communicate()
     kept = sum(name.endswith(".exr") for name in store.objects(prefix))
     second = start(store, out, cache)
-    time.sleep(rng.uniform(0.3, 0.9) * seconds)
+    until(store, prefix, rng.randrange(kept + 1, 85), second)
     store.stop()
     time.sleep(away)
     store.start()
@@ -75,13 +85,11 @@ def main() -> int:
     bad = 0
     with tempfile.TemporaryDirectory() as name, object_store() as store:
         folder = Path(name)
-        begun = time.monotonic()
         process = start(store, str(folder / "local"), folder / "cache")
         if process.wait() != 0:
             raise SystemExit("the undisturbed run failed")
-        seconds = time.monotonic() - begun
         for number in range(args.trials):
-            row = trial(store, folder, number, seconds, args.away)
+            row = trial(store, folder, number, args.away)
             wrong = not row["same"] or row["twice"] or row["left"] or row["traceback"] or row["codes"] != [0, 0]
             bad += bool(wrong)
             sys.stdout.write(f"{'BAD' if wrong else 'good'} {json.dumps(row)}\n")

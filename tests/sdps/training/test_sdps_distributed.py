@@ -17,8 +17,9 @@ from sdps.training.stages import NormalStage
 from sdps.training.trainer import train
 
 config = NormalTraining(
-    steps=int(sys.argv[4]), batch_scenes=4, images=2, size=32, crop=16, lights="true", log_every=1, workers=0, validation_scenes=2,
-    validate_every=2, schedule=sys.argv[5], clip_gradient=1.0, ema=0.5, accumulate=int(sys.argv[3]),
+    steps=int(sys.argv[4]), batch_scenes=4, images=2, size=32, crop=16, lights="true", log_every=1, workers=0,
+    validation_scenes=2, validate_every=2, schedule=sys.argv[5], clip_gradient=1.0, ema=0.5,
+    accumulate=int(sys.argv[3]),
     precision="float32",  # in bfloat16 the order of a sum, which differs, shows at 2e-4
 )
 result = train(NormalStage(config), sys.argv[1], sys.argv[2])

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from render.records.ledger import LOG, SHARDS, Ledger
 from render.records.manifest import read_events
 from render.records.mirror import Mirror, mirror_of
+from render.shared.files import write_text
 from render.shared.storage import TOGETHER
 
 WAITING = ".waiting.jsonl"
@@ -162,6 +163,7 @@ class UploadingLedger(Ledger):
                     entry.sent.result()
             name = f"{LOG}/{kind}-{self.run}-{self.numbers:05d}.jsonl"
             text = "".join(json.dumps(line) + "\n" for line in lines)
+            write_text(self.folder / name, text)  # as the next reader will have it
             self.mirror.objects[name] = self.mirror.store.write(name, text.encode())
             self.numbers += 1
             if kind == "done":
