@@ -26,6 +26,7 @@ _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/{1,3}([^/].*)")  # `Path` makes one
 _VERSIONS = ("ETag", "etag", "generation", "md5Hash", "mtime", "LastModified", "last_modified")
 _DRIVERS = {"botocore", "aiobotocore", "aiohttp", "google", "gcsfs", "azure", "requests", "urllib3"}
 """Packages whose errors tell of the connection or the store; errors of others are defects."""
+_OPTIONS = {"s3": {"max_concurrency": 1}}  # else every read begins with a request for the size
 _HOPELESS = {errno.EINVAL, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EROFS}
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -83,7 +84,7 @@ class Store:
         try:
             from fsspec.core import url_to_fs
 
-            return url_to_fs(self.url)
+            return url_to_fs(self.url, **_OPTIONS.get(self.url.partition(":")[0], {}))
         except ImportError as error:
             raise InputError(f"{self.url}: {error}; pip install 'sdps[storage]', or the driver it names") from error
         except ValueError as error:

@@ -1,8 +1,9 @@
 """Render into an S3 server, and disturb it: kill -9, then a store that goes away; `python tests/faults/storage_run.py`.
 
 Each trial renders a small plan into a prefix of its own: started, killed once some shards are there, started again, the
-store taken away for some seconds once more shards are there, and started once more. Manifest and shards must be the bytes of a run into a local
-folder, every scene must have one ledger line, and nothing may be left on this disk. Prints a line per trial.
+store taken away for some seconds once more shards are there, and started once more. Manifest and shards must be the
+bytes of a run into a local folder, every scene must have one ledger line, and nothing may be left on this disk. Prints
+a line per trial.
 """
 
 import argparse

@@ -215,6 +215,12 @@ def test_commands_on_s3(s3: ObjectStore, tmp_path: Path, capsys: pytest.CaptureF
         assert said in text and wrong in text and text.count("\n") == 1
 
 
+def test_commands_that_want_a_folder_refuse_an_address(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["regenerate", "--shapes", "sphere", "--out", f"s3://{BUCKET}/run"]) == 2
+    assert f"s3://{BUCKET}/run: this command works in folders of this machine" in capsys.readouterr().err
+    assert not Path("s3:").exists()
+
+
 def test_a_server_that_goes_away_is_waited_for(s3: ObjectStore) -> None:
     store = Store(f"s3://{BUCKET}/away")
     store.write("a", b"1")
