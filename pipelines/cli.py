@@ -5,9 +5,11 @@ import importlib
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 from render.shared.errors import InputError, unknown
+from render.shared.storage import address
 
 
 class Command(NamedTuple):
@@ -18,12 +20,14 @@ class Command(NamedTuple):
         about: One line of help.
         declare: Function of the module that adds flags to a parser.
         run: Function of the module that takes the parsed flags and returns the exit code.
+        stores: Whether its folders may be addresses in object storage.
     """
 
     module: str
     about: str
     declare: str = "add_arguments"
     run: str = "main"
+    stores: bool = False
 
 
 class Group(NamedTuple):
@@ -34,13 +38,13 @@ class Group(NamedTuple):
 
 
 DATA = Group("plan, check, preview, describe, export, relight and import data folders", {
-    "plan": Command("data.data_plan", "write the manifest of a preset and estimate disk and time"),
-    "status": Command("data.data_status", "tell what is done, failed and left, and at what rate"),
-    "validate": Command("data.data_validate", "check every shard of a folder"),
+    "plan": Command("data.data_plan", "write the manifest of a preset and estimate disk and time", stores=True),
+    "status": Command("data.data_status", "tell what is done, failed and left, and at what rate", stores=True),
+    "validate": Command("data.data_validate", "check every shard of a folder", stores=True),
     "preview": Command("data.data_preview",
-                       "write contact sheets and a page with light, material and shape statistics"),
-    "card": Command("data.data_card", "write the dataset card and Croissant JSON"),
-    "export": Command("data.data_export", "write the scenes in a layout that other loaders read"),
+                       "write contact sheets and a page with light, material and shape statistics", stores=True),
+    "card": Command("data.data_card", "write the dataset card and Croissant JSON", stores=True),
+    "export": Command("data.data_export", "write the scenes in a layout that other loaders read", stores=True),
     "relight": Command("data.data_relight", "mix images under environments and several lights from a light stage"),
     "import": Command("data.data_import", "turn PS-FCN trees and DiLiGenT folders into shards"),
 })  # fmt: skip
@@ -50,10 +54,10 @@ COMMANDS: dict[str, Command | Group] = {
     "app": Command("app.app", "serve a local page for photographs, scenes and data"),
     "doctor": Command("bench.doctor", "show what this machine has and what is missing"),
     "demo": Command("demo", "render, train, evaluate and regenerate, fitted to this machine"),
-    "render-data": Command("rendering.render_data", "render the training scenes of a preset"),
+    "render-data": Command("rendering.render_data", "render the training scenes of a preset", stores=True),
     "data": DATA,
     "models": Command("train.list_models", "list the learned models"),
-    "train": Command("train.train", "train models, by default LCNet, then NENet"),
+    "train": Command("train.train", "train models, by default LCNet, then NENet", stores=True),
     "eval-merltest": Command("evaluate.eval_merltest", "render and score MERL-Test scenes"),
     "eval-diligent": Command("benchmarks.eval_diligent", "score methods on DiLiGenT's objects, by folder"),
     "eval-lights": Command("benchmarks.eval_lights", "score lighting on Gourd&Apple or the Light Stage gallery"),
@@ -126,7 +130,19 @@ def _add_commands(
         else:
             module = importlib.import_module(f"pipelines.{command.module}")
             getattr(module, command.declare)(child)
-            child.set_defaults(run=getattr(module, command.run))
+            child.set_defaults(run=getattr(module, command.run), stores=command.stores)
+
+
+def _require_folders(args: argparse.Namespace) -> None:
+    """Refuse addresses in object storage where a command wants a folder of this machine.
+
+    Raises:
+        InputError: such an address.
+    """
+    places = [getattr(args, name, None) for name in ("folder", "data", "out")]
+    for place in places if not getattr(args, "stores", True) else ():
+        if isinstance(place, str | Path) and (url := address(place)):
+            raise InputError(f"{url}: this command works in folders of this machine; export or copy the data first")
 
 
 def version() -> str:
@@ -147,6 +163,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.version:
             sys.stdout.write(f"sdps {version()}\n")
             return 0
+        _require_folders(args)
         return args.run(args)
     except InputError as error:
         sys.stderr.write(f"sdps: {error}\n")

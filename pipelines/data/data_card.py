@@ -5,10 +5,12 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
+from pipelines.shared.flags import add_cache_argument
 from render.checks.folder_checks import CHECKSUMS
 from render.planning.composition import Composition, compose
 from render.publishing import croissant, dataset_card
 from render.records.manifest import MANIFEST, read_manifest
+from render.records.mirror import finished, opened, shown
 from render.shared.config import read_yaml
 from render.shared.errors import InputError
 from render.shared.files import write_json, write_text
@@ -28,13 +30,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--url", default="", help="page of the data set; Croissant asks for it in published data")
     parser.add_argument("--creator", default="", help="who made it; Croissant asks for it in published data")
     parser.add_argument("--cite", default="", help="citation, BibTeX by preference")
+    add_cache_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     """Write the files, say where they are and what is missing before publishing."""
     texts = (args.name, args.license, args.url, args.creator, args.cite)
-    folder, missing = write_card(args.folder, *(text.strip() for text in texts))
-    sys.stdout.write("".join(f"{folder / name}\n" for name in (dataset_card.CARD, croissant.FILE, CHECKSUMS)))
+    with opened(args.folder, args.cache_gb) as folder:
+        _, missing = write_card(folder, *(text.strip() for text in texts))
+    names = (dataset_card.CARD, croissant.FILE, CHECKSUMS)
+    sys.stdout.write("".join(f"{shown(folder, written=True)}/{name}\n" for name in names))
     if missing:
         sys.stdout.write(f"before publishing, give {', '.join(missing)}\n")
     return 0
@@ -65,7 +70,7 @@ def write_card(
     if not license:
         raise InputError("--license is empty; give an identifier such as cc-by-4.0, or a URL")
     scenes = read_manifest(folder)
-    there = [scene for scene in scenes if (folder / scene.file).is_file()]
+    there = finished(folder, scenes)
     if not there:
         raise InputError(f"{folder}: no shard is there yet; run `sdps render-data` first")
     counts = compose(scenes)

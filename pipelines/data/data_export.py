@@ -3,13 +3,14 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal
 
+from pipelines.shared.flags import add_cache_argument
 from render.exchange.layouts import LAYOUTS
 from render.exchange.rules import RuleReport, check_tree
 from render.exchange.samples import ExportOptions
 from render.records.manifest import SceneSpec, read_manifest
+from render.records.mirror import finished, opened
 from render.shared.errors import InputError
 
 _SHOWN = 20
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--skip-missing", action="store_true", help="leave out planned scenes that have no shard yet")
     parser.add_argument("--check", action="store_true", help="check the tree against the rules of its loaders; "
                         "exit code 1 if it breaks one")  # fmt: skip
+    add_cache_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -43,11 +45,17 @@ def main(args: argparse.Namespace) -> int:
         if not args.check:
             raise InputError("--out is missing; give the folder to export to, or --check to check FOLDER itself")
         return report(check_tree(args.folder, args.layout, limit=args.limit), args.folder)
+    with opened(args.folder, args.cache_gb) as folder:
+        return _export(args, str(folder), options)
+
+
+def _export(args: argparse.Namespace, folder: str, options: ExportOptions) -> int:
+    """Export scenes of a folder, tell how it went, and check the tree if asked to."""
     from render.exchange.export import export, select
 
-    scenes = planned(args.folder, skip_missing=args.skip_missing)
+    scenes = planned(folder, skip_missing=args.skip_missing)
     chosen = select(scenes, ids=args.ids, split=args.split, limit=args.limit)
-    done = export(args.folder, args.out, options, chosen)
+    done = export(folder, args.out, options, chosen)
     sys.stdout.write(
         f"{args.out}: {len(done.scenes)} scenes as {args.layout}, {done.written} written now, {done.kept} kept\n"
     )
@@ -57,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
         sys.stdout.write(f"{words}: {mean:.2%} of the object's values on average, at most {most:.2%} ({worst})\n")
     if args.layout == "psfcn" and not any(scene["split"] == "val" for scene in done.scenes.values()):
         sys.stdout.write(f"{args.out}: val_mtrl.txt is empty; export scenes of split 'val' too before training on it\n")
-    return report(check_tree(args.out, args.layout, source=args.folder), args.out) if args.check else 0
+    return report(check_tree(args.out, args.layout, source=folder), args.out) if args.check else 0
 
 
 def _lost(scenes: Sequence[SceneSpec], layout: str) -> str:
@@ -86,7 +94,7 @@ def planned(folder: str, *, skip_missing: bool) -> list[SceneSpec]:
     """
     scenes = read_manifest(folder)
     if skip_missing:
-        scenes = [scene for scene in scenes if (Path(folder) / scene.file).is_file()]
+        scenes = finished(folder, scenes)
         if not scenes:
             raise InputError(f"{folder}: no shard yet; render some with `sdps render-data`")
     return scenes

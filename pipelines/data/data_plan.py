@@ -15,6 +15,7 @@ from pipelines.shared import presets
 from render.planning import budget
 from render.planning.budget import Pace
 from render.planning.chunks import cut, view_groups
+from render.records import mirror
 from render.records.ledger import survey
 from render.records.manifest import SceneSpec
 from render.running.supervisor import RunOptions, render_supervised
@@ -55,15 +56,16 @@ def main(args: argparse.Namespace) -> int:
     """
     preset, out = presets.from_arguments(args)
     options = RunOptions(workers=args.workers, keep_free=round(args.keep_free * 1e9))
-    folder = out / "data"
-    scenes = planned_scenes(preset, folder)
-    found = survey(folder, scenes)
-    left = [scene for scene in scenes if scene.id not in found.done]
-    sys.stdout.write(f"{folder}: {composition(scenes)}\n")
-    sample = None if args.no_sample or not left else render_sample(left, options)
-    needed = budget.disk_bytes(left, sample.measured if sample else ())
-    sys.stdout.write(describe(left, needed, folder, sample))
-    budget.require_space(folder, needed, options.keep_free)
+    with mirror.opened(out / "data", purpose="run") as folder:
+        scenes = planned_scenes(preset, folder)
+        found = survey(folder, scenes)
+        left = [scene for scene in scenes if scene.id not in found.done]
+        sys.stdout.write(f"{mirror.shown(folder)}: {composition(scenes)}\n")
+        sample = None if args.no_sample or not left else render_sample(left, options)
+        needed = budget.disk_bytes(left, sample.measured if sample else ())
+        sys.stdout.write(describe(left, needed, folder, sample))
+        if mirror.mirror_of(folder) is None:
+            budget.require_space(folder, needed, options.keep_free)
     return 0
 
 
@@ -119,8 +121,10 @@ def describe(left: list[SceneSpec], needed: int, folder: Path, sample: Sample | 
     """Lay out the estimates of what is left to render."""
     basis = f"measured on {sample.scenes} scenes of {sample.views} views" if sample else "not measured: a usual ratio"
     text = f"left: {len(left):,} scenes\n" if left else "left: nothing\n"
-    free = budget.gigabytes(budget.free_bytes(folder))
-    text += f"disk: about {budget.gigabytes(needed)} more ({basis}); {free} free\n"
+    place, free = "store", ""
+    if mirror.mirror_of(folder) is None:
+        place, free = "disk", f"; {budget.gigabytes(budget.free_bytes(folder))} free"
+    text += f"{place}: about {budget.gigabytes(needed)} more ({basis}){free}\n"
     if sample and sample.failures:
         text += f"sample: {len(sample.failures)} scenes failed, the first one thus: {sample.failures[0]}\n"
     if sample:

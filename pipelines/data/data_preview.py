@@ -10,8 +10,10 @@ import numpy as np
 from pipelines.data import preview_page
 from pipelines.data.preview_sample import Sample, caption, read_sample
 from pipelines.shared import pictures
+from pipelines.shared.flags import add_cache_argument
 from render.planning.composition import compose
 from render.records.manifest import SceneSpec, read_manifest
+from render.records.mirror import finished, opened, shown
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, write_text
 
@@ -23,12 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps data preview`."""
     parser.add_argument("folder", type=Path, help="data folder (the one with manifest.jsonl)")
     parser.add_argument("--count", type=int, default=PER_SHEET, help=f"scenes to show (default: {PER_SHEET})")
+    add_cache_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     """Write the sheets and the page, and say where they are."""
-    written = preview(args.folder, args.count)
-    sys.stdout.write("".join(f"{path}\n" for path in written))
+    with opened(args.folder, args.cache_gb) as folder:
+        written = preview(folder, args.count)
+    sys.stdout.write("".join(f"{shown(folder, written=True)}/{path.name}\n" for path in written))
     return 0
 
 
@@ -48,7 +52,7 @@ def preview(folder: str | Path, count: int = PER_SHEET) -> list[Path]:
     if count < 1:
         raise InputError(f"--count must be at least 1, got {count}")
     scenes = read_manifest(folder)
-    there = [scene for scene in scenes if (folder / scene.file).is_file()]
+    there = finished(folder, scenes)
     if not there:
         raise InputError(f"{folder}: no shard is there yet; run `sdps render-data` first")
     sample = read_sample(folder, there, count)

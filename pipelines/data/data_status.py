@@ -13,6 +13,7 @@ from typing import Any
 from render.planning import budget
 from render.records import ledger
 from render.records.manifest import MANIFEST, no_manifest, read_failed, read_manifest
+from render.records.mirror import mirror_of, opened, shown
 
 REASONS = 5  # most frequent reasons of failure that are shown
 QUIET = 300.0  # seconds without a finished scene after which a run is taken for stopped
@@ -28,7 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print the state of the folder."""
-    state = status(args.folder, verify=args.verify)
+    with opened(args.folder) as folder:
+        state = status(folder, verify=args.verify)
     sys.stdout.write(json.dumps(state, indent=2) + "\n" if args.json else render_text(state))
     return 0
 
@@ -58,7 +60,7 @@ def status(folder: Path, *, verify: bool = False) -> dict[str, Any]:
     age = (datetime.now(UTC) - datetime.fromisoformat(newest)).total_seconds() if newest else None
     rate = rates["recent_per_hour"] if age is not None and age < QUIET else rates["overall_per_hour"]
     return {
-        "folder": str(folder),
+        "folder": shown(folder),
         "scenes": len(ids),
         "done": len(done),
         "damaged": sum(id in sizes and id not in done for id in ids),
@@ -70,7 +72,7 @@ def status(folder: Path, *, verify: bool = False) -> dict[str, Any]:
         "seconds_left": 3600 * left / rate if rate else None,
         "bytes_used": used,
         "bytes_needed": left * used // len(done) if done else budget.disk_bytes(read_manifest(folder)),
-        "bytes_free": budget.free_bytes(folder),
+        "bytes_free": None if mirror_of(folder) else budget.free_bytes(folder),
     }
 
 
@@ -135,8 +137,10 @@ def render_text(state: dict[str, Any]) -> str:
         )
     if state["left"] and state["seconds_left"]:
         lines.append(f"left: about {budget.duration(state['seconds_left'])} at this rate")
+    free = f", {budget.gigabytes(state['bytes_free'])} free" if state["bytes_free"] is not None else ""
+    place = "disk" if free else "store"
     lines.append(
-        f"disk: {budget.gigabytes(state['bytes_used'])} used, about {budget.gigabytes(state['bytes_needed'])} more "
-        f"needed, {budget.gigabytes(state['bytes_free'])} free"
+        f"{place}: {budget.gigabytes(state['bytes_used'])} used, about {budget.gigabytes(state['bytes_needed'])} more "
+        f"needed{free}"
     )
     return "\n".join(lines) + "\n"

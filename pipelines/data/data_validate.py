@@ -6,9 +6,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from pipelines.shared.flags import add_cache_argument
 from render.checks.known_checks import CHECKS, ERROR, NOTE, WARNING
 from render.checks.shard_checks import Limits
 from render.checks.validate import REPORT, Validation, to_report, validate, write_report
+from render.records.mirror import opened, shown
 from render.shared.config import build, parse_yaml
 from render.shared.errors import InputError
 
@@ -23,13 +25,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the report as JSON instead of the summary")
     about = "move a threshold, e.g. min_area=0.05 (docs/reference/checks.md lists them); may be repeated"
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="LIMIT=VALUE", help=about)
+    add_cache_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     """Check, write `validation.json`, and return 0 when sound, 1 when there are findings of level error."""
     limits = build(Limits, dict(map(_override, args.overrides)))
-    result = validate(args.folder, limits=limits, workers=args.workers, limit=args.limit)
-    write_report(result)
+    with opened(args.folder, args.cache_gb) as folder:
+        result = validate(folder, limits=limits, workers=args.workers, limit=args.limit)
+        write_report(result)
     if args.json:
         sys.stdout.write(json.dumps(to_report(result), indent=2) + "\n")
     else:
@@ -47,7 +51,8 @@ def _override(text: str) -> tuple[str, object]:
 
 def summary(result: Validation) -> Iterator[str]:
     """Yield the lines of the readable summary."""
-    yield f"{result.folder}: {result.checked} shards checked, {result.planned} planned, {result.left} left to render"
+    where = shown(result.folder)
+    yield f"{where}: {result.checked} shards checked, {result.planned} planned, {result.left} left to render"
     yield ""
     width = max(map(len, CHECKS))
     for check in CHECKS.values():

@@ -10,6 +10,7 @@ from pipelines.shared import pictures
 from render.checks.statistics import SceneStatistics, measure, slants
 from render.planning.composition import components
 from render.records.manifest import SceneSpec
+from render.records.mirror import shard_path
 from render.records.shards import Shard, read_shard
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
@@ -44,11 +45,12 @@ def read_sample(folder: Path, there: Sequence[SceneSpec], count: int) -> Sample:
     for place in progress_bar(places, unit="shard", desc="preview"):
         scene = there[place]
         try:
-            shard = read_shard(folder / scene.file, scene)
+            path = shard_path(folder, scene)
+            shard = read_shard(path, scene)
         except InputError:
             sample.damaged.append(scene.id)
             continue
-        sample.statistics.append(measure(shard, (folder / scene.file).stat().st_size))
+        sample.statistics.append(measure(shard, path.stat().st_size))
         sample.slants.append(_some(slants(shard)))
         if scene.id in shown:
             sample.tiles.append((scene, strip(shard)))

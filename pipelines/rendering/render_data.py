@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipelines.shared import pictures, presets
 from render.planning import budget
-from render.records import manifest
+from render.records import manifest, mirror
 from render.records.manifest import FAILED, MANIFEST, SceneSpec, read_manifest
 from render.running.supervisor import RunOptions, RunSummary, render_supervised
 from render.shared.config import to_plain
@@ -60,12 +60,14 @@ def run_options(args: argparse.Namespace) -> RunOptions:
 def main(args: argparse.Namespace) -> int:
     """Plan, render what is missing, and say how it went: 0 when every scene is finished, 1 when some failed."""
     preset, out = presets.from_arguments(args)
-    options, folder = run_options(args), out / "data"
-    scenes = planned_scenes(preset, folder)
-    summary = render_supervised(scenes, folder, options)
-    if summary.lines:
-        write_preview(scenes, folder)
-    sys.stdout.write(report(summary, folder, len(scenes[0].lights)))
+    options = run_options(args)
+    with mirror.opened(out / "data", purpose="run") as folder:
+        scenes = planned_scenes(preset, folder)
+        mirror.publish(folder)  # other machines, and `sdps data status`, see the plan
+        summary = render_supervised(scenes, folder, options)
+        if summary.lines:
+            write_preview(scenes, folder)
+    sys.stdout.write(report(summary, mirror.shown(folder), len(scenes[0].lights)))
     return 1 if summary.failed or summary.skipped else 0
 
 
@@ -130,12 +132,12 @@ def render_planned(scenes: list[SceneSpec], folder: Path, preset: presets.Preset
 
 def write_preview(scenes: list[SceneSpec], folder: Path) -> None:
     """Write a contact sheet of finished scenes to `preview.png`."""
-    finished = [scene for scene in scenes if (folder / scene.file).is_file()]
+    finished = mirror.finished(folder, scenes)
     with atomic_path(folder / "preview.png") as temporary:
         pictures.scene_sheet(finished, folder).save(temporary)
 
 
-def report(summary: RunSummary, folder: Path, lights: int) -> str:
+def report(summary: RunSummary, folder: Path | str, lights: int) -> str:
     """Lay out what a run did, where its time went and what failed, a line each."""
     text = f"{folder}: {summary.done:,} of {summary.scenes:,} scenes finished, {summary.done * lights:,} images\n"
     if summary.lines:
@@ -154,7 +156,7 @@ def report(summary: RunSummary, folder: Path, lights: int) -> str:
         )
         now = f"{len(summary.failed)} scenes failed now ({most} x {reason})" if summary.failed else ""
         before = f"{summary.skipped} failed earlier and were not tried" if summary.skipped else ""
-        text += f"{'; '.join(filter(None, (now, before)))}; see {folder / FAILED}; try them again with --retry-failed\n"
+        text += f"{'; '.join(filter(None, (now, before)))}; see {folder}/{FAILED}; try them again with --retry-failed\n"
     return text
 
 

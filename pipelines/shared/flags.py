@@ -8,12 +8,19 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, get_origin
 
+from render.records.mirror import CACHE_GB
 from render.shared.errors import unknown
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 T = TypeVar("T", bound="DataclassInstance")
+
+
+def add_cache_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare how much of data in object storage is kept on this disk."""
+    parser.add_argument("--cache-gb", type=float, default=CACHE_GB, metavar="GB",
+                        help="of data in object storage, keep this much here (default: %(default)g)")  # fmt: skip
 
 
 def add_fields(parser: argparse.ArgumentParser, config: type, names: Iterable[str] = ()) -> None:

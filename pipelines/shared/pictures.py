@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw
 
 from pipelines.shared.charts import light_disc
 from render.records.manifest import SceneSpec
+from render.records.mirror import shard_path
 from render.records.shards import Shard, read_shard
 from sdps.photos.response import display
 
@@ -100,7 +101,7 @@ def scene_sheet(scenes: Sequence[SceneSpec], folder: Path, count: int = 24) -> I
     tiles = []
     for scene in spread(scenes, count):
         shape = scene.shape if len(scene.shape) < 20 else scene.shape.split(":")[0]
-        strip = preview_strip(read_shard(folder / scene.file, scene), lights=3)
+        strip = preview_strip(read_shard(shard_path(folder, scene), scene), lights=3)
         tiles.append((f"{shape}, {scene.material}"[:60], strip))
     return contact_sheet(tiles, columns=min(3, len(tiles)))
 

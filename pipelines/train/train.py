@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.shared import presets
+from pipelines.shared.flags import add_cache_argument
 from pipelines.shared.presets import Preset
+from pipelines.train.stored_runs import StoredRuns, data_folder
 from render.shared.config import to_yaml
 from render.shared.errors import InputError
 from render.shared.files import write_text
@@ -26,10 +28,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", default=None, help="data folder (default: <out>/data)")
     parser.add_argument("--stream", action="store_true", help="render the planned scenes while training; store none")
     parser.add_argument("--tensorboard", action="store_true", help="also write TensorBoard logs")
+    add_cache_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     """Train what is asked for, resuming whatever is there; exit code 130 when stopped by a signal."""
+    from sdps.methods.pretrained import MODELS_FOLDER, is_run
     from sdps.training import recipes
     from sdps.training.distributed import team
 
@@ -37,13 +41,15 @@ def main(args: argparse.Namespace) -> int:
     preset, out = presets.from_arguments(args)
     wanted = args.models.split(",") if args.models else list(preset.train)
     data = Path(args.data) if args.data else out / "data"
-    with team() as here:
+    with team() as here, data_folder(data, args.cache_gb, here) as folder:
+        runs = StoredRuns(out, MODELS_FOLDER, here)
         for name in in_order(preset, recipes.expand(wanted, preset.runs)):
-            result = train_run(preset, name, data, out, here, args)
+            runs.fetch([name, *filter(is_run, preset.run(name).requires.values())])
+            result = train_run(preset, name, folder, runs, here, args)
             if result.weights is None:
                 return 130
             if here.leads:
-                sys.stdout.write(describe(name, result))
+                sys.stdout.write(runs.shown(describe(name, result)))
     return 0
 
 
@@ -74,14 +80,14 @@ def in_order(preset: Preset, names: list[str]) -> list[str]:
 
 
 def train_run(
-    preset: Preset, name: str, data: Path, out: Path, here: "Team", args: argparse.Namespace
+    preset: Preset, name: str, data: Path, runs: StoredRuns, here: "Team", args: argparse.Namespace
 ) -> "TrainingResult":
     """Train one run into its folder, and describe it there with curves and a model card."""
     from sdps.methods.pretrained import MODELS_FOLDER
     from sdps.training.stage_factory import create_stage
     from sdps.training.trainer import train
 
-    run = preset.run(name)
+    run, out = preset.run(name), runs.folder
     trained = {use: required(out, needed) for use, needed in run.requires.items()}
     stage = create_stage(name, run.model, run.config, trained)
     folder = out / MODELS_FOLDER / name
@@ -90,12 +96,13 @@ def train_run(
         from pipelines.train.streaming import streamed
 
         source = streamed(preset, data, stage, here, preset.stream)
-    result = train(stage, data, folder, source=source, tensorboard=args.tensorboard)
+    result = train(stage, data, folder, source=source, tensorboard=args.tensorboard, on_save=lambda: runs.send(name))
     if here.leads:
         presets.save_resolved(preset, folder)
         write_text(folder / "training.yaml", to_yaml({"model": run.model, "training": run.config}))
         if result.weights is not None:
             document(folder, data, result)
+        runs.send(name, wait=True)
     return result
 
 

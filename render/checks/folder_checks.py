@@ -10,10 +10,9 @@ from render.checks.known_checks import Finding
 from render.planning.composition import IMPORTED, family
 from render.records.ledger import SHARDS
 from render.records.manifest import MANIFEST, SceneSpec
+from render.records.mirror import CHECKSUMS
 from render.records.shards import file_hash
 from render.shared.files import read_text
-
-CHECKSUMS = "checksums.txt"
 
 
 def read_checksums(folder: Path) -> dict[str, str]:

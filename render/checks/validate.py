@@ -23,6 +23,7 @@ from render.checks.shard_checks import Limits
 from render.checks.statistics import SceneStatistics, measure, summarise
 from render.records.ledger import shard_sizes
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
+from render.records.mirror import shard_path
 from render.records.shards import file_hash, read_shard
 from render.shared.config import to_plain
 from render.shared.errors import InputError
@@ -139,8 +140,11 @@ def validate(
 def check_one(task: tuple[str, SceneSpec, Limits, str | None]) -> ShardResult:
     """Check one shard: (folder, manifest line, limits, SHA-256 from checksums.txt or None)."""
     folder, scene, limits, expected = task
-    path = Path(folder) / scene.file
-    findings = []
+    findings: list[Finding] = []
+    try:
+        path = shard_path(Path(folder), scene)
+    except InputError as error:
+        return ShardResult(scene.id, (Finding("file", scene.id, str(error)),))
     if expected is not None and file_hash(path) != expected:
         findings.append(Finding("checksum", scene.id, f"SHA-256 differs from {CHECKSUMS}", 1.0))
     try:

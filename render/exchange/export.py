@@ -15,6 +15,7 @@ from render.exchange.layouts import LAYOUTS, Layout
 from render.exchange.names import Place
 from render.exchange.samples import ExportOptions, prepare
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
+from render.records.mirror import finished, shard_path
 from render.records.shards import file_hash, read_shard
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_folder, write_json
@@ -99,7 +100,8 @@ def select(
 
 def _check_shards(folder: Path, scenes: Sequence[SceneSpec]) -> None:
     """Refuse scenes without a shard before anything is written."""
-    missing = [scene.id for scene in scenes if not (folder / scene.file).is_file()]
+    there = {scene.id for scene in finished(folder, scenes)}
+    missing = [scene.id for scene in scenes if scene.id not in there]
     if missing:
         raise InputError(
             f"{folder}: {len(missing)} of {len(scenes)} shards are missing, the first is {missing[0]!r}; finish the "
@@ -138,7 +140,7 @@ def _marker(root: Path, layout: Layout, place: Place, scene: SceneSpec) -> dict[
 
 def _write_scene(folder: Path, root: Path, scene: SceneSpec, place: Place, options: ExportOptions) -> None:
     """Write one scene's folder, its record with it."""
-    layout, source = LAYOUTS[options.layout], folder / scene.file
+    layout, source = LAYOUTS[options.layout], shard_path(folder, scene)
     sample, facts = prepare(read_shard(source, scene), scene, options)
     marker = {"id": scene.id, "shape": scene.shape, "material": scene.material, "split": scene.split} | facts
     marker |= {"bits": options.settings()["bits"], "sha256": file_hash(source), "spec": scene.digest()}

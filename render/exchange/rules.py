@@ -15,6 +15,7 @@ from render.exchange.foreign_samples import Note, noted
 from render.exchange.layouts import LAYOUTS
 from render.exchange.loaders import SAMPLES, Pictures, Samples
 from render.records.manifest import SceneSpec, read_manifest
+from render.records.mirror import shard_path
 from render.records.shards import read_shard
 from render.shared.errors import InputError, unknown
 from render.shared.progress import progress_bar
@@ -96,7 +97,7 @@ def _compare(pictures: Pictures, source: Path, planned: dict[str, SceneSpec], no
     scene = planned.get(str(read_record(pictures.folder / MARKER).get("id")))
     if scene is None:
         raise InputError(f"{pictures.folder / MARKER}: names no scene of {source}; give the folder it came from")
-    shard = read_shard(source / scene.file, scene)
+    shard = read_shard(shard_path(source, scene), scene)
     if not np.array_equal(shard.mask, pictures.mask):
         note(f"{pictures.folder}: the mask differs from the shard's; export the scene again")
         return

@@ -14,6 +14,7 @@ from render.materials import library
 from render.materials.textures import textured
 from render.planning.composition import IMPORTED, Composition, components
 from render.records.manifest import OWN_MESHES, SceneSpec
+from render.records.mirror import shard_path
 from render.records.shards import read_shard
 from render.shared.errors import InputError
 
@@ -91,7 +92,7 @@ def headers(folder: Path, there: Sequence[SceneSpec]) -> dict[str, str]:
     found: dict[str, dict[str, None]] = {key: {} for key in HEADERS}
     for place in np.unique(np.linspace(0, len(there) - 1, min(READ, len(there))).round().astype(int)):
         try:
-            header = read_shard(folder / there[place].file, there[place]).provenance
+            header = read_shard(shard_path(folder, there[place]), there[place]).provenance
         except InputError:
             continue
         for key in HEADERS:

@@ -11,6 +11,7 @@ from render.planning.composition import Composition
 from render.publishing import croissant
 from render.publishing.croissant import Description
 from render.records.manifest import MANIFEST, SceneSpec
+from render.records.mirror import shard_path
 from render.records.shards import file_hash
 from render.shared.config import read_yaml, to_yaml
 from render.shared.errors import InputError
@@ -44,8 +45,10 @@ def write_checksums(folder: Path, there: Sequence[SceneSpec]) -> dict[str, str]:
     Returns:
         {path relative to the folder: SHA-256} of the shards, the manifest and the configuration.
     """
-    names = [name for name in (MANIFEST, CONFIG) if (folder / name).is_file()] + [scene.file for scene in there]
-    sums = {name: file_hash(folder / name) for name in progress_bar(names, unit="file", desc="checksums")}
+    names = [name for name in (MANIFEST, CONFIG) if (folder / name).is_file()]
+    sums = {name: file_hash(folder / name) for name in names}
+    for scene in progress_bar(there, unit="file", desc="checksums"):
+        sums[scene.file] = file_hash(shard_path(folder, scene))
     with atomic_path(folder / CHECKSUMS) as temporary, open(temporary, "w", encoding="utf-8") as handle:
         handle.writelines(f"{digest}  {name}\n" for name, digest in sums.items())
     return sums

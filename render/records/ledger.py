@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any, Self, TextIO
 
 from render.records.manifest import FAILED, SceneSpec, read_events, read_failed
+from render.records.mirror import LOG, SHARDS, Damaged, mirror_of, shard_path
 from render.records.shards import is_whole
 from render.shared.errors import InputError
-
-LOG = "log"
-SHARDS = "shards"
 
 
 def now() -> str:
@@ -45,7 +43,12 @@ class Ledger:
         self.path = folder / LOG / f"done-{host}-{os.getpid()}-{start}.jsonl"
         self._handle: TextIO | None = None
 
-    def __enter__(self) -> "Ledger":
+    @property
+    def crowded(self) -> bool:
+        """Whether no further work should be handed out for now."""
+        return False
+
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -91,7 +94,9 @@ def latest(runs: Sequence[list[dict[str, Any]]]) -> dict[str, dict[str, Any]]:
 
 
 def shard_sizes(folder: Path) -> dict[str, int]:
-    """Return the bytes of every shard file by scene id, from one look at the folder."""
+    """Return the bytes of every shard file by scene id, from one look at the folder or the listing of its store."""
+    if mirror := mirror_of(folder):
+        return mirror.sizes()
     try:
         with os.scandir(folder / SHARDS) as entries:
             return {
@@ -135,12 +140,20 @@ def survey(folder: Path, scenes: Sequence[SceneSpec], *, verify: bool = False) -
             continue
         line = lines.get(scene.id, {})
         known = line.get("bytes") == size and line.get("spec") == scene.digest()
-        if (known and not verify) or is_whole(folder / scene.file, scene):
+        if (known and not verify) or _is_whole(folder, scene):
             done.add(scene.id)
             if known:
                 listed[scene.id] = line
     failed = {id: rows for id, rows in read_failed(folder).items() if id not in done}
     return Survey(frozenset(done), failed, listed, sum(sizes[id] for id in done))
+
+
+def _is_whole(folder: Path, scene: SceneSpec) -> bool:
+    """Hash a shard, here or in the store."""
+    try:
+        return is_whole(shard_path(folder, scene), scene)
+    except Damaged:
+        return False
 
 
 def sweep(folder: Path, pids: Collection[int | None] = (), older_than: float = 3600.0) -> None:

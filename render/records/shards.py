@@ -252,16 +252,21 @@ def is_whole(path: str | Path, scene: SceneSpec) -> bool:
     return spec is not None and spec.group(1).decode() == scene.digest()
 
 
+def is_sealed(data: bytes) -> bool:
+    """Tell whether the bytes are those of a whole, unaltered shard."""
+    match = _DIGEST.search(data)
+    return match is not None and _digest(data, match) == match.group(1).decode()
+
+
 def _read_sealed(path: str | Path) -> bytes:
     """Read the file and check its digest.
 
     This comes before OpenEXR opens a file, because OpenEXR skips over what is damaged, telling so only on stderr.
     """
     data = read_bytes(path, "no such shard; run `sdps render-data` to finish the folder")
-    match = _DIGEST.search(data)
-    if match is None:
+    if _DIGEST.search(data) is None:
         raise InputError(f"{path}: not a shard of schema {SCHEMA}, or truncated; delete the file and render it again")
-    if _digest(data, match) != match.group(1).decode():
+    if not is_sealed(data):
         raise InputError(f"{path}: truncated or altered since it was written; delete the file and render it again")
     return data
 

@@ -21,6 +21,8 @@ from render.planning import budget
 from render.planning.chunks import cut, share
 from render.records.ledger import Ledger, Survey, now, survey, sweep
 from render.records.manifest import SceneSpec
+from render.records.mirror import mirror_of
+from render.records.sending import open_ledger, send_leftovers
 from render.running.isolation import serve
 from render.running.messages import Begun, Done, Ended, Failed, Fatal, Message, Ready, WorkerConfig
 from render.running.process import Worker
@@ -115,6 +117,7 @@ def render_supervised(
     options, folder = options or RunOptions(), Path(folder)
     scenes = share(scenes, options.part, options.parts)
     sweep(folder)
+    send_leftovers(folder)
     found = survey(folder, scenes, verify=options.verify)
     wanted = [scene for scene in scenes if scene.id not in found.done]
     if not options.retry_failed:
@@ -122,9 +125,11 @@ def render_supervised(
     by_id = {scene.id: scene for scene in scenes}
     measured = [(by_id[id], line["bytes"]) for id, line in list(found.lines.items())[-1000:]]
     if wanted:
-        budget.require_space(folder, budget.disk_bytes(wanted, measured), options.keep_free)
+        # Shards on their way to a store stay here only until they are sent.
+        needed = 0 if mirror_of(folder) else budget.disk_bytes(wanted, measured)
+        budget.require_space(folder, needed, options.keep_free)
     start = time.monotonic()
-    with tempfile.TemporaryDirectory() as errors, Ledger(folder) as ledger, _sigterm_as_interrupt():
+    with tempfile.TemporaryDirectory() as errors, open_ledger(folder) as ledger, _sigterm_as_interrupt():
         run = _Run(scenes, wanted, found, folder, options, ledger, Path(errors), serve)
         run.go()
     return RunSummary(
@@ -183,6 +188,8 @@ class _Run:
 
     def _hand_out(self) -> None:
         """Give every idle process a chunk, and start processes while there is work for them."""
+        if self.ledger.crowded:
+            return
         for worker in [worker for worker in self.workers if not worker.busy]:
             if worker.rendered >= self.options.recycle:
                 self._retire(worker)

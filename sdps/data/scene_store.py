@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from render.records.manifest import FAILED, SceneSpec, read_failed, read_manifest
+from render.records.mirror import finished as there
+from render.records.mirror import kept, shard_path, stored_size
 from render.records.shards import read_shard
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
@@ -79,13 +81,12 @@ class SceneStore:
         Raises:
             InputError: the shard is missing, damaged or differs from the manifest.
         """
-        path = self.folder / scene.file
         if not self.cache:
-            return _decode(path, scene)
-        entry = f"{scene.id}-{_identity(path, scene)}"
+            return _decode(shard_path(self.folder, scene), scene)
+        entry = f"{scene.id}-{_identity(self.folder, scene)}"
         images, truth = (self.folder / CACHE_FOLDER / f"{entry}.{kind}.npy" for kind in ("images", "truth"))
-        if not images.is_file():
-            stored = _decode(path, scene)
+        if not kept(self.folder, truth, images):
+            stored = _decode(shard_path(self.folder, scene), scene)
             packed = PackedImages.of(stored.images)
             # The images come last: where they are, the ground truth is.
             layers = [stored.normals, stored.mask[..., None], packed.kept[..., None]]
@@ -111,7 +112,7 @@ def finished_scenes(folder: Path, split: str, *, skip_missing: bool = False) -> 
         InputError: no manifest, no scene of the split, or a folder whose rendering is not finished.
     """
     planned = read_manifest(folder, split)
-    scenes = [scene for scene in planned if (folder / scene.file).is_file()]
+    scenes = there(folder, planned)
     missing = {scene.id for scene in planned} - {scene.id for scene in scenes}
     failed = missing & read_failed(folder).keys() if missing and not skip_missing else set()
     if not scenes or (missing - failed and not skip_missing):
@@ -144,13 +145,14 @@ def require_equal_counts(where: str | Path, scenes: Sequence[SceneSpec], images:
         )
 
 
-def _identity(path: Path, scene: SceneSpec) -> str:
-    """Return a short hash of the manifest line and the file's size and time."""
+def _identity(folder: Path, scene: SceneSpec) -> str:
+    """Return a short hash of the manifest line and the file's size and time, or what a store has for these."""
     try:
-        status = path.stat()
+        size, version = stored_size(folder, scene)
     except OSError as error:
-        raise InputError(f"{path}: no such shard; run `sdps render-data` to finish the folder") from error
-    text = f"{_LAYOUT} {scene.digest()} {status.st_size} {status.st_mtime_ns}"
+        where = folder / scene.file
+        raise InputError(f"{where}: no such shard; run `sdps render-data` to finish the folder") from error
+    text = f"{_LAYOUT} {scene.digest()} {size} {version}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -113,8 +113,7 @@ def solve(
     """
     beside, moving = neighbours(problem.mask), free & RATES.keys()
     state = State(**{name: part.clone().requires_grad_(name in moving) for name, part in state._asdict().items()})
-    groups = [{"params": [getattr(state, name)], "base": RATES[name]} for name in RATES if name in moving]
-    adam = torch.optim.Adam(groups)
+    adam = torch.optim.Adam([{"params": [getattr(state, name)], "base": RATES[name]} for name in sorted(moving)])
     start, begun = normalize(state.directions.detach(), dim=-1), normalize(state.normals.detach(), dim=-1)
     for number in range(iterations):
         part = number / max(iterations - 1, 1)
@@ -134,8 +133,7 @@ def solve(
         loss.backward()
         adam.step()
         _unit_length(state, free)
-        value = float(loss.detach())
-        if not math.isfinite(value):
+        if not math.isfinite(float(loss.detach())):
             raise InputError("refinement failed: the images hold values that are no numbers")
         after()
     return State(*(part.detach() for part in state))

@@ -101,8 +101,7 @@ def refine(
     problem = _problem(values, scene.mask, stride, gains)
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
     free = frozenset(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
-    fine = config.fine_iterations if stride > 1 else 0
-    before = config.iterations_before if config.bounces else 0
+    fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
     total = before + config.iterations + fine
     with progress_bar(None, total=total, desc="refine", unit="iteration") as bar:
         move = partial(solve, free=free, boost=config.boost, weights=Weights(), after=_advance(bar, total))

@@ -9,7 +9,7 @@ several processes share every batch and take the steps one process would take.
 import logging
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,7 @@ def train(
     device: str | torch.device | None = None,
     loggers: Sequence[Logger] = (),
     tensorboard: bool = False,
+    on_save: Callable[[], None] | None = None,
 ) -> TrainingResult:
     """Train a stage until its budget is spent, resuming whatever `out_folder` holds.
 
@@ -87,6 +88,7 @@ def train(
         device: Torch device; CUDA when there is one, else CPU.
         loggers: Receivers of metrics beside `metrics.jsonl`.
         tensorboard: Also log to `<out_folder>/tensorboard`.
+        on_save: Called in the leading process whenever a checkpoint has been written.
 
     Raises:
         InputError: unusable data, a checkpoint of another configuration or data set, or a loss that is
@@ -94,6 +96,7 @@ def train(
     """
     with team(device) as here:
         trainer = Trainer(stage, Path(data_folder), Path(out_folder), here, source)
+        trainer.on_save = on_save
         try:
             return _train(trainer, list(loggers), tensorboard)
         finally:
@@ -213,6 +216,7 @@ class Trainer:
         self.best = math.inf
         self.learning_rate = config.learning_rate
         self.saved: int | None = None  # step of the checkpoint on disk
+        self.on_save: Callable[[], None] | None = None
         self.finished_metrics: dict[str, float] | None = None
         self._earlier_seconds, self._started = 0.0, time.perf_counter()
 
@@ -245,12 +249,13 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate
         sums: dict[str, Tensor] = {}
-        for part in _parts(batch, config.accumulate):
+        for part in _parts(batch, config.batch_scenes // config.accumulate):
+            share = len(batch.seed) / len(part.seed)
             with self.arithmetic.autocast():
                 loss, terms = self._loss(part.to(self.team.device))
-            (loss / config.accumulate).backward()
+            (loss / share).backward()
             for name, value in {"loss": loss, **terms}.items():
-                sums[name] = sums.get(name, 0.0) + value.detach().double() / config.accumulate
+                sums[name] = sums.get(name, 0.0) + value.detach().double() / share
         # One transfer a step: a GPU is waited for once.
         totals = self.team.mean(dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True)))
         if not math.isfinite(totals["loss"]):
@@ -332,6 +337,8 @@ class Trainer:
         }
         save_state(self.folder / CHECKPOINT, state)
         self.saved = self.step
+        if self.on_save is not None:
+            self.on_save()
 
     def resume(self) -> None:
         """Go on from the folder's checkpoint, if there is one.
@@ -416,6 +423,6 @@ def _optimiser(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimi
     return kind(network.parameters(), **options, fused=True)
 
 
-def _parts(batch: Batch, count: int) -> list[Batch]:
-    """Split a batch into `count` equal parts."""
-    return [Batch(*tensors) for tensors in zip(*(tensor.chunk(count) for tensor in batch), strict=True)]
+def _parts(batch: Batch, scenes: int) -> list[Batch]:
+    """Split a batch into parts of so many scenes, the last of the rest: with more processes there are fewer parts."""
+    return [Batch(*tensors) for tensors in zip(*(tensor.split(scenes) for tensor in batch), strict=True)]

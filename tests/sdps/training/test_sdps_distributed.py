@@ -17,23 +17,26 @@ from sdps.training.stages import NormalStage
 from sdps.training.trainer import train
 
 config = NormalTraining(
-    steps=4, batch_scenes=4, images=2, size=32, crop=16, lights="true", log_every=1, workers=0, validation_scenes=2,
-    validate_every=2, schedule="cosine", clip_gradient=1.0, ema=0.5, accumulate=int(sys.argv[3]),
+    steps=int(sys.argv[4]), batch_scenes=4, images=2, size=32, crop=16, lights="true", log_every=1, workers=0,
+    validation_scenes=2, validate_every=2, schedule=sys.argv[5], clip_gradient=1.0, ema=0.5,
+    accumulate=int(sys.argv[3]),
     precision="float32",  # in bfloat16 the order of a sum, which differs, shows at 2e-4
 )
 result = train(NormalStage(config), sys.argv[1], sys.argv[2])
-assert result.steps == 4, result
+assert result.steps == int(sys.argv[4]), result
 """
 
 
-def run(folder: Path, out: Path, processes: int, accumulate: int = 1) -> list[dict]:
+def run(
+    folder: Path, out: Path, processes: int, accumulate: int = 1, steps: int = 4, schedule: str = "cosine"
+) -> list[dict]:
     """Train in a fresh process, or several under torchrun; return the metrics without what measures time."""
     script = out.with_suffix(".py")
     script.write_text(SCRIPT)
     launch = (
         ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)] if processes > 1 else []
     )
-    command = [sys.executable, *launch, str(script), str(folder), str(out), str(accumulate)]
+    command = [sys.executable, *launch, str(script), str(folder), str(out), str(accumulate), str(steps), schedule]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -61,12 +64,22 @@ def test_two_processes_give_the_losses_of_one(folder: Path, tmp_path: Path) -> N
         assert float((tensor - weights[1][name]).abs().max()) < 2e-3, name
 
 
+def test_accumulation_and_another_number_of_processes_keep_the_batch(folder: Path, tmp_path: Path) -> None:
+    """Four parts of one scene in one process, for all steps, or for two and then two parts in each of two processes."""
+    alone = run(folder, tmp_path / "one", 1, accumulate=4, schedule="constant")
+    run(folder, tmp_path / "two", 1, accumulate=4, steps=2, schedule="constant")
+    shared = run(folder, tmp_path / "two", 2, accumulate=4, schedule="constant")
+    for key, tolerance in (("loss", 2e-4), ("gradient_norm", 2e-3)):
+        found, wanted = ({line["step"]: line[key] for line in lines if key in line} for lines in (shared, alone))
+        assert len(wanted) == 4 and found == pytest.approx(wanted, rel=tolerance)
+
+
 def test_a_batch_that_cannot_be_shared_is_refused(folder: Path, tmp_path: Path) -> None:
     script = tmp_path / "odd.py"
     script.write_text(SCRIPT.replace("batch_scenes=4", "batch_scenes=3"))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
     done = subprocess.run(
-        [*command, str(folder), str(tmp_path / "out"), "1"], capture_output=True, text=True, check=False,
+        [*command, str(folder), str(tmp_path / "out"), "1", "4", "cosine"], capture_output=True, text=True, check=False,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode != 0
