@@ -1,0 +1,75 @@
+"""Join the finished scenes of several data folders into one, on which networks then train.
+
+    python docs/scripts/join_scenes.py out/world/data out/ship/data --out out/mix/data
+
+Scenes that have no shard yet are left out. Shards are linked where the file system allows it, else copied. Plans of
+different presets number their shapes alike: render different parts of them (`sdps render-data --shard`), so that no
+name is met twice.
+"""
+
+import argparse
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from render.records.manifest import SceneSpec, claim, read_manifest
+from render.shared.errors import InputError
+from render.shared.files import atomic_path
+
+
+def join(folders: Sequence[Path], out: Path) -> int:
+    """Write `out`, a data folder, and return its number of scenes.
+
+    Raises:
+        InputError: a folder without a manifest, two scenes of one name, no scene at all, or another plan in `out`.
+    """
+    origins: dict[str, Path] = {}
+    scenes: list[SceneSpec] = []
+    for folder in folders:
+        for scene in read_manifest(folder):
+            if not (folder / scene.file).is_file():
+                continue
+            if scene.id in origins:
+                raise InputError(
+                    f"{folder}: scene {scene.id} is in {origins[scene.id]} too; render different parts with --shard"
+                )
+            origins[scene.id] = folder
+            scenes.append(scene)
+    if not scenes:
+        raise InputError(f"{', '.join(map(str, folders))}: no finished scene; run `sdps render-data`")
+    (out / "shards").mkdir(parents=True, exist_ok=True)
+    claim(out, scenes)
+    for scene in scenes:
+        _link(origins[scene.id] / scene.file, out / scene.file)
+    return len(scenes)
+
+
+def _link(source: Path, target: Path) -> None:
+    if target.exists():
+        return
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without links
+        with atomic_path(target) as temporary:
+            shutil.copyfile(source, temporary)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; exit code 2 where the input cannot be used."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folders", nargs="+", type=Path, help="data folders")
+    parser.add_argument("--out", type=Path, required=True, help="data folder to write")
+    args = parser.parse_args(arguments)
+    try:
+        count = join(args.folders, args.out)
+    except InputError as error:
+        sys.stderr.write(f"join_scenes: {error}\n")
+        return 2
+    sys.stdout.write(f"{args.out}: {count} scenes\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
