@@ -76,7 +76,9 @@ def test_unusable_files_and_copies_are_skipped_with_their_reasons(folder, caplog
     lines = sorted(record.getMessage() for record in caplog.records if record.name == "render.planning.mesh_family")
     assert len(lines) == 3 and not any("\n" in line for line in lines)
     assert any("a copy of" in line for line in lines)
-    assert any("broken.ply: damaged or not a mesh" in line for line in lines) and any("points.obj" in line for line in lines)
+    assert any("broken.ply: damaged or not a mesh" in line for line in lines) and any(
+        "points.obj" in line for line in lines
+    )
 
 
 def test_no_usable_file_is_one_line(folder, tmp_path):
