@@ -35,6 +35,11 @@ class Chunk:
         groups = tuple(group for group in self.groups if any(scene.id in wanted for scene in group))
         return replace(self, groups=groups, wanted=wanted) if groups else None
 
+    def only(self, group: Collection[SceneSpec]) -> "Chunk | None":
+        """Return what is wanted of one view, or None."""
+        kept = {scene.id for scene in group}
+        return self.without([id for id in self.wanted if id not in kept])
+
 
 def view_groups(scenes: Sequence[SceneSpec]) -> Iterator[list[SceneSpec]]:
     """Split the manifest into runs of scenes that differ only in id, split and material."""

@@ -1,4 +1,4 @@
-"""Who renders the chunks of a run: processes of this machine, or whatever else takes chunks and tells what came of them.
+"""Who renders the chunks of a run: processes of this machine, or others that take chunks and tell what came of them.
 
 `render.running.supervisor` keeps the books of a run and asks its crew for news. The processes here are watched: one
 that hangs, dies or takes too much memory costs the view it works on, and another takes over the rest of its chunk.

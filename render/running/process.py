@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -11,6 +12,8 @@ from multiprocessing.connection import Connection
 from render.planning.chunks import Chunk
 from render.running.isolation import TAIL
 from render.running.messages import WorkerConfig
+
+_STARTING = threading.Lock()
 
 
 class Worker:
@@ -84,9 +87,10 @@ def _may_have_children() -> Iterator[None]:
     (`render.running.isolation`).
     """
     config = vars(multiprocessing.current_process())["_config"]
-    daemon = config.pop("daemon", None)
-    try:
-        yield
-    finally:
-        if daemon is not None:
-            config["daemon"] = daemon
+    with _STARTING:
+        daemon = config.pop("daemon", None)
+        try:
+            yield
+        finally:
+            if daemon is not None:
+                config["daemon"] = daemon
