@@ -23,6 +23,7 @@ from pipelines.shared.cluster import link
 from pipelines.shared.cluster.cluster_config import ClusterChoice, ClusterConfig
 from pipelines.shared.cluster.dask_crew import crew_on
 from render.planning import chunks
+from render.planning.chunks import Chunk
 from render.records import ledger
 from render.records.ledger import Ledger
 from render.records.manifest import SceneSpec, View
@@ -208,6 +209,17 @@ def test_a_scheduler_that_stays_away_ends_the_run(tmp_path, monkeypatch):
     assert 0 < len(files(tmp_path)) < 16
 
 
+def test_chunks_that_kill_their_workers_are_taken_apart(tmp_path, address):
+    views = [replace(scene, shape="sphere") for scene in planned([["ok", "ok"], ["ok"]])]
+    chunk = Chunk("sphere", (tuple(views[:2]), tuple(views[2:])), frozenset(scene.id for scene in views))
+    error = type("KilledWorker", (Exception,), {})()
+    with crew_on(ClusterChoice(name=address), tmp_path) as crew:
+        assert crew._refused(chunk, error) == []
+        assert [part.scenes() for part in crew.queue] == [views[:2], views[2:]]
+        (failed,) = crew._refused(crew.queue[0], error)
+    assert failed.ids == ("s0-m0", "s0-m1") and failed.reason == "every worker that tried it died"
+
+
 def test_a_process_that_takes_too_much_memory_costs_its_scene(tmp_path):
     crew = station.Station(tmp_path, memory=300 * 2**20)
     (chunk,) = chunks.cut(planned([["ok", "hoard", "ok"]]), {"s0-m0", "s0-m1", "s0-m2"})
@@ -260,3 +272,13 @@ def test_real_renders_have_the_bytes_of_a_local_run(tmp_path):
     assert files(tmp_path / "a" / "data") == files(tmp_path / "b" / "data")
     a, b = ((tmp_path / name / "data" / "manifest.jsonl").read_bytes() for name in "ab")
     assert a == b
+
+
+@pytest.mark.slow
+def test_test_scenes_have_the_bytes_of_a_plain_run(tmp_path, capsys):
+    words = ["regenerate", "--shapes", "sphere", "--materials", "chrome,lambertian:0.5", "--set", "test.size=16"]
+    words += ["--set", "test.spp=4"]
+    assert cli.main([*words, "--out", str(tmp_path / "a")]) == 0
+    assert cli.main([*words, "--out", str(tmp_path / "b"), "--cluster", "local:1"]) == 0
+    assert "2 rendered now" in capsys.readouterr().out
+    assert files(tmp_path / "a") == files(tmp_path / "b")

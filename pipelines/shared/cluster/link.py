@@ -3,8 +3,11 @@
 import importlib
 import logging
 import shutil
+import signal
 import sys
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from pipelines.shared.cluster.cluster_config import BATCH, KUBERNETES, ClusterChoice
@@ -81,10 +84,11 @@ class Link:
         choice = self.choice
         if choice.local:
             memory = max(budget.available_memory() // choice.local, budget.GIBIBYTE)
-            return importlib.import_module("distributed").LocalCluster(
-                n_workers=choice.local, threads_per_worker=1, memory_limit=memory, dashboard_address=":0",
-                silence_logs=logging.CRITICAL,
-            )  # fmt: skip
+            with _undisturbed():
+                return importlib.import_module("distributed").LocalCluster(
+                    n_workers=choice.local, threads_per_worker=1, memory_limit=memory, dashboard_address=":0",
+                    silence_logs=logging.CRITICAL,
+                )  # fmt: skip
         if choice.name in BATCH:
             kind, command = BATCH[choice.name]
             jobqueue = _module("dask_jobqueue", "dask-jobqueue", "sdps[cluster]")
@@ -107,6 +111,19 @@ class Link:
         except Exception as error:  # each batch system has its own
             said = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(f"{self.choice.file}: job: {said}; see the documentation of {kind.__name__}") from error
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Let processes that are started inside ignore Ctrl-C, which reaches the whole group; this one decides."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _module(name: str, package: str, install: str) -> Any:
