@@ -27,7 +27,8 @@ FOLDERS = [
     )),
     "sdps",
     *(f"pipelines.{name}" for name in (
-        "shared", "rendering", "data", "train", "report", "evaluate", "evaluate.figures", "benchmarks", "bench",
+        "shared", "shared.cluster", "rendering", "data", "train", "report", "evaluate", "evaluate.figures",
+        "benchmarks", "bench",
     )),
     "pipelines", "pipelines.app.work", "pipelines.app.rooms", "pipelines.app",
 ]  # fmt: skip

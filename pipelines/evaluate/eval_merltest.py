@@ -19,6 +19,7 @@ from pipelines.evaluate.workbench import Workbench, lit_object
 from pipelines.report import page as report
 from pipelines.report.sections import Table
 from pipelines.shared import presets, using
+from pipelines.shared.cluster import cluster_config
 from pipelines.shared.presets import Preset
 from render.records.manifest import SceneSpec
 from render.shared.config import to_plain
@@ -36,6 +37,7 @@ from sdps.models.registry import MODELS, TRUE_LIGHTS
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps eval-merltest`."""
     presets.add_common_arguments(parser)
+    cluster_config.add_arguments(parser)
     parser.add_argument("--lights", default=None, metavar="NAME|FILE|true",
                         help="lighting model of a combination (default: every trained model, a row each)")  # fmt: skip
     parser.add_argument("--normals", default=None, metavar="NAME|FILE",
@@ -50,7 +52,8 @@ def main(args: argparse.Namespace) -> int:
     lighting, normals = table_rows(args, out, preset)
     config = inference_config(preset.test)
     runners = tuple(Runner(method, finder(out), config) for method in (*lighting, *normals))
-    bench, pictured = Workbench(preset, out, runners), shown(normals)
+    bench = Workbench(preset, out, runners, cluster=cluster_config.from_arguments(args))
+    pictured = shown(normals)
     wanted, folder = bench.merltest()
     results = list(evaluate(bench, wanted, folder, pictured))
     tables, networks = build_tables(results, lighting, normals), using.describe(runners, config)

@@ -12,6 +12,7 @@ import numpy as np
 from pipelines.evaluate.evaluation import Evaluation, Result, TestObject
 from pipelines.rendering.render_data import render_planned
 from pipelines.shared import scenes
+from pipelines.shared.cluster.cluster_config import ClusterChoice
 from pipelines.shared.presets import Preset, TestConfig
 from render.records.manifest import SceneSpec
 from render.records.shards import Shard, file_hash, read_shard
@@ -88,12 +89,14 @@ class Workbench:
         out: The run's folder; MERL-Test scenes are shared with `eval-merltest`.
         runners: The methods.
         draws: Random choices per point, where a figure makes any.
+        cluster: Where scenes are rendered; this process when omitted.
     """
 
     preset: Preset
     out: Path
     runners: tuple[Runner, ...]
     draws: int = 3
+    cluster: ClusterChoice | None = None
 
     @property
     def config(self) -> TestConfig:
@@ -111,7 +114,7 @@ class Workbench:
     def rendered(self, config: TestConfig, folder: Path) -> tuple[list[SceneSpec], Path]:
         """Return the scenes of a test configuration and their folder, rendered where they are not yet."""
         wanted = scenes.test_scenes(config)
-        render_planned(wanted, folder, replace(self.preset, test=config))
+        render_planned(wanted, folder, replace(self.preset, test=config), self.cluster)
         return wanted, folder
 
     @cached_property

@@ -10,6 +10,7 @@ from pathlib import Path
 from pipelines.rendering import photographs
 from pipelines.rendering.render_data import render_planned
 from pipelines.shared import presets, scenes
+from pipelines.shared.cluster import cluster_config
 from pipelines.shared.flags import split_list
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
@@ -34,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="also save each scene for stock Mitsuba, in <out>/mitsuba/<id>")  # fmt: skip
     parser.add_argument("--photographs", action="store_true", help="also save each scene as the pictures of a camera "
                         "drawn for it (test.sensor), in <out>/photographs/<id>")  # fmt: skip
+    cluster_config.add_arguments(parser)
     presets.add_common_arguments(parser)
 
 
@@ -53,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
     )
     wanted = scenes.test_scenes(test)
     folder = Path(args.out or "out/regenerated")
-    rendered = render_planned(wanted, folder, replace(preset, test=test))
+    rendered = render_planned(wanted, folder, replace(preset, test=test), cluster_config.from_arguments(args))
     sys.stdout.write(
         f"{folder}: {len(wanted)} scenes x {len(wanted[0].lights)} lights; {rendered} rendered now; see preview.png\n"
     )

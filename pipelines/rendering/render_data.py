@@ -6,6 +6,8 @@ from collections import Counter
 from pathlib import Path
 
 from pipelines.shared import pictures, presets
+from pipelines.shared.cluster import cluster_config
+from pipelines.shared.cluster.dask_crew import crew_on
 from render.planning import budget
 from render.records import manifest, mirror
 from render.records.manifest import FAILED, MANIFEST, SceneSpec, read_manifest
@@ -31,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="give a view up that takes longer; 0 waits for ever (default: 600)")  # fmt: skip
     parser.add_argument("--shard", default="1/1", metavar="I/N", help="render only every N-th shape, from the I-th on")
     parser.add_argument("--retry-failed", action="store_true", help="try scenes again that failed before")
+    cluster_config.add_arguments(parser)
     parser.add_argument("--verify", action="store_true", help="check finished shards by their hash, not their ledger")
 
 
@@ -60,11 +63,14 @@ def run_options(args: argparse.Namespace) -> RunOptions:
 def main(args: argparse.Namespace) -> int:
     """Plan, render what is missing, and say how it went: 0 when every scene is finished, 1 when some failed."""
     preset, out = presets.from_arguments(args)
-    options = run_options(args)
-    with mirror.opened(out / "data", purpose="run") as folder:
+    options, cluster = run_options(args), cluster_config.from_arguments(args)
+    with (
+        mirror.opened(out / "data", purpose="run") as folder,
+        crew_on(cluster, folder, timeout=options.timeout) as crew,
+    ):
         scenes = planned_scenes(preset, folder)
         mirror.publish(folder)  # other machines, and `sdps data status`, see the plan
-        summary = render_supervised(scenes, folder, options)
+        summary = render_supervised(scenes, folder, options, crew=crew)
         if summary.lines:
             write_preview(scenes, folder)
     sys.stdout.write(report(summary, mirror.shown(folder), len(scenes[0].lights)))
@@ -112,8 +118,13 @@ def claim(scenes: list[SceneSpec], folder: Path, preset: presets.Preset | None) 
         presets.save_resolved(preset, folder)
 
 
-def render_planned(scenes: list[SceneSpec], folder: Path, preset: presets.Preset | None = None) -> int:
-    """Claim the folder, render what is missing in this process, and write a contact sheet; for test scenes.
+def render_planned(
+    scenes: list[SceneSpec],
+    folder: Path,
+    preset: presets.Preset | None = None,
+    cluster: cluster_config.ClusterChoice | None = None,
+) -> int:
+    """Claim the folder, render what is missing in this process or on a cluster, and write a contact sheet.
 
     Returns:
         Number of shards rendered now.
@@ -122,9 +133,17 @@ def render_planned(scenes: list[SceneSpec], folder: Path, preset: presets.Preset
         InputError: the folder holds another plan, or a scene cannot be rendered.
     """
     claim(scenes, folder, preset)
-    from render.running.worker import render_scenes
+    if cluster is None:
+        from render.running.worker import render_scenes
 
-    rendered = render_scenes(scenes, folder)
+        rendered = render_scenes(scenes, folder)
+    else:
+        with crew_on(cluster, folder) as crew:
+            summary = render_supervised(scenes, folder, RunOptions(retry_failed=True), crew=crew)
+        rendered = len(summary.lines)
+        if summary.failed:
+            first = summary.failed[0]
+            raise InputError(f"{folder}: {len(summary.failed)} scenes failed, {first['id']} thus: {first['reason']}")
     if rendered:
         write_preview(scenes, folder)
     return rendered

@@ -4,6 +4,7 @@ from collections.abc import Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
+from render.planning.budget import disk_bytes
 from render.records.manifest import SceneSpec
 
 GROUP_SIZE = 16  # most materials that share rays, and the mixture of bounce directions: it decides the bytes of shards
@@ -34,6 +35,11 @@ class Chunk:
         groups = tuple(group for group in self.groups if any(scene.id in wanted for scene in group))
         return replace(self, groups=groups, wanted=wanted) if groups else None
 
+    def only(self, group: Collection[SceneSpec]) -> "Chunk | None":
+        """Return what is wanted of one view, or None."""
+        kept = {scene.id for scene in group}
+        return self.without([id for id in self.wanted if id not in kept])
+
 
 def view_groups(scenes: Sequence[SceneSpec]) -> Iterator[list[SceneSpec]]:
     """Split the manifest into runs of scenes that differ only in id, split and material."""
@@ -54,17 +60,20 @@ def share(scenes: Sequence[SceneSpec], part: int = 1, parts: int = 1) -> list[Sc
     return [scene for number, run in enumerate(runs) if number % parts == part - 1 for scene in run]
 
 
-def cut(scenes: Sequence[SceneSpec], wanted: Collection[str], workers: int = 1) -> list[Chunk]:
+def cut(scenes: Sequence[SceneSpec], wanted: Collection[str], workers: int = 1, chunk_bytes: int = 0) -> list[Chunk]:
     """Cut the scenes into chunks, without those in which nothing is wanted.
 
     Args:
         scenes: Scenes in the order of the manifest, views whole.
         wanted: Ids of the scenes to render.
         workers: Processes that share the work; few views are cut finer, so that none is idle.
+        chunk_bytes: Most bytes of shards in a chunk of several views, as estimated; 0: any.
     """
     wanted = set(wanted)
     groups = [group for group in view_groups(scenes) if any(scene.id in wanted for scene in group)]
     length = max(1, min(VIEWS_PER_CHUNK, len(groups) // (4 * workers)))
+    if chunk_bytes and groups:
+        length = max(1, min(length, chunk_bytes // max(map(disk_bytes, groups))))
     chunks = []
     for shape, run in groupby(groups, key=lambda group: group[0].shape):
         views = [tuple(group) for group in run]

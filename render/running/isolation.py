@@ -8,11 +8,13 @@ import faulthandler
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from multiprocessing.connection import Connection
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from render.planning.chunks import Chunk
@@ -22,6 +24,7 @@ from render.running.messages import Begun, Done, Ended, Failed, Fatal, Message, 
 from render.shared.errors import InputError
 
 TAIL = 12  # lines of a traceback that are kept
+GRACE = 5.0  # seconds to unwind
 
 
 def serve(connection: Connection, config: WorkerConfig) -> None:
@@ -55,6 +58,7 @@ def settle(config: WorkerConfig) -> None:
         import resource
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     descriptor = os.open(config.errors, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     os.dup2(descriptor, 2)
     os.close(descriptor)
@@ -62,6 +66,17 @@ def settle(config: WorkerConfig) -> None:
     os.environ["SDPS_VARIANT"] = config.variant
     if config.llvm:
         os.environ["DRJIT_LIBLLVM_PATH"] = config.llvm
+
+
+def _end_with_parent() -> None:
+    """End when the parent is gone, killed perhaps: a process that hangs would stay for ever."""
+    parent = parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        with suppress(AttributeError, OSError):
+            os.kill(os.getpid(), signal.SIGTERM)  # unwinds, if it still can
+        time.sleep(GRACE)
+        os._exit(1)
 
 
 class Work:

@@ -3,14 +3,17 @@
 import multiprocessing
 import os
 import signal
+import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 
 from render.planning.chunks import Chunk
 from render.running.isolation import TAIL
 from render.running.messages import WorkerConfig
+
+_STARTING = threading.Lock()
 
 
 class Worker:
@@ -21,7 +24,8 @@ class Worker:
         self.connection, theirs = context.Pipe()
         self.errors = config.errors
         self.process = context.Process(target=serve, args=(theirs, config), daemon=True)
-        self.process.start()
+        with _may_have_children():
+            self.process.start()
         theirs.close()
         self.ready, self.busy, self.rendered = False, False, 0
         self.left: Chunk | None = None  # of the chunk it works on
@@ -73,3 +77,20 @@ class Worker:
         with suppress(OSError):
             return "\n".join(self.errors.read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL:])
         return ""
+
+
+@contextmanager
+def _may_have_children() -> Iterator[None]:
+    """Let a daemon start processes, which multiprocessing forbids lest they outlive it.
+
+    A worker of Dask is a daemon of its nanny. Our processes end with their parent, killed or not
+    (`render.running.isolation`).
+    """
+    config = vars(multiprocessing.current_process())["_config"]
+    with _STARTING:
+        daemon = config.pop("daemon", None)
+        try:
+            yield
+        finally:
+            if daemon is not None:
+                config["daemon"] = daemon

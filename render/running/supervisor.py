@@ -1,36 +1,33 @@
 """Rendering a plan with several processes, so that no scene can stop the run: the parent's side.
 
-The parent hands out chunks of consecutive views of a shape, writes the ledger and the failures, and watches time and
-disk. It never imports mitsuba. The bytes of a shard depend on the manifest alone, not on how the work was shared.
+The parent gives chunks of consecutive views of a shape to a crew (`render.running.crew`), writes the ledger and the
+failures, and watches the disk. It never imports mitsuba. The bytes of a shard depend on the manifest alone, not on how
+the work was shared.
 """
 
 import signal
 import tempfile
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
-from render.backend import variant
 from render.planning import budget
 from render.planning.chunks import cut, share
 from render.records.ledger import Ledger, Survey, now, survey, sweep
 from render.records.manifest import SceneSpec
 from render.records.mirror import mirror_of
 from render.records.sending import open_ledger, send_leftovers
+from render.running.crew import Crew, LocalCrew, News
 from render.running.isolation import serve
-from render.running.messages import Begun, Done, Ended, Failed, Fatal, Message, Ready, WorkerConfig
-from render.running.process import Worker
+from render.running.messages import Done, Failed, Fatal
 from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 
-STARTING = 300.0  # seconds a process may take to import and choose its variant
 HOPELESS = 20  # failures after which a run without a single success is given up
 
 
@@ -101,6 +98,7 @@ def render_supervised(
     options: RunOptions | None = None,
     *,
     serve: Callable[..., None] = serve,
+    crew: Crew | None = None,
 ) -> RunSummary:
     """Render every scene that has no whole shard yet and did not fail before; go on after failures.
 
@@ -109,6 +107,7 @@ def render_supervised(
         folder: Data folder; its `shards/`, `log/` and `failed.jsonl` are written.
         options: How to run it.
         serve: What a rendering process runs, a module-level function.
+        crew: Who renders, closed at the end; processes of this machine when omitted.
 
     Raises:
         InputError: a mistake that concerns the whole run: the disk, or a process that cannot start. Shards stay.
@@ -130,16 +129,20 @@ def render_supervised(
         budget.require_space(folder, needed, options.keep_free)
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as errors, open_ledger(folder) as ledger, _sigterm_as_interrupt():
-        run = _Run(scenes, wanted, found, folder, options, ledger, Path(errors), serve)
-        run.go()
+        run = _Run(scenes, wanted, found, folder, options, ledger)
+        if wanted or crew:
+            run.go(crew or LocalCrew(
+                folder, Path(errors), workers=options.workers, timeout=options.timeout, recycle=options.recycle,
+                serve=serve,
+            ))  # fmt: skip
     return RunSummary(
         scenes=len(scenes), done=len(found.done) + len(run.lines), lines=run.lines, failed=run.failed,
-        skipped=len(scenes) - len(found.done) - len(wanted), seconds=time.monotonic() - start, workers=run.count,
+        skipped=len(scenes) - len(found.done) - len(wanted), seconds=time.monotonic() - start, workers=run.workers,
     )  # fmt: skip
 
 
 class _Run:
-    """One run: the queue of chunks, the processes, and what has come of them."""
+    """The books of one run: what has come of its scenes."""
 
     def __init__(
         self,
@@ -149,108 +152,45 @@ class _Run:
         folder: Path,
         options: RunOptions,
         ledger: Ledger,
-        errors: Path,
-        serve: Callable[..., None],
     ) -> None:
-        self.folder, self.options, self.ledger, self.errors, self.serve = folder, options, ledger, errors, serve
-        self.total, self.initial = len(scenes), len(scenes) - len(wanted)
+        self.scenes, self.folder, self.options, self.ledger = scenes, folder, options, ledger
         self.wanted = {scene.id: scene for scene in wanted}
         self.attempts = {id: len(rows) for id, rows in found.failed.items()}
         self.lines: list[dict[str, Any]] = []
         self.failed: list[dict[str, Any]] = []
-        self.workers: list[Worker] = []
-        self.started = 0
-        choice = variant.choose() if wanted else None
-        self.variant, self.llvm = (choice.variant, choice.llvm) if choice else ("", None)
-        limit = options.workers or budget.default_workers(self.variant)
-        self.queue = deque(cut(scenes, self.wanted, limit))
-        self.count = max(1, min(limit, len(self.queue)))
+        self.workers = 1
 
-    def go(self) -> None:
-        """Render until the queue is empty."""
+    def go(self, crew: Crew) -> None:
+        """Render until nothing is left."""
         self.bar = progress_bar(
-            total=self.total, initial=self.initial, unit="scene", desc="render",
+            total=len(self.scenes), initial=len(self.scenes) - len(self.wanted), unit="scene", desc="render",
             bar_format="{desc}: {percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]",
         )  # fmt: skip
         try:
             with self.bar:
-                while self.queue or any(worker.busy for worker in self.workers):
-                    self._hand_out()
-                    self._listen()
-            for worker in self.workers:
-                worker.dismiss()
+                crew.give(cut(self.scenes, self.wanted, crew.slots, crew.chunk_bytes))
+                while crew.busy():
+                    while self.ledger.crowded:  # shards that wait for their store fill the disk: make no more of them
+                        time.sleep(0.1)
+                    for news in crew.step():
+                        self._take(news)
+                    self.workers = crew.count
+                    if crew.note:
+                        self.bar.set_postfix_str(crew.note)
         finally:
-            for worker in self.workers:
-                worker.process.terminate()
-            for worker in self.workers:
-                worker.close()
-            sweep(self.folder, [worker.process.pid for worker in self.workers])
+            crew.close()
 
-    def _hand_out(self) -> None:
-        """Give every idle process a chunk, and start processes while there is work for them."""
-        if self.ledger.crowded:
-            return
-        for worker in [worker for worker in self.workers if not worker.busy]:
-            if worker.rendered >= self.options.recycle:
-                self._retire(worker)
-            elif self.queue:
-                worker.take(self.queue.popleft())
-        while self.queue and len(self.workers) < self.count:
-            config = WorkerConfig(
-                folder=self.folder, number=self.started, threads=max(1, budget.cores() // self.count),
-                variant=self.variant, llvm=str(self.llvm) if self.llvm else None,
-                errors=self.errors / f"{self.started}.txt",
-            )  # fmt: skip
-            self.workers.append(Worker(self.serve, config))
-            self.started += 1
-            self.workers[-1].take(self.queue.popleft())
-
-    def _listen(self) -> None:
-        """Wait for news from the processes, and stop those that hang."""
-        ready = wait([worker.connection for worker in self.workers], timeout=self._patience())
-        for worker in [worker for worker in self.workers if worker.connection in ready]:
-            try:
-                message = worker.connection.recv()
-            except (EOFError, OSError):
-                self._lost(worker, worker.exit_reason())
-                continue
-            worker.since = time.monotonic()
-            self._take(worker, message)
-        for worker in list(self.workers):
-            limit = self._limit(worker)
-            if limit and worker.busy and time.monotonic() - worker.since > limit:
-                worker.abort()
-                self._lost(worker, f"timed out after {limit:g} s")
-
-    def _limit(self, worker: Worker) -> float:
-        return self.options.timeout if worker.ready else STARTING
-
-    def _patience(self) -> float:
-        """Return how long nothing needs to be looked at."""
-        ends = [worker.since + limit for worker in self.workers if worker.busy and (limit := self._limit(worker))]
-        return min(max(min(ends, default=1e9) - time.monotonic(), 0.0) + 0.01, 1.0)
-
-    # ---- Messages from the processes ----
-
-    def _take(self, worker: Worker, message: Message) -> None:
-        """Act on a message of a process."""
-        match message:
-            case Ready():
-                worker.ready = True
-            case Begun(ids):
-                worker.current, worker.view_start = ids, worker.since
+    def _take(self, news: News) -> None:
+        """Enter what a crew tells."""
+        match news:
             case Done(line):
-                self._done(worker, line)
+                self._done(line)
             case Failed():
-                self._failed(worker, message)
-            case Ended(sound):
-                self._ended(worker, sound)
+                self._failed(news)
             case Fatal(reason):
                 raise InputError(f"{reason} ({self._kept()})" if self.lines else reason)
 
-    def _done(self, worker: Worker, line: dict[str, Any]) -> None:
-        worker.finished(line["id"])
-        worker.rendered += 1
+    def _done(self, line: dict[str, Any]) -> None:
         self.lines.append(line)
         self.ledger.add(line)
         self._tick(1)
@@ -260,9 +200,8 @@ class _Run:
                 f"{self._kept()}; free space and run it again to go on"
             )
 
-    def _failed(self, worker: Worker, failure: Failed) -> None:
+    def _failed(self, failure: Failed) -> None:
         for id in failure.ids:
-            worker.finished(id)
             scene = self.wanted[id]
             self.attempts[id] = self.attempts.get(id, 0) + 1
             line = {
@@ -279,39 +218,10 @@ class _Run:
                 "mend that, then run it again with --retry-failed"
             )
 
-    def _ended(self, worker: Worker, sound: bool) -> None:
-        worker.busy, worker.current = False, ()
-        if worker.left:  # a process that is no longer sound leaves the rest to another one
-            self.queue.appendleft(worker.left)
-        if not sound:
-            self._retire(worker)
-
-    # ---- Losing processes ----
-
-    def _lost(self, worker: Worker, reason: str) -> None:
-        """Record what a dead or stopped process was working on, and give the rest of its chunk to another."""
-        worker.process.join()
-        tail = worker.stderr_tail()
-        if not worker.ready:
-            said = f": {tail.splitlines()[-1]}" if tail else ""
-            raise InputError(f"a rendering process did not start ({reason}){said}; run `sdps doctor`")
-        if worker.current:
-            self._failed(worker, Failed(worker.current, reason, tail, time.monotonic() - worker.view_start))
-        if worker.left:
-            self.queue.appendleft(worker.left)
-        self.workers.remove(worker)
-        sweep(self.folder, [worker.process.pid])
-
-    def _retire(self, worker: Worker) -> None:
-        worker.dismiss()
-        worker.process.terminate()
-        worker.close()
-        self.workers.remove(worker)
-
     # ---- Telling ----
 
     def _tick(self, count: int) -> None:
-        pace = budget.recent_pace(self.lines, self.count)
+        pace = budget.recent_pace(self.lines, self.workers)
         left = len(self.wanted) - len(self.lines) - len(self.failed)
         eta = f"{budget.duration(pace.left(left))} left, " if pace else ""
         self.bar.set_postfix_str(f"{eta}{len(self.failed)} failed", refresh=False)

@@ -19,6 +19,12 @@ def pretend(connection, config: WorkerConfig) -> None:
             match scene.material:
                 case "hang":
                     time.sleep(60)
+                case "slow":
+                    time.sleep(0.2)
+                case "hoard":
+                    hoard = bytearray(os.urandom(1 << 20) * 400)
+                    time.sleep(60)
+                    del hoard
                 case "die":
                     os.kill(os.getpid(), signal.SIGSEGV)
                 case "quit":

@@ -1,0 +1,188 @@
+"""Trials of `--cluster`: workers killed while they render, and how much one client and one scheduler carry.
+
+    python docs/scripts/cluster_trials.py kills --times 10
+    python docs/scripts/cluster_trials.py plan --chunks 20000
+    python docs/scripts/cluster_trials.py load --slots 1000 --seconds 5 --bytes 2000000 --chunks 4000
+
+`kills` renders a tiny preset on two workers, kills one (-9) at a random moment of the rendering, and compares manifest
+and shards with an undisturbed local run. `load` has tasks that sleep instead of rendering and return random bytes.
+`plan` tells what a scene of 64 lights takes in the manifest and in the memory of who reads it.
+"""
+
+import argparse
+import contextlib
+import os
+import random
+import signal
+import sys
+import tempfile
+import threading
+import time
+import tracemalloc
+from pathlib import Path
+
+import distributed
+
+from pipelines.rendering.render_data import planned_scenes
+from pipelines.shared import presets
+from pipelines.shared.cluster import dask_crew
+from pipelines.shared.cluster.cluster_config import ClusterChoice
+from pipelines.shared.memory import resident_bytes
+from render.planning.chunks import Chunk
+from render.records import manifest
+from render.records.ledger import now, read_runs
+from render.records.manifest import SceneSpec, View
+from render.records.shards import file_hash
+from render.running.messages import Done
+from render.running.station import Rendered, Task
+from render.running.supervisor import render_supervised
+
+TINY = ["data.size=32", "data.spp=16", "data.light_count=8", "data.materials_per_view=4", "data.views=1"]
+
+
+def kills(times: int, seed: int) -> int:
+    """Kill a worker in each of several runs; return 1 if one of them differs from the local run."""
+    rng, preset, bad = random.Random(seed), presets.load("smoke", TINY), 0
+    with tempfile.TemporaryDirectory() as temporary:
+        plain = Path(temporary) / "plain"
+        scenes = planned_scenes(preset, plain)
+        render_supervised(scenes, plain)
+        expected = content(plain)
+        for number in range(times):
+            folder = Path(temporary) / f"run-{number}"
+            done = killed_run(preset, folder, rng)
+            good = done == len(scenes) and content(folder) == expected and listed_once(folder, scenes)
+            bad += not good
+            said = "the bytes of the local run" if good else "DIFFERS"
+            sys.stdout.write(f"run {number + 1}: {done} of {len(scenes)} scenes, {said}\n")
+            sys.stdout.flush()
+    return int(bad > 0)
+
+
+def killed_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
+    """Render on two workers, one of which is killed while scenes are at work; return how many scenes are done."""
+    scenes = planned_scenes(preset, folder)
+    with cluster(2, 1) as (address, client):
+        pids, moments = list(client.run(os.getpid).values()), []
+
+        def kill() -> None:
+            while not any(client.run(busy).values()):
+                time.sleep(0.1)
+            time.sleep(rng.uniform(0.5, 4.0))
+            os.kill(rng.choice(pids), signal.SIGKILL)
+            moments.append(time.monotonic())
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        with dask_crew.crew_on(ClusterChoice(name=address), folder) as crew:
+            summary = render_supervised(scenes, folder, crew=crew)
+        assert moments, "the run ended before a worker was killed; give it more scenes"
+        killer.join()
+    return summary.done
+
+
+def busy(dask_worker: distributed.Worker) -> bool:
+    """Tell, on a worker, whether it has a task at work."""
+    return dask_worker.state.executing_count > 0
+
+
+def content(folder: Path) -> dict[str, str]:
+    """Return the hash of the manifest and of every shard."""
+    return {path.name: file_hash(path) for path in [folder / "manifest.jsonl", *(folder / "shards").iterdir()]}
+
+
+def listed_once(folder: Path, scenes: list[SceneSpec]) -> bool:
+    """Tell whether every scene stands in the ledger once."""
+    ids = [line["id"] for lines in read_runs(folder) for line in lines]
+    return sorted(ids) == sorted(scene.id for scene in scenes)
+
+
+def sleeping(task: Task) -> tuple[str, Rendered]:
+    """Sleep instead of rendering: the shape's name is `SECONDS:BYTES` of the chunk's only scene."""
+    seconds, size = task.chunk.shape.split(":")
+    time.sleep(float(seconds))
+    (scene,) = task.chunk.scenes()
+    line = {"id": scene.id, "spec": scene.digest(), "bytes": int(size), "seconds": float(seconds), "stages": {},
+            "time": now(), "worker": 0}  # fmt: skip
+    return distributed.get_worker().address, Rendered([Done(line)], {scene.id: os.urandom(int(size))})
+
+
+def load(slots: int, chunks: int, seconds: float, size: int) -> int:
+    """Send sleeping chunks through one client; print what it and the scheduler carry."""
+    scenes = [
+        SceneSpec(id=f"s{number}", seed=0, split="train", shape=f"{seconds}:{size}", material="none", view=View(),
+                  lights=((0.0, 0.0, 1.0),) * 64, size=128, spp=1, bounces=0)
+        for number in range(chunks)
+    ]  # fmt: skip
+    parts = [Chunk(scene.shape, ((scene,),), frozenset([scene.id])) for scene in scenes]
+    dask_crew.render_task = sleeping
+    processes = max(2, min(4, slots // 250))
+    with tempfile.TemporaryDirectory() as folder, cluster(processes, slots // processes) as (address, _):
+        before = resident_bytes() or 0
+        with dask_crew.crew_on(ClusterChoice(name=address), Path(folder)) as crew:
+            assert crew is not None
+            start, processor, done = time.monotonic(), time.process_time(), 0
+            crew.give(parts)
+            while crew.busy():
+                done += len(crew.step())
+            passed, processor = time.monotonic() - start, time.process_time() - processor
+            crew.close()
+        after = resident_bytes("VmHWM") or 0
+    ideal = chunks * seconds / slots
+    sys.stdout.write(
+        f"{done} chunks of {size / 1e6:g} MB, {slots} slots, {seconds:g} s each: {passed:.1f} s ({ideal:.1f} s without "
+        f"overhead), {done / passed:.0f} chunks/s, {done * size / passed / 1e6:.0f} MB/s; client and scheduler in one "
+        f"process: {1e3 * processor / done:.2f} ms of a core per chunk, {before / 1e6:.0f} MB before, "
+        f"{after / 1e6:.0f} MB at most\n"
+    )
+    return 0
+
+
+def plan(count: int) -> int:
+    """Write and read a manifest; print its bytes and those of memory."""
+    rng = random.Random(0)
+    with tempfile.TemporaryDirectory() as folder:
+        manifest.claim(Path(folder), [
+            SceneSpec(id=f"s{number}", seed=number, split="train", shape=f"sculpture:{number}", material="none",
+                      view=View(rotation=(0.36, 0.48, -0.8, -0.8, 0.6, 0.0, 0.48, 0.64, 0.6)),
+                      lights=tuple((round(rng.random(), 6), round(rng.random(), 6), 0.123457) for _ in range(64)),
+                      size=128, spp=64, bounces=2)
+            for number in range(count)
+        ])  # fmt: skip
+        tracemalloc.start()
+        scenes = manifest.read_manifest(Path(folder))
+        held = tracemalloc.get_traced_memory()[0]
+        size = (Path(folder) / manifest.MANIFEST).stat().st_size
+        sys.stdout.write(
+            f"{len(scenes)} scenes: {size / count:.0f} bytes a line, {held / count:.0f} bytes of memory a scene\n"
+        )
+    return 0
+
+
+@contextlib.contextmanager
+def cluster(processes: int, threads: int):
+    """Yield the address of a scheduler in this process with workers of their own, and a client."""
+    with (
+        distributed.LocalCluster(
+            n_workers=processes, threads_per_worker=threads, dashboard_address=":0", silence_logs=50
+        ) as made,
+        distributed.Client(made, set_as_default=False) as client,
+    ):
+        yield made.scheduler_address, client
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("trial", choices=("kills", "load", "plan"))
+    parser.add_argument("--times", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--slots", type=int, default=1000)
+    parser.add_argument("--chunks", type=int, default=4000)
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--bytes", type=int, default=2_000_000)
+    flags = parser.parse_args()
+    if flags.trial == "kills":
+        sys.exit(kills(flags.times, flags.seed))
+    if flags.trial == "plan":
+        sys.exit(plan(flags.chunks))
+    sys.exit(load(flags.slots, flags.chunks, flags.seconds, flags.bytes))

@@ -1,0 +1,194 @@
+"""Rendering a chunk for a run on another machine: what a worker of a cluster does, whatever engine brings it the task.
+
+A station keeps its rendering process from one task to the next, so that kernels are compiled once, and supervises it as
+a local run does: a crash or a hang costs one view, never the worker. Shards return as bytes; nothing is shared.
+"""
+
+import hashlib
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import assets
+from render.planning import provenance
+from render.planning.chunks import Chunk
+from render.records.manifest import SceneSpec
+from render.running.crew import LocalCrew, News
+from render.running.isolation import serve
+from render.running.messages import Done, Fatal
+from render.shared.errors import InputError
+from render.shared.files import source_digest
+
+IDLE = 60.0  # seconds after which a process without work ends: its run may be gone
+_OWN = (".yaml", ".yml", ".binary", ".bsdf", ".obj", ".ply", ".stl", ".gz")
+
+
+class Task(NamedTuple):
+    """What a worker is given.
+
+    Attributes:
+        run: Name of the run, for `stop`.
+        chunk: What to render.
+        digest: Of the manifest lines of its scenes, as planned.
+        needs: What the worker must have (`installed`), and the files the chunk names with their hashes.
+        timeout: Seconds without a finished scene after which the process is stopped.
+        serve: What the rendering process runs.
+    """
+
+    run: str
+    chunk: Chunk
+    digest: str
+    needs: dict[str, str]
+    timeout: float
+    serve: Callable[..., None] = serve
+
+
+class Rendered(NamedTuple):
+    """What came of a chunk: news in order, and the bytes of the shards by scene id."""
+
+    news: list[News]
+    shards: dict[str, bytes]
+
+
+class Mismatch(InputError):
+    """The worker would render something else than was planned."""
+
+
+@cache
+def installed() -> dict[str, str]:
+    """Return what decides the bytes of shards, as installed here: versions, code, fitted materials."""
+    found = {name: version for name, version in provenance.versions().items() if name != "python"}
+    materials = hashlib.sha256()
+    folder = Path(str(assets.__file__)).parent / "materials"
+    for path in sorted(folder.rglob("*.yaml")):
+        materials.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
+    code = source_digest(Path(__file__).parent.parent)
+    return found | {"code of the renderer": code, "fitted materials": materials.hexdigest()[:12]}
+
+
+def own_files(chunk: Chunk) -> dict[str, str]:
+    """Return {path: hash} of the files that the chunk's shape and materials are; `missing` where there is none."""
+    names = {chunk.shape, *(scene.material for group in chunk.groups for scene in group)}
+    paths = {name: Path(name) for name in names if name.lower().endswith(_OWN)}
+    return {
+        f"file {name}": hashlib.sha256(path.read_bytes()).hexdigest()[:12] if path.is_file() else "missing"
+        for name, path in paths.items()
+    }
+
+
+def lines_digest(scenes: Sequence[SceneSpec]) -> str:
+    """Return one hash of manifest lines."""
+    return hashlib.sha256("".join(scene.digest() for scene in scenes).encode()).hexdigest()
+
+
+def task_of(run: str, chunk: Chunk, timeout: float, serve: Callable[..., None] = serve) -> Task:
+    """Return the task of a chunk, with what a worker must agree on."""
+    return Task(run, chunk, lines_digest(chunk.scenes()), installed() | own_files(chunk), timeout, serve)
+
+
+def check(task: Task) -> None:
+    """Refuse a task that would give other bytes here.
+
+    Raises:
+        Mismatch: the first thing that differs.
+    """
+    here = installed() | own_files(task.chunk)
+    for name, there in task.needs.items():
+        if here.get(name) != there:
+            raise Mismatch(f"has {name} {here.get(name, 'of none')}, the run {there}; install the same sdps on both")
+    if lines_digest(task.chunk.scenes()) != task.digest:
+        raise Mismatch("reads the plan otherwise than it was written; install the same sdps on both")
+
+
+class Station:
+    """The rendering processes of a worker, one per task at a time, kept while there is work.
+
+    Args:
+        folder: Folder for what is on its way.
+        memory: Bytes of memory each process may take; 0: any.
+    """
+
+    def __init__(self, folder: Path, memory: int = 0) -> None:
+        self.folder, self.memory = folder, memory
+        self.idle: list[tuple[Callable[..., None], LocalCrew]] = []
+        self.lock = threading.Lock()
+        self.stopped: set[str] = set()
+        self.timer: threading.Timer | None = None
+
+    def render(self, task: Task) -> Rendered:
+        """Render a chunk, if its run was not stopped.
+
+        Raises:
+            Mismatch: this machine would give other bytes.
+        """
+        check(task)
+        crew = self._borrow(task)
+        news: list[News] = []
+        try:
+            crew.give([task.chunk])
+            while crew.busy() and task.run not in self.stopped:
+                step = crew.step()
+                news += step
+                if any(isinstance(item, Fatal) for item in step):
+                    break  # what concerns the whole run
+            ended = not crew.busy()
+            shards = {item.line["id"]: self._collect(crew, item) for item in news if isinstance(item, Done)}
+        except BaseException:
+            self._remove(crew)
+            raise
+        if ended:
+            self._give_back(task.serve, crew)
+        else:
+            self._remove(crew)
+        return Rendered(news, shards)
+
+    def stop(self, run: str) -> None:
+        """Let the tasks of a run end, those under way within about a second, and the idle processes."""
+        self.stopped.add(run)
+        self.dismiss()
+
+    def dismiss(self) -> None:
+        """End the idle processes."""
+        with self.lock:
+            crews, self.idle = self.idle, []
+        for _, crew in crews:
+            self._remove(crew)
+
+    def _borrow(self, task: Task) -> LocalCrew:
+        with self.lock:
+            if self.timer is not None:
+                self.timer.cancel()
+            for entry in self.idle:
+                if entry[0] is task.serve:
+                    self.idle.remove(entry)
+                    entry[1].timeout = task.timeout
+                    return entry[1]
+        self.folder.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix="sdps-", dir=self.folder))
+        return LocalCrew(
+            folder, folder, workers=1, timeout=task.timeout, threads=1, memory=self.memory, serve=task.serve
+        )
+
+    def _give_back(self, serve: Callable[..., None], crew: LocalCrew) -> None:
+        with self.lock:
+            self.idle.append((serve, crew))
+            self.timer = threading.Timer(IDLE, self.dismiss)
+            self.timer.daemon = True
+            self.timer.start()
+
+    @staticmethod
+    def _collect(crew: LocalCrew, done: Done) -> bytes:
+        """Return the bytes of a shard and remove its file."""
+        path = crew.folder / "shards" / f"{done.line['id']}.exr"
+        data = path.read_bytes()
+        path.unlink()
+        return data
+
+    @staticmethod
+    def _remove(crew: LocalCrew) -> None:
+        crew.close()
+        shutil.rmtree(crew.folder, ignore_errors=True)

@@ -1,0 +1,284 @@
+"""Rendering on a Dask cluster: the books are those of a local run, whatever happens to workers and scheduler.
+
+Most tests run processes that only pretend to render, on two workers of this machine.
+"""
+
+import contextlib
+import json
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from pretend_renderer import pretend, stillborn
+
+from pipelines import cli
+from pipelines.shared.cluster import link
+from pipelines.shared.cluster.cluster_config import ClusterChoice, ClusterConfig
+from pipelines.shared.cluster.dask_crew import crew_on
+from render.planning import chunks
+from render.planning.chunks import Chunk
+from render.records import ledger
+from render.records.ledger import Ledger
+from render.records.manifest import SceneSpec, View
+from render.records.shards import file_hash
+from render.running import station
+from render.running.supervisor import RunOptions, RunSummary, render_supervised
+from render.shared.errors import InputError
+
+distributed = pytest.importorskip("distributed")
+LIGHTS = ((0.0, 0.0, 1.0), (0.6, 0.0, 0.8))
+
+
+def planned(materials: list[list[str]]) -> list[SceneSpec]:
+    """Return a plan of one view per inner list, each of a shape of its own, with these materials."""
+    return [
+        SceneSpec(
+            id=f"s{shape}-m{slot}", seed=shape, split="train", shape=f"blobby:{shape}", material=material, view=View(),
+            lights=LIGHTS, size=16, spp=4, bounces=0,
+        )
+        for shape, row in enumerate(materials)
+        for slot, material in enumerate(row)
+    ]  # fmt: skip
+
+
+@contextlib.contextmanager
+def workers(count: int = 2, **options) -> Iterator[str]:
+    """Yield the address of a scheduler with workers."""
+    with distributed.LocalCluster(
+        n_workers=count, threads_per_worker=1, dashboard_address=":0", silence_logs=50, **options
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with workers() as found:
+        yield found
+
+
+def run(
+    scenes: list[SceneSpec], folder: Path, address: str, serve=pretend, timeout=60.0, patience=300.0, **options
+) -> RunSummary:
+    choice = ClusterChoice(name=address, config=ClusterConfig(patience=patience))
+    with crew_on(choice, folder, timeout=timeout, serve=serve) as crew:
+        return render_supervised(scenes, folder, RunOptions(**options), crew=crew)
+
+
+def files(folder: Path) -> dict[str, str]:
+    return {path.name: file_hash(path) for path in (folder / "shards").glob("*.exr")}
+
+
+def failures(folder: Path) -> dict[str, str]:
+    return {line["id"]: line["reason"] for line in map(json.loads, (folder / "failed.jsonl").read_text().splitlines())}
+
+
+def rendering(address: str) -> int:
+    """Return how many rendering processes the cluster has."""
+    with distributed.Client(address, set_as_default=False) as client:
+        return sum(client.run(lambda: len(multiprocessing.active_children())).values())
+
+
+def test_books_and_bytes_are_those_of_a_local_run(tmp_path, address):
+    scenes = planned([["ok", "raise", "ok"], ["ok", "hang"], ["die", "ok"], ["ok", "quit"], ["ok"] * 4])
+    here = render_supervised(scenes, tmp_path / "a", RunOptions(workers=2, timeout=0.5), serve=pretend)
+    there = run(scenes, tmp_path / "b", address, timeout=0.5)
+    assert (there.scenes, there.done, len(there.failed)) == (here.scenes, here.done, len(here.failed)) == (13, 9, 4)
+    assert files(tmp_path / "a") == files(tmp_path / "b") and failures(tmp_path / "a") == failures(tmp_path / "b")
+    assert len(ledger.survey(tmp_path / "b", scenes).lines) == 9  # all in the ledger, once
+    assert there.workers == 2 and {line["worker"] for line in there.lines} <= {0, 1}
+    assert rendering(address) == 0  # the cluster is left clean
+    again = run(scenes, tmp_path / "b", address)
+    assert (again.done, again.skipped, again.lines) == (9, 4, [])
+    assert run(scenes, tmp_path / "b", address, timeout=0.5, retry_failed=True).failed[0]["attempt"] == 2
+
+
+@pytest.mark.parametrize("name", ["sdps", "fitted materials", "code of the renderer"])
+def test_what_differs_is_refused(tmp_path, address, monkeypatch, name):
+    there = dict(station.installed()) | {name: "other"}
+    monkeypatch.setattr(station, "installed", lambda: there)
+    with pytest.raises(InputError, match=rf"a worker has {name} .*, the run other; install the same sdps on both"):
+        run(planned([["ok"]]), tmp_path, address)
+    assert not files(tmp_path)
+
+
+def test_a_plan_that_is_read_otherwise_is_refused(tmp_path, address, monkeypatch):
+    monkeypatch.setattr(station, "lines_digest", lambda scenes: "other")
+    with pytest.raises(InputError, match="reads the plan otherwise"):
+        run(planned([["ok"]]), tmp_path, address)
+
+
+def test_own_files_are_tied_to_their_content(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("a")
+    (chunk,) = chunks.cut(planned([[str(path)]]), {"s0-m0"})
+    task = station.task_of("run", chunk, 1.0)
+    station.check(task)
+    path.write_text("b")
+    with pytest.raises(station.Mismatch, match=r"has file .*mine\.yaml"):
+        station.check(task)
+
+
+def test_what_concerns_the_whole_run_stops_it(tmp_path, address):
+    with pytest.raises(InputError, match=r"worker tcp.*No space left on device"):
+        run(planned([["ok"], ["full"]]), tmp_path / "a", address)
+    with pytest.raises(InputError, match=r"worker tcp.*did not start \(worker died, exit code 7\)"):
+        run(planned([["ok"]]), tmp_path / "b", address, serve=stillborn)
+    with pytest.raises(InputError, match=r"the first 20 scenes all failed"):
+        run(planned([["raise"] * 16] * 2), tmp_path / "c", address)
+    assert rendering(address) == 0
+
+
+def test_interrupt_cancels_what_is_out_and_keeps_what_is_back(tmp_path, address, monkeypatch):
+    scenes, add = planned([["ok"], ["hang"], ["hang"], ["ok"]]), Ledger.add
+
+    def stop(ledger: Ledger, line: dict) -> None:
+        add(ledger, line)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Ledger, "add", stop)
+    with pytest.raises(KeyboardInterrupt):
+        run(scenes, tmp_path, address)
+    assert set(files(tmp_path)) == {"s0-m0.exr"}
+    end = time.monotonic() + 10
+    while rendering(address) and time.monotonic() < end:
+        time.sleep(0.2)
+    assert rendering(address) == 0
+
+
+def test_a_killed_worker_costs_no_scene(tmp_path, monkeypatch):
+    scenes, add, lines = planned([["slow"] * 3] * 6), Ledger.add, []
+    with workers() as address, distributed.Client(address, set_as_default=False) as client:
+        pids = list(client.run(os.getpid).values())
+
+        def kill(ledger: Ledger, line: dict) -> None:
+            add(ledger, line)
+            lines.append(line["id"])
+            if len(lines) == 4:
+                os.kill(pids[0], signal.SIGKILL)
+
+        monkeypatch.setattr(Ledger, "add", kill)
+        summary = run(scenes, tmp_path, address)
+    assert summary.done == 18 and not summary.failed and sorted(lines) == sorted(scene.id for scene in scenes)
+    assert all((tmp_path / scene.file).read_bytes() == scene.digest().encode() for scene in scenes)
+
+
+@pytest.mark.slow
+def test_a_lost_scheduler_is_waited_for(tmp_path, monkeypatch):
+    scenes, add = planned([["slow"] * 2] * 8), Ledger.add
+    first = contextlib.ExitStack()
+    address = first.enter_context(workers(1))
+    again, stop = contextlib.ExitStack(), threading.Event()
+
+    def restart() -> None:
+        first.close()
+        time.sleep(0.5)
+        again.enter_context(workers(1, scheduler_port=int(address.rpartition(":")[2])))
+
+    def lose(ledger: Ledger, line: dict) -> None:
+        add(ledger, line)
+        if not stop.is_set():
+            stop.set()
+            threading.Thread(target=restart).start()
+
+    monkeypatch.setattr(Ledger, "add", lose)
+    with again:
+        summary = run(scenes, tmp_path, address)
+    assert summary.done == 16 and len({line["id"] for line in summary.lines}) == len(summary.lines) == 16
+
+
+def test_a_scheduler_that_stays_away_ends_the_run(tmp_path, monkeypatch):
+    scenes, add = planned([["slow"] * 2] * 8), Ledger.add
+    stack = contextlib.ExitStack()
+    address = stack.enter_context(workers(1))
+
+    def lose(ledger: Ledger, line: dict) -> None:
+        add(ledger, line)
+        stack.close()
+
+    monkeypatch.setattr(Ledger, "add", lose)
+    monkeypatch.setattr(link, "ANSWER", 0.5)
+    with pytest.raises(InputError, match=r"no scheduler for 1 s; .*go on \(\d+ scenes of this run are finished and"):
+        run(scenes, tmp_path, address, patience=1.0)
+    assert 0 < len(files(tmp_path)) < 16
+
+
+def test_chunks_that_kill_their_workers_are_taken_apart(tmp_path, address):
+    views = [replace(scene, shape="sphere") for scene in planned([["ok", "ok"], ["ok"]])]
+    chunk = Chunk("sphere", (tuple(views[:2]), tuple(views[2:])), frozenset(scene.id for scene in views))
+    error = type("KilledWorker", (Exception,), {})()
+    with crew_on(ClusterChoice(name=address), tmp_path) as crew:
+        assert crew._refused(chunk, error) == []
+        assert [part.scenes() for part in crew.queue] == [views[:2], views[2:]]
+        (failed,) = crew._refused(crew.queue[0], error)
+    assert failed.ids == ("s0-m0", "s0-m1") and failed.reason == "every worker that tried it died"
+
+
+def test_a_process_that_takes_too_much_memory_costs_its_scene(tmp_path):
+    crew = station.Station(tmp_path, memory=300 * 2**20)
+    (chunk,) = chunks.cut(planned([["ok", "hoard", "ok"]]), {"s0-m0", "s0-m1", "s0-m2"})
+    rendered = crew.render(station.task_of("run", chunk, 60.0, pretend))
+    crew.dismiss()
+    assert set(rendered.shards) == {"s0-m0", "s0-m2"}
+    assert [news.reason for news in rendered.news if not hasattr(news, "line")] == ["took more than 315 MB of memory"]
+
+
+def test_chunks_of_a_cluster_are_bounded_in_bytes():
+    scenes = [replace(scene, shape="sphere", size=512) for scene in planned([["ok"]] * 64)]
+    whole, bounded = (chunks.cut(scenes, {scene.id for scene in scenes}, 1, limit) for limit in (0, 20_000_000))
+    assert max(len(chunk.groups) for chunk in whole) == chunks.VIEWS_PER_CHUNK
+    assert max(len(chunk.groups) for chunk in bounded) == 4
+    assert [scene for chunk in bounded for scene in chunk.scenes()] == scenes
+    assert bounded[0].only(bounded[0].groups[1]).scenes() == list(bounded[0].groups[1])
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--cluster", "tcp://127.0.0.1:1"], "no Dask scheduler answers there"),
+        (["--cluster", "tcp://nowhere"], "expected tcp://HOST:PORT"),
+        (["--cluster", "local:0"], "local:N, N from 1"),
+        (["--cluster", "slum"], "did you mean 'slurm'"),
+        (["--cluster", "slurm"], "needs --cluster-config FILE"),
+        (["--cluster", "slurm", "--cluster-config", "{tmp}/none.yaml"], "no such file"),
+        (["--cluster", "slurm", "--cluster-config", "{tmp}/key.yaml"], "key.yaml: .*'job'"),
+        (["--cluster", "kubernetes", "--cluster-config", "{tmp}/good.yaml"], "needs the package dask-kubernetes"),
+        (["--cluster-config", "x.yaml"], "goes with --cluster"),
+        (["--cluster", "local:2", "--workers", "3"], "the cluster decides"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path, capsys, monkeypatch, flags, message):
+    monkeypatch.setattr(link, "ANSWER", 0.3)
+    (tmp_path / "key.yaml").write_text("jop: {cores: 1}\n")
+    (tmp_path / "good.yaml").write_text("job: {image: some}\n")
+    words = [word.format(tmp=tmp_path) for word in flags]
+    assert cli.main(["render-data", "--preset", "smoke", "--out", str(tmp_path / "out"), *words]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and not (tmp_path / "out").exists()
+    assert re.search(message, error), error
+
+
+@pytest.mark.slow
+def test_real_renders_have_the_bytes_of_a_local_run(tmp_path):
+    words = ["render-data", "--preset", "smoke", "--set", "data.size=32", "--set", "data.spp=4"]
+    assert cli.main([*words, "--out", str(tmp_path / "a")]) == 0
+    assert cli.main([*words, "--out", str(tmp_path / "b"), "--cluster", "local:2"]) == 0
+    assert files(tmp_path / "a" / "data") == files(tmp_path / "b" / "data")
+    a, b = ((tmp_path / name / "data" / "manifest.jsonl").read_bytes() for name in "ab")
+    assert a == b
+
+
+@pytest.mark.slow
+def test_test_scenes_have_the_bytes_of_a_plain_run(tmp_path, capsys):
+    words = ["regenerate", "--shapes", "sphere", "--materials", "chrome,lambertian:0.5", "--set", "test.size=16"]
+    words += ["--set", "test.spp=4"]
+    assert cli.main([*words, "--out", str(tmp_path / "a")]) == 0
+    assert cli.main([*words, "--out", str(tmp_path / "b"), "--cluster", "local:1"]) == 0
+    assert "2 rendered now" in capsys.readouterr().out
+    assert files(tmp_path / "a") == files(tmp_path / "b")
