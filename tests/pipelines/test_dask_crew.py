@@ -264,6 +264,15 @@ def test_mistakes_are_one_line(tmp_path, capsys, monkeypatch, flags, message):
     assert re.search(message, error), error
 
 
+def test_ctrl_c_stays_ours(tmp_path, monkeypatch):
+    pytest.importorskip("dask_jobqueue")
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(link.shutil, "which", lambda command: None)
+    with pytest.raises(InputError, match="no command sbatch here"):
+        link.Link(ClusterChoice(name="slurm", config=ClusterConfig(job={"cores": 1})))
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 @pytest.mark.slow
 def test_real_renders_have_the_bytes_of_a_local_run(tmp_path):
     words = ["render-data", "--preset", "smoke", "--set", "data.size=32", "--set", "data.spp=4"]

@@ -91,7 +91,8 @@ class Link:
                 )  # fmt: skip
         if choice.name in BATCH:
             kind, command = BATCH[choice.name]
-            jobqueue = _module("dask_jobqueue", "dask-jobqueue", "sdps[cluster]")
+            with _undisturbed():  # its import takes Ctrl-C for itself
+                jobqueue = _module("dask_jobqueue", "dask-jobqueue", "sdps[cluster]")
             if shutil.which(command) is None:
                 raise InputError(
                     f"--cluster {choice.name}: no command {command} here; run this where jobs are submitted"
