@@ -32,7 +32,7 @@ def test_the_refined_model_is_the_one_that_was_fitted() -> None:
     state = State(
         normals=normals, log_albedo=np.log(albedo), log_strength=np.log(strength), body=lobes["body"],
         lobes=np.log(np.expm1(lobes["amplitudes"])), log_sharpness=np.log(lobes["sharpness"]), directions=lights,
-        log_intensities=np.zeros((8, 3)),
+        log_intensities=np.zeros((8, 3)), whiteness=0.0,
     )  # fmt: skip
     tensors = State(*(torch.as_tensor(np.asarray(part), dtype=torch.float64) for part in state))
     images = torch.as_tensor(made)  # (P, 3, L)

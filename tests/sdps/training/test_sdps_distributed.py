@@ -64,6 +64,7 @@ def test_two_processes_give_the_losses_of_one(folder: Path, tmp_path: Path) -> N
         assert float((tensor - weights[1][name]).abs().max()) < 2e-3, name
 
 
+@pytest.mark.slow
 def test_accumulation_and_another_number_of_processes_keep_the_batch(folder: Path, tmp_path: Path) -> None:
     """Four parts of one scene in one process, for all steps, or for two and then two parts in each of two processes."""
     alone = run(folder, tmp_path / "one", 1, accumulate=4, schedule="constant")
