@@ -12,6 +12,7 @@ from sdps.methods.parse import parse
 from sdps.methods.runner import Runner
 from sdps.refinement.fused import data_term
 from sdps.refinement.image_model import LOBES, State, difference, factors
+from sdps.refinement.modes import MODES
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.refined import Refined
 
@@ -78,6 +79,7 @@ def random_state(pixels: int, lights: int, seed: int = 0) -> tuple[State, torch.
         torch.randn(pixels, 3) * 0.5 + front, torch.randn(pixels, 3) * 0.3 - 1.0, torch.randn(pixels) * 0.3,
         torch.tensor([-0.8, 0.6, -0.5, -1.2]), torch.randn(LOBES), torch.linspace(5.7, 2.3, LOBES),
         torch.randn(lights, 3) * 0.5 + front, torch.randn(lights, 3) * 0.2, torch.tensor(0.3),
+        torch.zeros(MODES),
     )  # fmt: skip
     return state, torch.rand(pixels, 3, lights), (torch.rand(pixels, lights) > 0.1).float()
 
@@ -92,7 +94,7 @@ def test_the_fused_term_and_its_gradient_are_those_of_the_plain_one() -> None:
     fast.backward()
     assert float(fast.detach()) == pytest.approx(float(slow.detach()), rel=1e-5)
     for name, one, other in zip(State._fields, plain, fused, strict=True):
-        if name == "whiteness":  # not in the term: it is searched, not descended
+        if name in ("whiteness", "modes"):  # not in the term: they are searched, not descended
             continue
         scale = float(one.grad.abs().max())
         assert float((one.grad - other.grad).abs().max()) < 1e-4 * scale, name
