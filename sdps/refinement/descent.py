@@ -29,8 +29,6 @@ RATES = {
 _LEAST_RATE = 0.02
 _TRIED_EVERY, _TRIED, _WHITEST = 20, 0.05, 0.95
 """Iterations after which other albedos of the brightest parts are tried, by how much they differ, and the largest."""
-_MODES_FROM = 0.4
-"""Part of the iterations from which modes are fitted: before, they explain what wrong normals and lights do."""
 _PART = 4096  # pixels worked on at once
 _FITS, _MISFITS = 0.01, 0.03
 """A data term of a model that fits, and one of a model that does not; start and end of the trust in the start."""
@@ -138,7 +136,7 @@ def solve(
         adam.zero_grad(set_to_none=True)
         made = factors(state)
         if number % _TRIED_EVERY == 0:
-            images = _explained(problem, state, made, free if part >= _MODES_FROM else free - {"modes"})
+            images = _explained(problem, state, made, free)
         loss = data_term(made, images, problem.kept)
         misfit = min(max((float(loss.detach()) - _FITS) / (_MISFITS - _FITS), 0.0), 1.0)
         held = weights.near * misfit + weights.dark * faint  # (P,)
