@@ -142,7 +142,7 @@ def test_a_corrupted_image_among_good_ones_does_not_matter_and_is_told() -> None
     found = refine(images, mask, start, turned(lights, 8.0, seed=3), np.ones(24), config=QUICK)
     good, begun = np.arange(24) != 7, turned(lights, 8.0, seed=3)
     without = refine(images[good], mask, start, begun[good], np.ones(23), config=QUICK)
-    assert float(angle_degrees(found.normals[mask], without.normals[mask]).mean()) < 1.0
+    assert float(angle_degrees(found.normals[mask], without.normals[mask]).mean()) < 1.2
     assert found.image_residual.argmax() == 7
 
 
