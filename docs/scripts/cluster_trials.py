@@ -51,9 +51,12 @@ def kills(times: int, seed: int) -> int:
         for number in range(times):
             folder = Path(temporary) / f"run-{number}"
             done = killed_run(preset, folder, rng)
-            good = done == len(scenes) and content(folder) == expected and listed_once(folder, scenes)
-            bad += not good
-            said = "the bytes of the local run" if good else "DIFFERS"
+            found = content(folder)
+            wrong = [name for name in sorted(expected | found) if found.get(name) != expected.get(name)]
+            if not listed_once(folder, scenes):
+                wrong.append("ledger")
+            bad += bool(wrong)
+            said = f"DIFFERS ({', '.join(wrong)})" if wrong else "the bytes of the local run"
             sys.stdout.write(f"run {number + 1}: {done} of {len(scenes)} scenes, {said}\n")
             sys.stdout.flush()
     return int(bad > 0)

@@ -127,20 +127,15 @@ class Store:
     def write(self, name: str, data: bytes) -> Stored:
         """Write an object, in place of what is there; its version is left to the next listing."""
         driver, root = self._open()
-        path = f"{root}/{name}"
-        if "file" in driver.protocol:
-            driver.makedirs(path.rpartition("/")[0], exist_ok=True)
-        self._patiently("write", name, lambda: driver.pipe_file(path, data))
+        self._patiently("write", name, lambda: _put(driver, f"{root}/{name}", data))
         self.sent += len(data)
         return Stored(len(data), "")
 
     def create(self, name: str, data: bytes) -> bool:
         """Write an object unless there is one; return whether it was written."""
         driver, root = self._open()
-        if "file" in driver.protocol:
-            driver.makedirs(root, exist_ok=True)
         try:
-            self._patiently("write", name, lambda: driver.pipe_file(f"{root}/{name}", data, mode="create"))
+            self._patiently("write", name, lambda: _put(driver, f"{root}/{name}", data, mode="create"))
         except FileExistsError:
             return False
         return True
@@ -178,6 +173,25 @@ class Store:
                 told = True
             self.stopped.wait(min(pause, left))
             pause = min(2 * pause, 20.0)
+
+
+def _put(driver: Any, path: str, data: bytes, **mode: str) -> None:
+    """Write an object whole or not at all, which a folder does not do by itself.
+
+    Raises:
+        FileExistsError: with mode `create`, there is one.
+    """
+    if "file" not in driver.protocol:
+        driver.pipe_file(path, data, **mode)
+        return
+    folder, _, name = path.rpartition("/")
+    part = f"{folder}/.{name}.{os.getpid()}.part"
+    driver.makedirs(folder, exist_ok=True)
+    try:
+        driver.pipe_file(part, data)
+        (os.link if mode else os.replace)(part, path)
+    finally:
+        Path(part).unlink(missing_ok=True)
 
 
 def _stored(info: dict[str, Any]) -> Stored:
