@@ -11,7 +11,8 @@ from torch.nn.functional import normalize
 
 from render.shared.errors import InputError
 from sdps.refinement.fused import data_term
-from sdps.refinement.image_model import Factors, State, factors
+from sdps.refinement.image_model import DATA_FLOOR, Factors, State, factors
+from sdps.refinement.modes import factor, fitted
 from sdps.refinement.priors import Neighbours, anchor, curl, neighbours, roughness
 
 RATES = {
@@ -28,6 +29,7 @@ RATES = {
 _LEAST_RATE = 0.02
 _TRIED_EVERY, _TRIED, _WHITEST = 20, 0.05, 0.95
 """Iterations after which other albedos of the brightest parts are tried, by how much they differ, and the largest."""
+_PART = 4096  # pixels worked on at once
 _FITS, _MISFITS = 0.01, 0.03
 """A data term of a model that fits, and one of a model that does not; start and end of the trust in the start."""
 
@@ -46,6 +48,7 @@ class Weights(NamedTuple):
             better.
         near: Of how far the normals are from the start, by how badly the model fits: a model that does not describe
             the object's reflectance explains it by wrong normals.
+        dark: The same of pixels that are dark in all images, which tell little, however well the model fits.
     """
 
     smooth: float = 0.005
@@ -56,6 +59,7 @@ class Weights(NamedTuple):
     curl: tuple[float, float] = (0.6, 0.1)
     shift: tuple[float, float] = (10.0, 0.03)
     near: float = 0.15
+    dark: float = 0.1
 
 
 class Problem(NamedTuple):
@@ -69,6 +73,7 @@ class Problem(NamedTuple):
         bounced: (P, 3, L) float32, light that other parts of the object throw on a pixel, as it would be under lights
             of intensity 1 if the brightest parts reflected everything; None where it is left out.
         twice: How much brighter it would be by what bounces again.
+        ready: Bounced light is off the images, and they are divided by G.
     """
 
     mask: np.ndarray
@@ -77,6 +82,7 @@ class Problem(NamedTuple):
     mean: float = 1.0
     bounced: Tensor | None = None
     twice: float = 0.0
+    ready: bool = False
 
     def direct(self, made: Factors, whiteness: float) -> Tensor:  # (P, 3, L)
         """Return the images without the light that bounced, if the brightest parts have this albedo."""
@@ -85,6 +91,13 @@ class Problem(NamedTuple):
         share = whiteness + self.twice * whiteness**2
         found = torch.addcmul(self.images, self.bounced, made.log_intensities.detach().exp().T, value=-share)
         return found.clamp_min_(0.0)
+
+    def explained(self, made: Factors, state: State) -> Tensor:  # (P, 3, L)
+        """Return the images as the term of `fused` takes them: without the light that bounced, over G."""
+        if self.ready:
+            return self.images
+        bent = factor(made.normals.detach(), made.directions.detach(), state.modes)
+        return self.direct(made, float(state.whiteness)) / bent[:, None]
 
 
 def solve(
@@ -115,6 +128,7 @@ def solve(
     state = State(**{name: part.clone().requires_grad_(name in moving) for name, part in state._asdict().items()})
     adam = torch.optim.Adam([{"params": [getattr(state, name)], "base": RATES[name]} for name in sorted(moving)])
     start, begun = normalize(state.directions.detach(), dim=-1), normalize(state.normals.detach(), dim=-1)
+    faint = _faint(problem.images)
     for number in range(iterations):
         part = number / max(iterations - 1, 1)
         for group in adam.param_groups:
@@ -122,14 +136,13 @@ def solve(
         adam.zero_grad(set_to_none=True)
         made = factors(state)
         if number % _TRIED_EVERY == 0:
-            images = _whitened(problem, state, made, "whiteness" in free)
+            images = _explained(problem, state, made, free)
         loss = data_term(made, images, problem.kept)
-        misfit = min(max((float(loss.detach()) - _FITS) / (_MISFITS - _FITS), 0.0), 1.0)
-        loss = loss + weights.near * misfit * (1.0 - (made.normals * begun).sum(dim=1)).mean()
+        held = weights.near * _misfit(float(loss.detach())) + weights.dark * faint  # (P,)
+        loss = loss + (held * (1.0 - (made.normals * begun).sum(dim=1))).mean()
         loss = loss + _priors(state, made, beside, weights, part)
         if "directions" in free:
-            stretch, shift = anchor(state.directions, start)
-            loss = loss + stretch + _falling(weights.shift, part) * shift
+            loss = loss + _lights_prior(state.directions, start, weights, part)
         loss.backward()
         adam.step()
         _unit_length(state, free)
@@ -140,16 +153,31 @@ def solve(
 
 
 @torch.no_grad()
-def _whitened(problem: Problem, state: State, made: Factors, free: bool) -> Tensor:
-    """Return the images without bounced light; move the albedo of the brightest parts to where they fit better."""
-    if problem.bounced is None:
-        return problem.images
-    now = float(state.whiteness)
-    tried = {min(max(now + step, 0.0), _WHITEST) for step in (-_TRIED, 0.0, _TRIED)} if free else {now}
-    shown = {white: problem.direct(made, white) for white in sorted(tried)}
-    best = min(shown, key=lambda white: float(data_term(made, shown[white], problem.kept)))
-    state.whiteness.fill_(best)
-    return shown[best]
+def _explained(problem: Problem, state: State, made: Factors, free: frozenset[str]) -> Tensor:
+    """Move albedo of the brightest parts and modes to where the images fit better; return `Problem.explained`."""
+    if problem.bounced is not None and "whiteness" in free:
+        now = float(state.whiteness)
+        tried = sorted({min(max(now + step, 0.0), _WHITEST) for step in (-_TRIED, 0.0, _TRIED)})
+        states = [state._replace(whiteness=torch.tensor(white)) for white in tried]
+        terms = [float(data_term(made, problem.explained(made, one), problem.kept)) for one in states]
+        state.whiteness.fill_(tried[int(np.argmin(terms))])
+    if "modes" in free:
+        state.modes.copy_(fitted(made, problem.direct(made, float(state.whiteness)), problem.kept))
+    return problem.explained(made, state)
+
+
+def _misfit(data: float) -> float:
+    """Return how badly a model with this data term fits: from 0, well, to 1."""
+    return min(max((data - _FITS) / (_MISFITS - _FITS), 0.0), 1.0)
+
+
+def _faint(images: Tensor) -> Tensor:  # (P,)
+    """Return how little the images tell of a pixel: 1 where it is dark in all, 0 where it is bright."""
+    bright = torch.empty(len(images))
+    for part in range(0, len(images), _PART):
+        squared = images[part : part + _PART] ** 2
+        bright[part : part + _PART] = (squared / (squared + DATA_FLOOR)).mean(dim=(1, 2))
+    return 1.0 - bright
 
 
 def _priors(
@@ -161,6 +189,11 @@ def _priors(
     loss = loss + weights.body * (state.body.pow(2).sum() + 0.01).sqrt()
     gloss = state.log_strength
     return loss + weights.gloss * (roughness(gloss, beside) + weights.gloss_size * (gloss**2).mean())
+
+
+def _lights_prior(directions: Tensor, start: Tensor, weights: Weights, part: float) -> Tensor:
+    stretch, shift = anchor(directions, start)
+    return stretch + _falling(weights.shift, part) * shift
 
 
 def _falling(weight: tuple[float, float], part: float) -> float:

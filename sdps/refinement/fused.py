@@ -257,7 +257,7 @@ def data_term(made: Factors, images: Tensor, kept: Tensor) -> Tensor:
 
     Args:
         made: The model; float32 on the CPU.
-        images: (P, 3, L) float32, I, contiguous.
+        images: (P, 3, L) float32, I / G, contiguous.
         kept: (P, L) float32, 0 where an observation counts for nothing, else 1.
     """
     return _DataTerm.apply(images, kept, *(part.contiguous() for part in made))

@@ -7,13 +7,14 @@ Pixel p, image i, channel c; n unit normal, l unit direction to the light, v = (
     x, y  = 1 - n . l, 1 - n . v                                                        at grazing angles
     o     = (l . v - n . l n . v) / (max(n . l, n . v) if positive, else 1)             towards the light, and away
     S_pi  = s_p sum_k a_k exp(kappa_k (n_p . h_i - 1)) / (l_i . h_i)^2                  spherical Gaussians
-    y_pic = I_pic / e_ic                                                                radiance under equal lights
+    y_pic = I_pic / (e_ic G_pi)                                                         radiance under equal lights
     r_pic = w_pic sqrt((q_pic - y_pic)^2 / (sigma_pic^2 + 0.05) + 1e-4)                 robust difference
     sigma_pic = (rho_pc D_pi + S_pi) max(n_p . l_i, 0.05)                               constant in the gradient
 
 with I divided by its mean over the object, after light that other parts of it throw there is taken off, and e by its
-own mean. w is 0 where a pixel is black although it is lit elsewhere (`shadowed`) or a cast shadow was traced
-(`transport`), 0.15 where it is darker than the model explains by half of sigma (perhaps another shadow), else 1.
+own mean. G is what reflectance of real materials adds (`modes`), constant in the gradient; functions here take I / G.
+w is 0 where a pixel is black although it is lit elsewhere (`shadowed`) or a cast shadow was traced (`transport`), 0.15
+where it is darker than the model explains by half of sigma (perhaps another shadow), else 1.
 """
 
 from typing import NamedTuple
@@ -50,6 +51,7 @@ class State(NamedTuple):
         directions: (L, 3) from the surface to the light, towards unit length.
         log_intensities: (L, 3).
         whiteness: () albedo of the brightest parts, which tells how much light they throw on others.
+        modes: (M,) m of `sdps.refinement.modes`.
     """
 
     normals: Tensor
@@ -61,6 +63,7 @@ class State(NamedTuple):
     directions: Tensor
     log_intensities: Tensor
     whiteness: Tensor
+    modes: Tensor
 
 
 class Factors(NamedTuple):
@@ -123,7 +126,7 @@ def difference(made: Factors, images: Tensor, dark: Tensor) -> Tensor:  # (P, 3,
 
     Args:
         made: The model.
-        images: (P, 3, L), I.
+        images: (P, 3, L), I / G.
         dark: (P, L) bool, observations that count for nothing.
     """
     cosine = made.normals @ made.directions.T  # (P, L)
@@ -146,10 +149,14 @@ def reflectance(made: Factors) -> Tensor:  # (P, 3, L)
 
 def body(made: Factors) -> Tensor:  # (P, L)
     """Return D of the module's text."""
-    light = (made.normals @ made.directions.T).clamp_min(LEAST_COSINE)
-    view = made.normals[:, 2:].clamp_min(LEAST_COSINE)  # (P, 1)
-    x, y = 1.0 - light, 1.0 - view
-    across = made.directions[:, 2] - light * view
-    o = across / torch.where(across > 0.0, torch.maximum(light, view), 1.0)
+    x, y, o = grazing(made.normals, made.directions)
     shapes = torch.stack([x + y, x * y, x**2 + y**2, o])  # (4, P, L)
     return torch.tensordot(made.body, shapes, 1).exp()
+
+
+def grazing(normals: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return x, y and o of the module's text; (P, L), (P, 1) and (P, L)."""
+    light = (normals @ directions.T).clamp_min(LEAST_COSINE)
+    view = normals[:, 2:].clamp_min(LEAST_COSINE)
+    across = directions[:, 2] - light * view
+    return 1.0 - light, 1.0 - view, across / torch.where(across > 0.0, torch.maximum(light, view), 1.0)

@@ -22,6 +22,7 @@ from sdps.core.integration import integrate
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.image_model import LOBES, SHAPES, State, difference, factors, shadowed
+from sdps.refinement.modes import MODES, factor
 from sdps.refinement.refined import Refined
 from sdps.refinement.transport import trace
 
@@ -98,14 +99,14 @@ def refine(
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
     gains = np.broadcast_to(np.reshape(intensities, (len(images), -1)), (len(images), 3))
     values = _gathered(scene)
-    problem = _problem(values, scene.mask, stride, gains)
+    problem = problem_of(values, scene.mask, stride, gains)
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
     free = frozenset(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
     total = before + config.iterations + fine
     with progress_bar(None, total=total, desc="refine", unit="iteration") as bar:
         move = partial(solve, free=free, boost=config.boost, weights=Weights(), after=_advance(bar, total))
-        start = _start(problem, begun, lights, gains)
+        start = start_of(problem, begun, lights, gains)
         if before:
             problem = _traced(problem, move(problem, start, iterations=before), config.bounces)
             start = start._replace(log_albedo=_log_albedo(problem, start))
@@ -147,7 +148,7 @@ def _gathered(scene: ObjectImages) -> np.ndarray:  # (P, 3, L) float32
     return values
 
 
-def _problem(values: np.ndarray, mask: np.ndarray, stride: int, intensities: np.ndarray) -> Problem:
+def problem_of(values: np.ndarray, mask: np.ndarray, stride: int, intensities: np.ndarray) -> Problem:
     """Return the grid of every `stride`-th pixel; at 1 the pixels `values` are divided in place, not copied.
 
     Raises:
@@ -181,7 +182,7 @@ def _parts(count: int) -> list[slice]:
     return [slice(start, min(start + _PART, count)) for start in range(0, count, _PART)]
 
 
-def _start(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> State:
+def start_of(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> State:
     """Return the state that a method's normals and lights begin with."""
     count = len(problem.images)
     state = State(
@@ -194,6 +195,7 @@ def _start(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensitie
         directions=torch.from_numpy(np.array(lights, np.float32)),
         log_intensities=torch.from_numpy(np.log(np.maximum(intensities, 1e-6)).astype(np.float32)),
         whiteness=torch.tensor(_WHITENESS),
+        modes=torch.zeros(MODES),
     )
     state.normals[:, 2].clamp_min_(1e-3)
     return state._replace(log_albedo=_log_albedo(problem, state))
@@ -231,18 +233,19 @@ def _traced(problem: Problem, state: State, bounces: int) -> Problem:
 def _finer(values: np.ndarray, mask: np.ndarray, coarse: Problem, stride: int, state: State) -> tuple[Problem, State]:
     """Return every pixel, and the state there: interpolated between the coarse pixels, with an albedo of its own."""
     made = factors(state)
-    problem = _problem(values, mask, 1, made.log_intensities.exp().numpy())
+    problem = problem_of(values, mask, 1, made.log_intensities.exp().numpy())
     up = _interpolation(coarse.mask, mask, stride)
-    if coarse.bounced is not None:
-        share = (coarse.images - coarse.direct(made, float(state.whiteness))) * (coarse.mean / problem.mean)
-        for number in range(values.shape[2]):
+    normals = up(state.normals.numpy())
+    normals /= normals.norm(dim=1, keepdim=True)
+    share = (coarse.images - coarse.direct(made, float(state.whiteness))) * (coarse.mean / problem.mean)
+    for number in range(values.shape[2]):
+        if coarse.bounced is not None:
             problem.images[:, :, number].sub_(up(share[:, :, number].numpy())).clamp_min_(0.0)
             lit = up(coarse.kept[:, number : number + 1].numpy())[:, 0] > 0.5
             problem.kept[:, number].mul_(lit)
-    normals = up(state.normals.numpy())
-    state = state._replace(
-        normals=normals / normals.norm(dim=1, keepdim=True), log_strength=up(state.log_strength.numpy()[:, None])[:, 0]
-    )
+        problem.images[:, :, number].div_(factor(normals, made.directions[number : number + 1], state.modes))
+    problem = problem._replace(ready=True)
+    state = state._replace(normals=normals, log_strength=up(state.log_strength.numpy()[:, None])[:, 0])
     return problem, state._replace(log_albedo=_log_albedo(problem, state))
 
 
@@ -270,7 +273,7 @@ def _result(scene: ObjectImages, problem: Problem, state: State) -> Refined:
         image[scene.rows, scene.columns][problem.mask] = values.numpy()
         return image
 
-    images = problem.direct(made, float(state.whiteness))
+    images = problem.explained(made, state)
     by_pixel, by_image = torch.empty(len(problem.images)), torch.zeros(len(scene))
     for part in _parts(len(by_pixel)):
         some = made._replace(normals=made.normals[part], albedo=made.albedo[part], strength=made.strength[part])
@@ -283,6 +286,7 @@ def _result(scene: ObjectImages, problem: Problem, state: State) -> Refined:
         intensities=made.log_intensities.exp().numpy(),
         albedo=picture(made.albedo),
         strength=picture(made.strength),
+        modes=state.modes.numpy(),
         body=made.body.numpy(),
         amplitudes=made.amplitudes.numpy(),
         sharpness=made.sharpness.numpy(),

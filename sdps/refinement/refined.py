@@ -18,6 +18,7 @@ class Refined:
         body: (4,) numbers b of the body's reflectance (`sdps.refinement.image_model`); 0 is Lambertian.
         amplitudes: (K,) of the lobes.
         sharpness: (K,) of the lobes.
+        modes: (M,) numbers m of `sdps.refinement.modes`; 0 adds nothing.
         pixel_residual: (H, W) float32, mean robust difference, zero outside the mask.
         image_residual: (L,) float32, the same of each image.
     """
@@ -30,6 +31,7 @@ class Refined:
     body: np.ndarray
     amplitudes: np.ndarray
     sharpness: np.ndarray
+    modes: np.ndarray
     pixel_residual: np.ndarray
     image_residual: np.ndarray
 

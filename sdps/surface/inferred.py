@@ -215,6 +215,7 @@ def _about_refined(diagnostics: dict[str, Any], photos: Photographs) -> dict[str
         "residual": round(float(refined.pixel_residual[mask].mean()), 4),
         "unexplained": [name for name, value in zip(photos.files, residual, strict=True) if value > limit],
         "body": refined.body.round(4).tolist(),
+        "modes": refined.modes.round(4).tolist(),
         "lobes": {"amplitudes": refined.amplitudes.round(4).tolist(), "sharpness": refined.sharpness.round(1).tolist()},
     }
 

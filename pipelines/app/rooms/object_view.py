@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 SIDE = 384
 _MESH_SIDE = 512
 _FULL = 65535
+_LOBES = ("amplitudes", "sharpness", "body", "modes")
 
 
 def write(result: "Inference", folder: Path) -> dict[str, Any]:
@@ -65,7 +66,7 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
 def shading(
     normals: np.ndarray, albedo: np.ndarray, strength: np.ndarray, lobes: dict[str, list[float]], light: np.ndarray
 ) -> np.ndarray:  # (h, w, 3)
-    """Return the radiance under a light of intensity 1: Lambert's law, or the model of `sdps.refinement.image_model`.
+    """Return the radiance under a light of intensity 1: Lambert's law, or the model of `sdps.refinement`.
 
     `static/relight.js` computes the same.
 
@@ -73,7 +74,7 @@ def shading(
         normals: (h, w, 3), zero outside the object.
         albedo: (h, w, 3).
         strength: (h, w) of the highlights.
-        lobes: `amplitudes`, `sharpness` and `body` of a refined object; empty for Lambert's law.
+        lobes: `amplitudes`, `sharpness`, `body` and `modes` of a refined object; empty for Lambert's law.
         light: (3,) unit.
     """
     cosine = np.maximum(normals @ light, 0.0)
@@ -89,9 +90,12 @@ def shading(
     b = lobes["body"]
     body = np.exp(b[0] * (x + y) + b[1] * x * y + b[2] * (x * x + y * y) + b[3] * opposed)
     away = normals @ half - 1.0
+    slant, tilt = x + y, np.maximum(-away, 0.0)
+    terms = [slant * opposed, (1.0 - light[2]) * opposed, slant * x * y, slant * (x - y) ** 2, tilt**2, np.sqrt(tilt)]
+    factor = np.exp(np.clip(sum(m * term for m, term in zip(lobes["modes"], terms, strict=True)), -0.7, 0.7))
     glints = sum(a * np.exp(k * away) for a, k in zip(lobes["amplitudes"], lobes["sharpness"], strict=True))
     shine = strength * glints / max(float(light @ half), 1e-3) ** 2
-    return (albedo * body[..., None] + shine[..., None]) * cosine[..., None]
+    return (albedo * body[..., None] + shine[..., None]) * (cosine * factor)[..., None]
 
 
 def _reflectance(result: "Inference") -> tuple[np.ndarray, np.ndarray, dict[str, list[float]]]:
@@ -99,7 +103,7 @@ def _reflectance(result: "Inference") -> tuple[np.ndarray, np.ndarray, dict[str,
     found = result.estimate.diagnostics
     refined = found.get("refined")
     if refined is not None and not found["trust"].doubt:
-        lobes = {name: getattr(refined, name).astype(float).tolist() for name in ("amplitudes", "sharpness", "body")}
+        lobes = {name: getattr(refined, name).astype(float).tolist() for name in _LOBES}
         return refined.albedo, refined.strength, lobes
     albedo = result.albedo
     if albedo is None:

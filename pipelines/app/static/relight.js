@@ -82,7 +82,7 @@ export class Reflectance {
     const image = context.createImageData(width, height), data = image.data;
     const [lx, ly, lz] = light, refined = Boolean(lobes.body);
     const [hx, hy, hz] = refined ? half(light) : [0, 0, 1], spread = refined ? 1 / Math.max(lx * hx + ly * hy + lz * hz, 1e-3) ** 2 : 0;
-    const glints = refined ? table(lobes) : null, b = lobes.body;
+    const glints = refined ? table(lobes) : null, b = lobes.body, m = lobes.modes;
     const peak = this.view.albedo / 65535, shine = this.view.strength / 65535, n = this.normals, a = this.albedo;
     for (let p = 0, i = 0; i < width * height; i++, p += 3) {
       data[4 * i + 3] = 255;
@@ -93,8 +93,11 @@ export class Reflectance {
         const lit = Math.max(cosine, 0.02), seen = Math.max(nz, 0.02), x = 1 - lit, y = 1 - seen;
         let opposed = lz - lit * seen;
         if (opposed > 0) opposed /= Math.max(lit, seen);
-        body = Math.exp(b[0] * (x + y) + b[1] * x * y + b[2] * (x * x + y * y) + b[3] * opposed);
-        gloss = shine * this.strength[i] * glints[Math.min(4095, Math.max(0, 4095 * (nx * hx + ny * hy + nz * hz)) | 0)] * spread;
+        const near = nx * hx + ny * hy + nz * hz, s = x + y, t = Math.max(1 - near, 0);
+        const g = m[0] * s * opposed + m[1] * (1 - lz) * opposed + m[2] * s * x * y + m[3] * s * (x - y) ** 2 + m[4] * t * t + m[5] * Math.sqrt(t);
+        const factor = Math.exp(Math.min(0.7, Math.max(-0.7, g)));
+        body = factor * Math.exp(b[0] * s + b[1] * x * y + b[2] * (x * x + y * y) + b[3] * opposed);
+        gloss = factor * shine * this.strength[i] * glints[Math.min(4095, Math.max(0, 4095 * near) | 0)] * spread;
       }
       for (let c = 0; c < 3; c++) data[4 * i + c] = coded((peak * a[p + c] * body + gloss) * cosine);
     }
