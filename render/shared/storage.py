@@ -10,6 +10,7 @@ import hashlib
 import logging
 import os
 import re
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -27,6 +28,7 @@ _VERSIONS = ("ETag", "etag", "generation", "md5Hash", "mtime", "LastModified", "
 _DRIVERS = {"botocore", "aiobotocore", "aiohttp", "google", "gcsfs", "azure", "requests", "urllib3"}
 """Packages whose errors tell of the connection or the store; errors of others are defects."""
 _OPTIONS = {"s3": {"max_concurrency": 1}}  # else every read begins with a request for the size
+_INSTALL = {"s3": "sdps[storage]", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
 _HOPELESS = {errno.EINVAL, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EROFS}
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -86,7 +88,9 @@ class Store:
 
             return url_to_fs(self.url, **_OPTIONS.get(self.url.partition(":")[0], {}))
         except ImportError as error:
-            raise InputError(f"{self.url}: {error}; pip install 'sdps[storage]', or the driver it names") from error
+            python = f"{sys.executable} -m " if sys.executable else ""
+            driver = _INSTALL.get(self.url.partition(":")[0], _INSTALL["s3"])
+            raise InputError(f"{self.url}: needs a driver: {python}pip install '{driver}'") from error
         except ValueError as error:
             raise InputError(f"{self.url}: {error}; use s3://, gs://, az:// or https://") from error
 
