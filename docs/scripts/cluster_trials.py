@@ -1,11 +1,13 @@
-"""Trials of `--cluster`: workers killed while they render, and how much one client and one scheduler carry.
+"""Trials of `--cluster`: workers or the scheduler killed while scenes render, and what one client and scheduler carry.
 
     python docs/scripts/cluster_trials.py kills --times 10
+    python docs/scripts/cluster_trials.py schedulers --times 10
     python docs/scripts/cluster_trials.py plan --chunks 20000
     python docs/scripts/cluster_trials.py load --slots 1000 --seconds 5 --bytes 2000000 --chunks 4000
 
 `kills` renders a tiny preset on two workers, kills one (-9) at a random moment of the rendering, and compares manifest
-and shards with an undisturbed local run. `load` has tasks that sleep instead of rendering and return random bytes.
+and shards with an undisturbed local run. `schedulers` kills the scheduler instead, and starts it and its workers anew
+three seconds later. `load` has tasks that sleep instead of rendering and return random bytes.
 `plan` tells what a scene of 64 lights takes in the manifest and in the memory of who reads it.
 """
 
@@ -14,11 +16,14 @@ import contextlib
 import os
 import random
 import signal
+import socket
+import subprocess
 import sys
 import tempfile
 import threading
 import time
 import tracemalloc
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import distributed
@@ -40,8 +45,8 @@ from render.running.supervisor import render_supervised
 TINY = ["data.size=32", "data.spp=16", "data.light_count=8", "data.materials_per_view=4", "data.views=1"]
 
 
-def kills(times: int, seed: int) -> int:
-    """Kill a worker in each of several runs; return 1 if one of them differs from the local run."""
+def kills(times: int, seed: int, disturbed: Callable[[presets.Preset, Path, random.Random], int]) -> int:
+    """Disturb each of several runs; return 1 if one of them differs from the local run."""
     rng, preset, bad = random.Random(seed), presets.load("smoke", TINY), 0
     with tempfile.TemporaryDirectory() as temporary:
         plain = Path(temporary) / "plain"
@@ -50,10 +55,13 @@ def kills(times: int, seed: int) -> int:
         expected = content(plain)
         for number in range(times):
             folder = Path(temporary) / f"run-{number}"
-            done = killed_run(preset, folder, rng)
-            good = done == len(scenes) and content(folder) == expected and listed_once(folder, scenes)
-            bad += not good
-            said = "the bytes of the local run" if good else "DIFFERS"
+            done = disturbed(preset, folder, rng)
+            found = content(folder)
+            wrong = [name for name in sorted(expected | found) if found.get(name) != expected.get(name)]
+            if not listed_once(folder, scenes):
+                wrong.append("ledger")
+            bad += bool(wrong)
+            said = f"DIFFERS ({', '.join(wrong)})" if wrong else "the bytes of the local run"
             sys.stdout.write(f"run {number + 1}: {done} of {len(scenes)} scenes, {said}\n")
             sys.stdout.flush()
     return int(bad > 0)
@@ -79,6 +87,57 @@ def killed_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
         assert moments, "the run ended before a worker was killed; give it more scenes"
         killer.join()
     return summary.done
+
+
+def restarted_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
+    """Render while the scheduler is killed and, with its workers, started again; return how many scenes are done."""
+    scenes = planned_scenes(preset, folder)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+    with contextlib.ExitStack() as first, contextlib.ExitStack() as second:
+        (scheduler, *_) = first.enter_context(processes(address))
+        moments = []
+
+        def kill() -> None:
+            with distributed.Client(address, set_as_default=False) as client:
+                while not any(client.run(busy).values()):
+                    time.sleep(0.1)
+            time.sleep(rng.uniform(0.5, 4.0))
+            scheduler.kill()
+            moments.append(time.monotonic())
+            time.sleep(3.0)
+            second.enter_context(processes(address))
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        with dask_crew.crew_on(ClusterChoice(name=address), folder) as crew:
+            summary = render_supervised(scenes, folder, crew=crew)
+        assert moments, "the run ended before the scheduler was killed; give it more scenes"
+        killer.join()
+    return summary.done
+
+
+@contextlib.contextmanager
+def processes(address: str) -> Iterator[list["subprocess.Popen[bytes]"]]:
+    """Start a scheduler and two workers as an operator would; yield the processes, and end them."""
+    words = (["scheduler", "--port", address.rpartition(":")[2]], *[["worker", address, "--nthreads", "1"]] * 2)
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *part, "--no-dashboard"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for part in words
+    ]
+    try:
+        with distributed.Client(address, timeout=60, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+        yield started
+    finally:
+        for process in started:
+            process.terminate()
+            process.wait()
 
 
 def busy(dask_worker: distributed.Worker) -> bool:
@@ -173,7 +232,7 @@ def cluster(processes: int, threads: int):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("trial", choices=("kills", "load", "plan"))
+    parser.add_argument("trial", choices=("kills", "schedulers", "load", "plan"))
     parser.add_argument("--times", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--slots", type=int, default=1000)
@@ -181,8 +240,8 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--bytes", type=int, default=2_000_000)
     flags = parser.parse_args()
-    if flags.trial == "kills":
-        sys.exit(kills(flags.times, flags.seed))
+    if flags.trial in ("kills", "schedulers"):
+        sys.exit(kills(flags.times, flags.seed, killed_run if flags.trial == "kills" else restarted_run))
     if flags.trial == "plan":
         sys.exit(plan(flags.chunks))
     sys.exit(load(flags.slots, flags.chunks, flags.seconds, flags.bytes))
