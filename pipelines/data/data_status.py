@@ -87,7 +87,7 @@ def scene_ids(folder: Path) -> list[str]:
         data = path.read_bytes()
     except OSError as error:
         raise no_manifest(folder) from error
-    found = [name.decode() for name in _ID.findall(data)]
+    found = [name.decode(errors="replace") for name in _ID.findall(data)]
     if len(found) == data.count(b"\n"):
         return found
     return [scene.id for scene in read_manifest(folder)]  # written by other means

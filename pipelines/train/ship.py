@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipelines.shared import presets
 from render.shared.errors import InputError
-from render.shared.files import read_bytes, write_text
+from render.shared.files import read_text, write_text
 from sdps.methods import pretrained
 from sdps.training import recipes
 
@@ -59,6 +59,6 @@ def ship(names: Sequence[str], out: Path, folder: Path) -> list[tuple[str, int]]
         kept = folder / f"{name}.safetensors"
         save_weights(kept, load_weights(file), half=True)
         write_model_card(kept.with_suffix(".md"), file, out / "data", shipped=kept)
-        write_text(kept.with_suffix(".jsonl"), read_bytes(file.parent / METRICS).decode())
+        write_text(kept.with_suffix(".jsonl"), read_text(file.parent / METRICS))
         written.append((name, kept.stat().st_size))
     return written

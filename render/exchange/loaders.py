@@ -12,6 +12,7 @@ from render.exchange.foreign_samples import Note, Source, read_mask, read_stack
 from render.exchange.read_diligent import diligent_sources
 from render.exchange.read_psfcn import psfcn_sources
 from render.shared.errors import InputError
+from render.shared.files import read_text
 from render.shared.images import MASK_THRESHOLD, bit_depth, decode_normals, read_image, to_unit
 from render.shared.tables import check_directions, natural_key, read_names, read_numbers
 
@@ -106,7 +107,10 @@ def _diligent_pictures(source: Source, note: Note) -> Pictures:
     truth = source.truth()
     text = source.folder / "normal.txt"
     if text.is_file() and truth.origin.name == "Normal_gt.mat":
-        numbers = np.array(text.read_text(encoding="utf-8").split(), np.float64)
+        try:
+            numbers = np.array(read_text(text).split(), np.float64)
+        except ValueError:
+            numbers = np.zeros(0)  # a word that is no number
         if numbers.size != truth.normals.size or (np.abs(numbers - truth.normals.ravel()) > 1e-4).any():
             note(f"{text}: differs from Normal_gt.mat; write it row by row, x y z, top row first")
     images, _ = source.stack(truth.mask.shape)

@@ -5,6 +5,7 @@ readers skip. Every run writes a ledger of its own; several machines may fill on
 """
 
 import json
+import math
 import os
 import socket
 from collections.abc import Collection, Iterator, Sequence
@@ -82,9 +83,20 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def read_runs(folder: Path) -> list[list[dict[str, Any]]]:
-    """Return the ledger lines of every run that finished a shard."""
-    runs = (list(read_events(path)) for path in sorted((folder / LOG).glob("done-*.jsonl")))
+    """Return the ledger lines of every run that finished a shard; a damaged line counts as torn."""
+    paths = sorted((folder / LOG).glob("done-*.jsonl"))
+    runs = ([line for line in read_events(path) if _is_finished(line)] for path in paths)
     return [lines for lines in runs if lines]
+
+
+def _is_finished(line: dict[str, Any]) -> bool:
+    """Tell whether a line has a time of a known zone, and numbers where it must."""
+    try:
+        zone = datetime.fromisoformat(line["time"]).tzinfo
+    except ValueError:
+        return False
+    numbers = (line.get("seconds"), line.get("bytes"))
+    return zone is not None and all(isinstance(value, int | float) and abs(value) < math.inf for value in numbers)
 
 
 def latest(runs: Sequence[list[dict[str, Any]]]) -> dict[str, dict[str, Any]]:

@@ -214,6 +214,8 @@ def read_failed(folder: Path) -> dict[str, list[dict[str, Any]]]:
     """Return all recorded failures by scene id, oldest first; some of these scenes may be done by now."""
     failures: dict[str, list[dict[str, Any]]] = {}
     for line in read_events(folder / FAILED):
+        if not isinstance(line.get("reason"), str):
+            continue  # damaged: it happens again
         failures.setdefault(line["id"], []).append(line)
     return failures
 

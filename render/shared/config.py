@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import yaml
 
 from render.shared.errors import InputError, unknown
-from render.shared.files import read_text
+from render.shared.files import check_digits, read_text
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -76,6 +76,7 @@ def parse_yaml(text: str, where: str) -> Any:
         InputError: not YAML, with its line.
     """
     try:
+        check_digits(text)
         return yaml.safe_load(text)
     # The library lets through what its conversions raise: ValueError of dates, KeyError of `!!bool maybe`, and
     # RecursionError of lists in lists.

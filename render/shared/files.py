@@ -12,6 +12,9 @@ from typing import Any
 
 from render.shared.errors import InputError
 
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+_DIGITS = re.compile(r"[0-9a-fA-F_:]+")
+_LONG_NUMBER = re.compile(r"[0-9a-fA-F_:]{256}")
 _PLAIN_NAME = re.compile(r"(?!\.)[^/\\\0-\x1f\x7f]{1,200}")
 
 
@@ -109,8 +112,8 @@ def read_bytes(path: str | Path, missing: str = "no such file") -> bytes:
         return Path(path).read_bytes()
     except FileNotFoundError as error:
         raise InputError(f"{path}: {missing}") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (OSError, ValueError) as error:  # a path may hold a zero
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', '') or error})") from error
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -129,14 +132,30 @@ def write_jsonl(path: str | Path, rows: list[dict[str, Any]]) -> None:
     write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
 
 
-def parse_json(text: str) -> Any:
-    """Parse JSON, with one kind of error: numbers of thousands of digits and lists in lists without end have others.
+def check_digits(text: str) -> None:
+    """Refuse text with a number that no float can hold; it would end in an `OverflowError` wherever it is used.
 
     Raises:
-        ValueError: not JSON.
+        ValueError: there are 256 digits, decimal or hexadecimal, in a row.
     """
+    # A run of 256 covers a whole block of 128; most blocks are left at their first letter.
+    if any(_DIGITS.fullmatch(text, at, at + 128) for at in range(0, len(text), 128)) and _LONG_NUMBER.search(text):
+        raise ValueError("a number of more than 255 digits")
+
+
+def parse_json(text: str) -> Any:
+    """Parse JSON, with one kind of error: numbers of hundreds of digits and lists in lists without end have others.
+
+    Raises:
+        ValueError: not JSON, a number beyond those of floating point, or text that no file can hold (one half of a
+            surrogate pair).
+    """
+    check_digits(text)
     try:
-        return json.loads(text)
+        value = json.loads(text)
+        if _SURROGATE.search(text):
+            json.dumps(value, ensure_ascii=False).encode()
+        return value
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
 
@@ -199,7 +218,7 @@ def read_text(path: str | Path) -> str:
         return Path(path).read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:  # of the text, or of a zero in the path
         raise InputError(f"{path}: cannot be read as text ({error})") from error
 
 

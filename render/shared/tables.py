@@ -14,9 +14,11 @@ UNIT_TOLERANCE = 0.01
 
 
 def natural_key(text: str) -> list[tuple[int, int, str]]:
-    """Return a sorting key by which `9.png` comes before `10.png`."""
+    """Return a sorting key by which `9.png` comes before `10.png`; numbers may have any length."""
     parts = re.split(r"([0-9]+)", text)
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts if part]
+    digits = [part.lstrip("0") if part.isascii() and part.isdigit() else None for part in parts]
+    return [(1, 0, part) if number is None else (0, len(number), number)
+            for part, number in zip(parts, digits, strict=True) if part]  # fmt: skip
 
 
 def format_rows(rows: np.ndarray, decimals: int = 8) -> list[str]:

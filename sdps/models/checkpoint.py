@@ -5,6 +5,7 @@ Neither file can execute code when loaded, and neither is ever half-written.
 
 import json
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,7 @@ from torch import nn
 from render.shared.config import build
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
-from render.shared.files import atomic_path, source_digest
+from render.shared.files import atomic_path, parse_json, source_digest
 from sdps.data.augment import Augmentation
 from sdps.models import registry
 
@@ -116,19 +117,30 @@ def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedM
     damaged = next((key for key, tensor in tensors.items() if not torch.isfinite(tensor).all()), None)
     if damaged is not None:
         raise InputError(f"{path}: {damaged} has values that are infinite or NaN; copy or train it again")
-    network = registry.create(name, **options)
     try:
-        network.load_state_dict(tensors)
-    except RuntimeError as error:
-        detail = " ".join(str(error).split())[:160]
-        raise InputError(f"{path}: weights do not fit {name!r} ({detail}); train it again") from error
+        with torch.device("meta"):  # shapes only: options may ask for terabytes
+            wanted = registry.create(name, **options).state_dict()
+    except Exception as error:  # whatever a network's layers raise at values of any kind
+        raise InputError(f"{path}: damaged header ({error}); copy or train it again") from error
+    misfit = next((key for key in wanted.keys() | tensors.keys() if _shape(wanted, key) != _shape(tensors, key)), None)
+    if misfit is not None:
+        detail = f"{misfit}: {_shape(tensors, misfit)}, not {_shape(wanted, misfit)}"
+        raise InputError(f"{path}: weights do not fit {name!r} ({detail}); train it again")
+    network = registry.create(name, **options)
+    network.load_state_dict(tensors)
     return TrainedModel(name, network.eval(), options, metadata)
+
+
+def _shape(tensors: Mapping[str, torch.Tensor], name: str) -> tuple[int, ...] | None:
+    return tuple(tensors[name].shape) if name in tensors else None
 
 
 def _described(path: str | Path, header: dict[str, str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Return model name, options and metadata of a file's header, or refuse it."""
     try:
-        name, options, metadata = header["model"], json.loads(header["options"]), json.loads(header["metadata"])
+        name, options, metadata = header["model"], parse_json(header["options"]), parse_json(header["metadata"])
+        if not isinstance(options, dict):
+            raise TypeError("options: must be a mapping")
         build(Augmentation, metadata["config"]["augmentation"], "augmentation")
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: damaged header ({error}); copy or train it again") from error

@@ -15,6 +15,7 @@ from typing import Any
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
 from render.records.shards import file_hash
 from render.shared.config import read_yaml
+from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import read_text, write_text
 from render.shared.templates import fill
@@ -56,8 +57,14 @@ def write_model_card(
 
 def render_card(weights: str | Path, data: str | Path | None = None, shipped: str | Path | None = None) -> str:
     """Compose the card; see `write_model_card`."""
-    weights, copy = Path(weights), Path(shipped or weights)
     model = load_weights(weights)
+    with decoding(weights, "weights that tell how they were trained", "train them again"):
+        return _composed(model, Path(weights), data, shipped)
+
+
+def _composed(model: TrainedModel, weights: Path, data: str | Path | None, shipped: str | Path | None) -> str:
+    """Fill the template."""
+    copy = Path(shipped or weights)
     metadata, config, entry = model.metadata, model.metadata["config"], registry.entry(model.name)
     metrics = weights.parent / _METRICS
     rows = read_metrics(metrics) if metrics.is_file() and metrics.stat().st_size else []

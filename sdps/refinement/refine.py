@@ -40,7 +40,7 @@ CACHE_BYTES = 2**30
 
 @dataclass(frozen=True, kw_only=True)
 class RefineConfig:
-    """How an object is refined. The defaults were chosen on DiLiGenT's ball, buddha, cow and pot2.
+    """How an object is refined. How the defaults were chosen: docs/studies/refinement.md.
 
     Attributes:
         coarse_pixels: Pixels of the coarse grid, about.

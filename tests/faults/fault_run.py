@@ -1,8 +1,8 @@
 """Stop long commands at random moments, go on, and compare the results with those of a run left alone: `make faults`.
 
-Each command is started again and again and meets a fault drawn from the seed: kill -9, SIGTERM, or a limit on the size
-of files, which acts as a full disk. Then it runs once to its end. What it promises to repeat must be there byte by
-byte, and no temporary file may be left.
+Each command is started again and again and meets one fault after another at moments drawn from the seed; `FAULTS` says
+which. Then it runs once to its end. What it promises to repeat must be there byte by byte, weights within `TOLERANCE`,
+no file may be missing, and no temporary file may be left.
 """
 
 import argparse
@@ -17,11 +17,21 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
-FAULTS = ("kill -9", "SIGTERM", "full disk")
+FAULTS = {
+    "kill -9": "the process alone is killed; its children must end by themselves",
+    "SIGTERM": "as a queue ends a job",
+    "SIGINT twice": "Ctrl-C, and again 0.3 s later, to the whole group of processes",
+    "full disk": "a limit on the size of files, there from the beginning",
+    "folder vanishes": "the output folder is renamed; it comes back when the command has ended",
+    "two at once": "the same command is started twice on one folder, and both run to their ends",
+    "clock set back": "killed; what is there is then dated a day ahead, as a clock that is set back leaves it",
+}
+TOLERANCE = 1e-6  # largest difference of weights
 SMALL = ["--preset", "smoke", "--set", "data.size=16", "--set", "data.spp=1", "--set", "data.light_count=4"]
 
 
@@ -46,6 +56,10 @@ JOBS: dict[str, Job] = {
                                       str(out / "tree")], ("tree/**/*.png", "tree/**/*.txt"), "render"),
     "train": Job(lambda out, given: ["train", *SMALL, "--data", str(given / "data"), "--out", str(out)],
                  ("**/manifest.jsonl",), "render"),
+    "ship": Job(lambda out, given: ["ship", "--preset", "smoke", "--out", str(given), "--into", str(out / "weights")],
+                ("weights/*.*",), "train"),
+    "import": Job(lambda out, given: ["data", "import", str(given / "tree"), "--layout", "psfcn", "--out",
+                                      str(out / "data")], ("data/manifest.jsonl", "data/shards/*.exr"), "export"),
     "train --stream": Job(lambda out, _: ["train", *SMALL, "--stream", "--out", str(out)], ()),
     "evaluate": Job(lambda out, _: ["eval-classical", "--out", str(out), "--preset", "smoke"], ()),
     "infer": Job(lambda out, _: ["infer", "--self-test", "--method", "pf14", "--out", str(out)], ()),
@@ -66,19 +80,46 @@ def start(words: list[str], fault: str, rng: random.Random) -> subprocess.Popen[
     )  # fmt: skip
 
 
-def disturbed(words: list[str], fault: str, seconds: float, rng: random.Random) -> dict[str, Any]:
-    """Run a command into one fault; of `kill -9` its children, orphans then, must end by themselves."""
-    process = start(words, fault, rng)
+def disturbed(words: list[str], fault: str, seconds: float, rng: random.Random, folder: Path) -> dict[str, Any]:
+    """Run a command that writes into `folder` into one fault, and tell how it ended."""
+    patience = 120 + 4 * seconds
+    processes = [start(words, fault, rng) for _ in range(1 + (fault == "two at once"))]
+    away = folder.with_name(f"{folder.name}-away")
     try:
-        if fault != "full disk":
+        if fault not in ("full disk", "two at once"):
             time.sleep(rng.uniform(0.0, seconds))
-            process.send_signal(signal.SIGKILL if fault == "kill -9" else signal.SIGTERM)
-        _, said = process.communicate(timeout=120 + 4 * seconds)
+            _strike(processes[0], fault, folder, away)
+        said = b"".join(process.communicate(timeout=patience)[1] for process in processes)
         hung = False
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        said, hung = process.communicate()[1], True
-    return {"code": process.returncode, "hang": hung, "traceback": b"Traceback" in said and fault != "kill -9"}
+        for process in processes:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+        said, hung = b"".join(process.communicate()[1] for process in processes), True
+    if away.exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        away.rename(folder)
+    if fault == "clock set back":
+        ahead = time.time() + 86_400
+        for path in folder.rglob("*"):
+            os.utime(path, (ahead, ahead))
+    broken = b"Traceback" in said and fault not in ("kill -9", "clock set back")
+    last = said.decode(errors="replace").strip().rsplit("\n", 1)[-1][-300:]
+    return {"code": [process.returncode for process in processes], "hang": hung, "traceback": broken, "said": last}
+
+
+def _strike(process: subprocess.Popen[bytes], fault: str, folder: Path, away: Path) -> None:
+    """Do to a running command what the fault is."""
+    if fault == "folder vanishes":
+        with suppress(FileNotFoundError):
+            folder.rename(away)
+    elif fault == "SIGINT twice":
+        for _ in range(2):
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGINT)
+            time.sleep(0.3)
+    else:
+        process.send_signal(signal.SIGTERM if fault == "SIGTERM" else signal.SIGKILL)
 
 
 def digests(folder: Path, patterns: tuple[str, ...]) -> dict[str, str]:
@@ -100,23 +141,73 @@ def finished(words: list[str]) -> tuple[int, float]:
     return process.returncode, time.monotonic() - begun
 
 
-def trial(name: str, out: Path, kills: int, seed: int) -> Iterator[dict[str, Any]]:
-    """Disturb one job `kills` times, let it end, and yield a line per fault and one at the end."""
-    job, given = JOBS[name], out / JOBS[name].needs.replace(" ", "") / "whole"
-    whole, broken = (out / name.replace(" ", "") / kind for kind in ("whole", "broken"))
-    seconds = 20.0
-    if not whole.exists():
-        code, seconds = finished(job.words(whole, given))
+def weights_differ(whole: Path, broken: Path) -> float:
+    """Return the largest difference of any weight of the runs of two folders; missing files differ endlessly."""
+    from safetensors.numpy import load_file
+
+    largest = 0.0
+    for path in whole.glob("**/*.safetensors"):
+        other = broken / path.relative_to(whole)
+        if not other.is_file():
+            return float("inf")
+        mine, yours = load_file(path), load_file(other)
+        largest = max([largest, *(float(abs(mine[name] - yours[name]).max(initial=0.0)) for name in mine)])
+    return largest
+
+
+def names(folder: Path) -> set[str]:
+    """Return the names of all files but ledgers, of which every run writes its own."""
+    found = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    return {str(path) for path in found if "log" not in path.parts}
+
+
+def whole(name: str, out: Path) -> tuple[Path, float]:
+    """Return the folder of a job's undisturbed run, made where it is not there, and its seconds."""
+    job, folder = JOBS[name], out / name.replace(" ", "") / "whole"
+    told = folder.with_name("seconds.json")
+    given = whole(job.needs, out)[0] if job.needs else out
+    if not told.is_file():
+        shutil.rmtree(folder, ignore_errors=True)
+        code, seconds = finished(job.words(folder, given))
         if code != 0:
             raise SystemExit(f"{name}: the undisturbed run ended with {code}")
+        told.write_text(json.dumps(seconds))
+    return folder, json.loads(told.read_text())
+
+
+def trial(name: str, out: Path, kills: int, seed: int, until: float = float("inf")) -> Iterator[dict[str, Any]]:
+    """Disturb a job `kills` times or until a time is over, let it end; yield a line per fault and one at the end."""
+    job = JOBS[name]
+    sound, seconds = whole(name, out)
+    broken, given = sound.with_name("broken"), whole(job.needs, out)[0] if job.needs else out
     shutil.rmtree(broken, ignore_errors=True)
     rng = random.Random(f"{seed}/{name}")
     for number in range(kills):
-        fault = FAULTS[number % len(FAULTS)]
-        yield {"job": name, "fault": fault, **disturbed(job.words(broken, given), fault, seconds, rng)}
+        if time.monotonic() > until:
+            break
+        fault = list(FAULTS)[number % len(FAULTS)]
+        row = {"job": name, "fault": fault, **disturbed(job.words(broken, given), fault, seconds, rng, broken)}
+        yield row
+        if not any(row["code"]):
+            shutil.rmtree(broken, ignore_errors=True)  # done: the next fault is to meet work
     code, _ = finished(job.words(broken, given))
-    same = digests(whole, job.kept) == digests(broken, job.kept)
-    yield {"job": name, "fault": "none", "code": code, "same": same, "left": left_over(broken)}
+    same = digests(sound, job.kept) == digests(broken, job.kept)
+    yield {
+        "job": name, "fault": "none", "code": code, "same": same, "left": left_over(broken),
+        "difference": weights_differ(sound, broken), "missing": sorted(names(sound) - names(broken)),
+    }  # fmt: skip
+
+
+def summary(rows: list[dict[str, Any]]) -> tuple[str, bool]:
+    """Return a line about a job, and whether it kept its promises."""
+    end = rows[-1]
+    broken = [row for row in rows[:-1] if row["traceback"] or row["hang"]]
+    good = end["same"] and end["difference"] <= TOLERANCE and not end["missing"]
+    text = (
+        f"{end['job']}: {len(rows) - 1} faults, {len(broken)} tracebacks or hangs; then exit code {end['code']}, "
+        f"{'same' if good else 'OTHER'} results, {len(end['left'])} temporary files\n"
+    )
+    return text, not broken and end["code"] == 0 and good and not end["left"]
 
 
 def main() -> int:
@@ -125,6 +216,7 @@ def main() -> int:
     parser.add_argument("--out", default="out/faults")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--minutes", type=float, default=60.0, help="of faults of one job")
     parser.add_argument("--jobs", default=",".join(JOBS))
     args = parser.parse_args()
     out, bad = Path(args.out).absolute(), 0
@@ -132,17 +224,14 @@ def main() -> int:
     with open(out / "faults.jsonl", "a", encoding="utf-8") as log:
         for name in args.jobs.split(","):
             rows = []
-            for row in trial(name, out, args.kills, args.seed):
+            for row in trial(name, out, args.kills, args.seed, time.monotonic() + 60 * args.minutes):
                 log.write(json.dumps(row) + "\n")
                 log.flush()
                 rows.append(row)
-            end = rows[-1]
-            broken = [row for row in rows[:-1] if row["traceback"] or row["hang"]]
-            bad += bool(broken or end["code"] or not end["same"] or end["left"])
-            sys.stdout.write(
-                f"{name}: {len(rows) - 1} faults, {len(broken)} tracebacks or hangs; then exit code {end['code']}, "
-                f"{'same' if end['same'] else 'OTHER'} bytes, {len(end['left'])} temporary files\n"
-            )
+            text, kept = summary(rows)
+            bad += not kept
+            sys.stdout.write(text)
+            sys.stdout.flush()
     return int(bad > 0)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from data_folders import good_folder, scene_of, sphere_shard
-from fault_run import digests, disturbed, finished, left_over
+from fault_run import FAULTS, digests, disturbed, finished, left_over
 
 from pipelines.cli import main
 from render.records.shards import read_shard, write_shard
@@ -125,8 +125,8 @@ def test_an_export_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_pat
     code, seconds = finished(words[0])
     assert code == 0
     rng = random.Random(0)
-    for fault in ("kill -9", "SIGTERM", "full disk") * 3:
-        found = disturbed(words[1], fault, seconds, rng)
+    for fault in list(FAULTS) * 2:
+        found = disturbed(words[1], fault, seconds, rng, trees[1].parent)
         assert not found["hang"] and not found["traceback"], (fault, found)
     assert finished(words[1])[0] == 0
     assert digests(trees[0], ("**/*.*",)) == digests(trees[1], ("**/*.*",)) and not left_over(trees[1])

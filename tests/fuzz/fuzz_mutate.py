@@ -37,12 +37,14 @@ def mutated(data: bytes, name: str, rng: random.Random) -> bytes:
     """Return another content of the file `name`, at most 1 MiB longer than before."""
     suffix = name.lower().rpartition(".")[2]
     ways: list[Callable[[bytes, random.Random], bytes]] = [_bytes]
-    if suffix in ("json", "jsonl", "yaml", "yml", "gltf"):
+    if suffix in ("json", "jsonl", "yaml", "yml", "gltf", "http"):
         ways += [_words, _values_of(suffix), _values_of(suffix)]
     elif suffix in ("txt", "obj", "off", "csv") or data[:5] in (b"solid", b"ply\nf"):
         ways += [_words, _words]
-    elif suffix == "pt":
+    elif suffix in ("pt", "zip"):
         ways += [_zipped]
+    elif suffix == "safetensors":
+        ways += [_described, _described]
     elif suffix == "argv":
         ways = [_argument]
     result = rng.choice(ways)(data, rng)
@@ -102,7 +104,7 @@ def _values_of(suffix: str) -> Callable[[bytes, random.Random], bytes]:
                 number = rng.randrange(len(lines))
                 lines[number] = json.dumps(_grafted(json.loads(lines[number]), rng))
                 return ("\n".join(lines) + "\n").encode("utf-8", "surrogatepass")
-            if suffix in ("json", "gltf"):
+            if suffix in ("json", "gltf", "http"):
                 return json.dumps(_grafted(json.loads(text), rng)).encode()
             return yaml.safe_dump(_grafted(yaml.safe_load(text), rng)).encode("utf-8", "surrogatepass")
         except (ValueError, yaml.YAMLError, IndexError):
@@ -135,13 +137,31 @@ def _argument(data: bytes, rng: random.Random) -> bytes:
     return json.dumps([*words, text]).encode()
 
 
+def _described(data: bytes, rng: random.Random) -> bytes:
+    """Put a hostile value into the header of a safetensors file, or into the JSON that a text of the header holds."""
+    try:
+        (length,) = struct.unpack_from("<Q", data)
+        header = json.loads(data[8 : 8 + length])
+        told = header["__metadata__"]
+        key = rng.choice(list(told))
+        if rng.random() < 0.8 and told[key].startswith("{"):
+            told[key] = json.dumps(_grafted(json.loads(told[key]), rng))
+        else:
+            header = _grafted(header, rng)
+        text = json.dumps(header).encode()
+    except (ValueError, KeyError, struct.error):
+        return _bytes(data, rng)
+    return struct.pack("<Q", len(text)) + text + data[8 + length :]
+
+
 def _zipped(data: bytes, rng: random.Random) -> bytes:
     """Change one member of a zip archive, and close the archive properly."""
     packed = io.BytesIO()
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive, zipfile.ZipFile(packed, "w") as other:
             members = archive.namelist()
-            chosen = rng.choice([name for name in members if name.endswith(".pkl")] if rng.random() < 0.7 else members)
+            pickles = [name for name in members if name.endswith(".pkl")]
+            chosen = rng.choice(pickles if pickles and rng.random() < 0.7 else members)
             for name in members:
                 content = archive.read(name)
                 other.writestr(name, _bytes(content, rng) if name == chosen else content)

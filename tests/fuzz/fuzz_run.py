@@ -37,7 +37,7 @@ HANGS = 20.0  # seconds on one input
 MEMORY = 2 << 30  # bytes above what the process held before
 BAD = ("traceback", "refused badly", "hang", "crash", "memory")
 _PER_SLOW = 12  # of so many inputs, one is for a slow target
-_RENEW = 4000  # inputs of one child
+_RENEW = 10_000  # inputs of one child
 FAST = [name for name in TARGETS if name not in SLOW]
 
 
@@ -149,26 +149,36 @@ def child(folder: Path, seed: int, first: int, last: int) -> None:
         shutil.rmtree(corpus.folder, ignore_errors=True)
 
 
-def run(folder: Path, seed: int, inputs: int, minutes: float) -> Counter[tuple[str, str]]:
-    """Read inputs that no earlier run has read, until enough are read or the time is over; return all counts."""
+def run(folder: Path, seed: int, inputs: int, minutes: float, again: bool = False) -> Counter[tuple[str, str]]:
+    """Read inputs that no earlier run has read, until enough are read or the time is over; return all counts.
+
+    With `again`, those that ended badly are read once more instead, and what comes of them now is what counts.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     path, until = folder / "results.jsonl", time.monotonic() + 60 * minutes
     done = _earlier(path)
-    first = max((row["i"] for row in done), default=-1) + 1
+    todo = [range(number, number + 1) for number, row in done.items() if row["outcome"] in BAD]
+    if not again:
+        first = max(done, default=-1) + 1
+        todo = [range(start, min(start + _RENEW, inputs)) for start in range(first, inputs, _RENEW)]
     with open(path, "a", encoding="utf-8") as log:
-        while first < inputs and time.monotonic() < until:
-            for row in _leg(folder, seed, first, min(first + _RENEW, inputs), until):
-                log.write(json.dumps(row) + "\n")
-                log.flush()
-                done.append(row)
-                first = row["i"] + 1
-    return Counter((row["target"], row["outcome"]) for row in done)
+        for part in todo:
+            first = part.start
+            while first < part.stop and time.monotonic() < until:
+                for row in _leg(folder, seed, first, part.stop, until):
+                    log.write(json.dumps(row) + "\n")
+                    log.flush()
+                    done[row["i"]] = row
+                    first = row["i"] + 1
+    return Counter((row["target"], row["outcome"]) for row in done.values())
 
 
-def _earlier(path: Path) -> list[dict[str, Any]]:
+def _earlier(path: Path) -> dict[int, dict[str, Any]]:
+    """Return the last result of every input."""
     if not path.is_file():
-        return []
-    return [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
+        return {}
+    rows = (json.loads(line) for line in path.read_text().splitlines() if line.endswith("}"))
+    return {row["i"]: row for row in rows}
 
 
 def _leg(folder: Path, seed: int, first: int, last: int, until: float):
@@ -226,12 +236,13 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--inputs", type=int, default=100_000)
     parser.add_argument("--minutes", type=float, default=120.0)
+    parser.add_argument("--again", action="store_true", help="read those that ended badly once more")
     parser.add_argument("--child", type=int, nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child:
         child(Path(args.out), args.seed, *args.child)
         return 0
-    counts = run(Path(args.out), args.seed, args.inputs, args.minutes)
+    counts = run(Path(args.out), args.seed, args.inputs, args.minutes, args.again)
     digest = hashlib.sha256(repr(sorted(counts.items())).encode()).hexdigest()[:12]
     sys.stdout.write(f"{table(counts)}\n\nseed {args.seed}, counts {digest}\n")
     return int(any(kind in BAD for _, kind in counts))

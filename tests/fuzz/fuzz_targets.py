@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ import benchmark_folders
 import cv2
 import data_folders
 import exchange_support
+import fuzz_app
 import numpy as np
 import tifffile
 import trimesh
@@ -138,6 +140,33 @@ def _weights(folder: Path) -> None:
     (folder / "metrics.jsonl").write_text('{"step": 1, "loss": 0.5}\n{"step": 2, "loss": 0.4, "val_mae": 9.5}\n')
 
 
+def _run(folder: Path) -> None:
+    """Write what a model card is made of: weights that tell much, curves, presets, a data folder with its own card."""
+    from render.records.manifest import MANIFEST
+    from render.records.shards import file_hash
+    from render.shared.config import to_plain
+    from sdps.data.augment import Augmentation
+    from sdps.models import registry
+    from sdps.models.checkpoint import TrainedModel, save_weights
+
+    data_folders.write_folder(folder / "data", [data_folders.sphere_shard(name="a", count=3)])
+    (folder / "data" / "DATASET_CARD.md").write_text("# a\n\n## Licences\n\nfree\n")
+    metadata = {
+        "config": {"augmentation": to_plain(Augmentation()), "lights": "true", "learning_rate": 1e-4, "epochs": [1, 2]},
+        "data": file_hash(folder / "data" / MANIFEST), "code": "0", "step": 2, "seconds": 7200.0, "scenes": 1,
+        "computed": [{"precision": "float32", "device": "cpu", "step": 1}], "metrics": {"val_direction_mae": 9.5},
+        "lighting": {"model": "lcnet", "sha256": "0"}, "lights": "true",
+    }  # fmt: skip
+    run = folder / "run"
+    run.mkdir()
+    model = TrainedModel("lcnet-second", registry.create("lcnet-second"), {}, metadata)
+    save_weights(run / "a.safetensors", model, half=True)
+    rows = [{"step": 1, "loss": 0.5, "images_per_second": 9.0}, {"step": 2, "loss": 0.4, "val_direction_mae": 9.5}]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (run / "training.yaml").write_text("model: lcnet\nsteps: 5\n")
+    (run / "config.yaml").write_text("name: x\ndata: {size: 16}\ntest: {size: 16}\n")
+
+
 def _psfcn(folder: Path) -> None:
     _exported(folder, "psfcn")
 
@@ -179,24 +208,33 @@ def _command_lines(folder: Path) -> None:
     known += [(name, inner) for name, group in COMMANDS.items() if isinstance(group, Group) for inner in group.commands]
     number = 0
     for words in known:
-        if words[0].startswith("bench") or words[0] in (
-            "noise",
-            "doctor",
-            "shapes",
-            "materials",
-        ):  # these work without any flag
-            continue
         parser = _innermost(build_parser(words), words)
         actions = [action for action in parser._actions if action.dest != "help"]
-        stop = ["--set", "data.size=0"] if any(action.dest == "preset" for action in actions) else []
-        for action in actions:
+        lines = [[*words, "--nothing", "value"]]
+        for action in actions if words[-1] not in _LONG else ():
             if action.nargs == 0:
                 continue
             flag = action.option_strings[-1:]
             missing = ["missing"] if flag and any(not other.option_strings for other in actions) else []
-            line = json.dumps([*words, *stop, *missing, *flag, "value"])
-            (folder / f"{number:03d}-{words[-1]}.argv").write_text(line)
+            lines.append([*words, *_stop(words, actions), *missing, *flag, "value"])
+        for line in lines:
+            (folder / f"{number:03d}-{words[-1]}.argv").write_text(json.dumps(line))
             number += 1
+
+
+_LONG = ("bench", "bench-train", "bench-classical", "bench-checks", "bench-infer", "bench-surface", "shapes")
+"""Commands that begin to work whatever their flags are; only flags they do not have are tried."""
+
+
+def _stop(words: tuple[str, ...], actions: list[Any]) -> list[str]:
+    """Return flags that end a command which needs no other, before anything long is begun."""
+    stops = {
+        "noise": ["--reference", "0"],
+        "materials": ["--materials", "missing"],
+        "app": ["--max-files", "0", "--max-megabytes", "0"],
+    }
+    preset = any(action.dest == "preset" for action in actions)
+    return stops.get(words[-1], ["--set", "data.size=0"] if preset else [])
 
 
 def _innermost(parser: Any, words: tuple[str, ...]) -> Any:
@@ -227,8 +265,8 @@ def _read_shard(folder: Path, path: Path) -> None:
 def _read_data(folder: Path, path: Path) -> None:
     from pipelines import cli
 
-    for words in (["status"], ["card"], ["preview"], ["validate"]) if path.suffix != ".exr" else (["validate"],):
-        _command(cli.main, ["data", *words, str(folder)])
+    command = ("status", "card", "preview", "validate")[zlib.crc32(path.read_bytes()) % 4]  # all four take a second
+    _command(cli.main, ["data", command, str(folder)])
     for made in ("DATASET_CARD.md", "croissant.json", "preview"):
         shutil.rmtree(folder / made, ignore_errors=True)
 
@@ -311,6 +349,12 @@ def _read_weights(folder: Path, path: Path) -> None:
     {".pt": load_state, ".jsonl": read_metrics}.get(path.suffix, load_weights)(path)
 
 
+def _read_run(folder: Path, path: Path) -> None:
+    from sdps.publishing.model_card import render_card
+
+    render_card(folder / "run" / "a.safetensors", folder / "data")
+
+
 def _read_tree(folder: Path, path: Path) -> None:
     from pipelines import cli
 
@@ -368,11 +412,15 @@ TARGETS: dict[str, Target] = {
     "environment maps": Target(_environments, _read_environment),
     "light files": Target(_light_files, _read_light_file),
     "weights, checkpoints, curves": Target(_weights, _read_weights),
+    "model cards": Target(_run, _read_run, "[rd]*/*.*"),
+    "uploads to the app": Target(fuzz_app.uploads, fuzz_app.read_upload, "uploads/*"),
+    "requests to the app": Target(fuzz_app.requests, fuzz_app.read_request, "*.http"),
+    "folders the app shows": Target(fuzz_app.room, fuzz_app.read_room, "root/**/*.json*"),
     "PS-FCN trees": Target(_psfcn, _read_tree, "tree/**/*.*"),
     "DiLiGenT trees": Target(_diligent, _read_tree, "tree/**/*.*"),
     "command lines": Target(_command_lines, _read_command_line, "*.argv"),
     "records": Target(_records, _read_records, "**/*.json"),
     "training cache": Target(_cache, _read_cache, "**/*.npy"),
 }
-SLOW = ("data folders", "PS-FCN trees", "DiLiGenT trees")
+SLOW = ("data folders", "PS-FCN trees", "DiLiGenT trees", "model cards", "folders the app shows")
 """Targets of which an input takes a tenth of a second or more: they get fewer."""

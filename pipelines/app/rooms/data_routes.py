@@ -145,10 +145,15 @@ def _curves(folder: Path) -> dict[str, dict[str, list[list[float]]]]:
         series: dict[str, list[list[float]]] = {}
         for row in read_whole_lines(path):
             for key, value in row.items() if isinstance(row, dict) and "step" in row else ():
-                if key == "loss" or key.startswith("val_"):
+                if (key == "loss" or key.startswith("val_")) and _drawn(value) and _drawn(row["step"]):
                     series.setdefault(key, []).append([row["step"], value])
         found[path.parent.name] = {key: _thinned(values) for key, values in series.items()}
     return found
+
+
+def _drawn(value: object) -> bool:
+    """Tell whether a value has a place in a plot; those of a training that diverged have none."""
+    return isinstance(value, int | float) and abs(value) < 1e300  # NaN is not below it either
 
 
 def _thinned(values: list[list[float]]) -> list[list[float]]:

@@ -16,6 +16,7 @@ from starlette.routing import Route
 from pipelines.app.work import uploads
 from pipelines.app.work.sessions import Session
 from pipelines.app.work.uploads import Limits
+from render.shared.decoding import decoding
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_path
 
@@ -85,7 +86,7 @@ async def paint(request: Request) -> Response:
 
 
 def _keep_mask(source: Path, target: Path) -> None:
-    with Image.open(source) as image:
+    with decoding(source.name, "a PNG picture", "paint it again"), Image.open(source, formats=["PNG"]) as image:
         grey = np.asarray(image.convert("L")) > 127
     if not grey.any():
         raise InputError("the mask is empty; paint over the object")
@@ -100,7 +101,7 @@ async def start(request: Request) -> Response:
     place = session.place(name)
     if task not in _TASKS:
         raise unknown("task", task, _TASKS)
-    asked = await request.json() if task != "example" else {}
+    asked = await uploads.settings(request.stream()) if task != "example" else {}
     arguments: dict[str, Any] = {"place": str(place)}
     if task != "example":
         arguments |= {"gamma": _one_of(asked, "gamma", _GAMMAS), "lights": asked.get("lights") is True}

@@ -30,7 +30,7 @@ async def start(request: Request) -> Response:
     if task != "gallery":
         place = session.folder / _PLACE
         place.mkdir(exist_ok=True)
-        asked = await request.json()
+        asked = await uploads.settings(request.stream())
         arguments = {"place": str(place)} | {name: asked[name] for name in _ASKED if name in asked}
         if task != "scene":
             arguments.pop("direct", None)

@@ -4,7 +4,6 @@ A scene is rendered once under lights spread over the hemisphere. The browser mi
 that is dragged, so nothing is rendered while it moves.
 """
 
-import json
 import re
 import zipfile
 from pathlib import Path
@@ -20,7 +19,7 @@ from render.records.manifest import SceneSpec
 from render.records.shards import Shard, read_shard, write_shard
 from render.shared.config import to_yaml
 from render.shared.errors import InputError
-from render.shared.files import atomic_path, cache_folder, write_json
+from render.shared.files import atomic_path, cache_folder, read_json, write_json
 from render.shared.progress import stage
 
 UPLOADS = "uploads"
@@ -75,7 +74,7 @@ def scene(place: str, direct: bool = False, **asked: Any) -> dict[str, Any]:
     stage("rendering")
     view = render.render_view(**_arguments(spec), spp=_SPP, bounces=0 if direct else spec["bounces"])
     if direct:
-        stored = json.loads((Path(place) / "view.json").read_text(encoding="utf-8"))
+        stored = read_json(Path(place) / "view.json", "render the scene first")
         (Path(place) / "direct.bin").write_bytes(_coded(view.images, stored["exposure"]))
         return {}
     exposure = pictures.auto_exposure(view.images, view.mask)

@@ -2,17 +2,23 @@
 
 import re
 import stat
+import struct
 import zipfile
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from render.shared.errors import InputError
+from render.shared.files import parse_json
 
 PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".exr")
 _BESIDE = (".txt", ".json")
 _NAME = re.compile(r"[^\w.,()+ -]+")
 _CHUNK = 2**20
+_EXR_HEADER = 2**16
+_EXR_WINDOW = re.compile(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", re.DOTALL)
+_MOST_SETTINGS = 64 << 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +70,26 @@ async def receive(stream: AsyncIterator[bytes], path: Path, room: int) -> int:
     return size
 
 
+async def settings(stream: AsyncIterator[bytes]) -> dict[str, Any]:
+    """Return the JSON object of a request's body.
+
+    Raises:
+        InputError: more than 64 KiB, or no JSON object.
+    """
+    body = bytearray()
+    async for chunk in stream:
+        body += chunk
+        if len(body) > _MOST_SETTINGS:
+            raise InputError(f"the request: more than {_MOST_SETTINGS >> 10} KiB of settings; load the page again")
+    try:
+        asked = parse_json(body.decode())
+    except ValueError as error:
+        raise InputError(f"the request: is not JSON ({error}); load the page again") from error
+    if not isinstance(asked, dict):
+        raise InputError("the request: must be a JSON object; load the page again")
+    return asked
+
+
 def unpack(archive: Path, folder: Path, limits: Limits, room: int) -> int:
     """Unpack the usable files of a ZIP, without their folders, and return their bytes.
 
@@ -84,9 +110,9 @@ def unpack(archive: Path, folder: Path, limits: Limits, room: int) -> int:
                 if count > limits.files:
                     raise InputError(f"{archive.name}: more than {limits.files} files; leave some out")
                 size += _extract(opened, item, folder / safe_name(item.filename), room - size)
-    except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError:
+        raise
+    except Exception as error:  # damaged archives end in errors of many kinds: zlib.error, OSError of a seek
         raise InputError(f"{archive.name}: cannot be unpacked ({error}); make the ZIP again") from error
     if not count:
         raise InputError(f"{archive.name}: no pictures in it; put PNG, TIFF, JPEG or EXR files there")
@@ -113,10 +139,7 @@ def _size(path: Path) -> tuple[int, int]:
     """Return (width, height) that the header tells."""
     try:
         if path.suffix.lower() == ".exr":
-            import OpenEXR
-
-            low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
-            return int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1
+            return _exr_size(path)
         if path.suffix.lower() in (".tif", ".tiff"):
             import tifffile
 
@@ -129,6 +152,19 @@ def _size(path: Path) -> tuple[int, int]:
             return image.size
     except Exception as error:  # the libraries' errors on damaged files are of many kinds
         raise InputError(f"{path.name}: is no picture that can be read; save it again") from error
+
+
+def _exr_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) of an OpenEXR file's first part, read by hand: its library could take the server down.
+
+    A header is a magic number and a version, then attributes: name, type, length, value.
+    """
+    with path.open("rb") as opened:
+        found = _EXR_WINDOW.search(opened.read(_EXR_HEADER))
+    if found is None or not found.string.startswith(b"\x76\x2f\x31\x01"):
+        raise ValueError("no dataWindow")
+    left, low, right, high = struct.unpack("<4i", found[1])
+    return right - left + 1, high - low + 1
 
 
 def _extract(opened: zipfile.ZipFile, item: zipfile.ZipInfo, path: Path, room: int) -> int:

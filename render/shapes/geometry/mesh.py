@@ -14,6 +14,8 @@ from render.shapes.geometry.strips import from_strips
 from render.shared.decoding import decoding, largest_unpacked
 from render.shared.errors import InputError
 
+_BLOCK = 1 << 20  # points looked at together
+
 
 @dataclass(frozen=True, kw_only=True)
 class TriangleMesh:
@@ -123,8 +125,13 @@ def bounding_centre(points: np.ndarray) -> np.ndarray:
     z = 1 - (2 * np.arange(count) + 1) / count
     turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)  # (128, 3)
-    heights = directions.astype(np.float32) @ points.astype(np.float32).T  # (128, N)
-    extremes = points[np.unique(heights.argmax(axis=1))].astype(np.float64)
+    highest, found = np.full(count, -np.inf, np.float32), np.zeros(count, np.int64)
+    for start in range(0, len(points), _BLOCK):  # all heights at once are 2.5 GB for a mesh of ten million triangles
+        heights = directions.astype(np.float32) @ points[start : start + _BLOCK].astype(np.float32).T  # (128, block)
+        block = heights.argmax(axis=1)
+        higher = heights[np.arange(count), block] > highest
+        highest[higher], found[higher] = heights.max(axis=1)[higher], block[higher] + start
+    extremes = points[np.unique(found)].astype(np.float64)
     centre = (extremes.min(axis=0) + extremes.max(axis=0)) / 2
     best, least = centre, np.inf
     for step in range(1, 200):

@@ -34,6 +34,15 @@ def test_folders_scenes_curves_and_results(place: tuple[Path, Client]) -> None:
     assert client.get(f"/data/picture?folder=run&section={section['name']}&file=000.png").startswith(b"\x89PNG")
 
 
+def test_curves_of_a_training_that_diverged_are_sent_without_what_cannot_be_drawn(place: tuple[Path, Client]) -> None:
+    folder, client = place
+    rows = ['{"step": 1, "loss": 2.0}', '{"step": 2, "loss": NaN}', '{"step": 3, "loss": "x", "val_\\ud800": 1}']
+    metrics = folder / "other" / "models" / "x" / "metrics.jsonl"
+    metrics.parent.mkdir(parents=True)
+    metrics.write_text("\n".join(rows) + "\n")
+    assert json.loads(client.get("/data/curves?folder=other")) == {"x": {"loss": [[1, 2.0]]}}
+
+
 def test_a_scene_under_the_lamp(place: tuple[Path, Client]) -> None:
     _, client = place
     (scene, *_) = json.loads(client.get("/data/scenes?folder=run/data"))

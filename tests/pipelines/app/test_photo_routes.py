@@ -16,6 +16,9 @@ from app_server import Client, serving
 from PIL import Image
 from sdps_scenes import hemisphere_lights
 
+from pipelines.app.work import uploads
+from render.shared.errors import InputError
+
 LIGHTS = hemisphere_lights(12, np.random.default_rng(0))
 LIMITS = {"files": 20, "bytes": 4_000_000, "pixels": 200_000}
 
@@ -105,6 +108,40 @@ def test_uploads_are_limited(address: str, hills: Path) -> None:
     for number in range(LIMITS["files"]):
         assert client.send("PUT", f"{path}/uploads/{number}.png", small)[0] == 200
     assert "more than 20 files" in message(client.send("PUT", f"{path}/uploads/more.png", small))
+
+
+@pytest.mark.parametrize(
+    "body", [b"{", b"[1]", b"\xff", b"[" * 30_000, b'{"gamma": "\\ud800"}', b'{"a": "%s"}' % bytes(70_000)]
+)
+def test_settings_that_are_none_end_in_one_line(body: bytes, address: str) -> None:
+    client = Client(address)
+    said = message(client.send("POST", f"{client.new_set()}/start/check", body))
+    assert said.startswith("the request: ") and "\n" not in said
+    assert message(client.send("POST", "/studio/start/preset", body)) == said
+
+
+def test_a_damaged_mask_or_archive_ends_in_one_line(address: str, hills: Path) -> None:
+    client = Client(address)
+    path, mask = client.new_set(hills), (hills / "mask.png").read_bytes()
+    assert "damaged" in message(client.send("PUT", f"{path}/mask", mask[:-40]))
+    jpeg = io.BytesIO()
+    Image.new("L", (8, 8)).save(jpeg, "jpeg")
+    assert "not a PNG" in message(client.send("PUT", f"{path}/mask", jpeg.getvalue()))
+    packed = archive(**{"a.png": mask * 3})
+    at = packed.index(b"PK\1\2")
+    moved = packed[: at + 42] + b"\xff\xff\xff\xff" + packed[at + 46 :]  # where it says the file begins
+    torn = packed[:60] + bytes(20) + packed[80:]
+    for data in (moved, torn):
+        assert "cannot be unpacked" in message(client.send("PUT", f"{client.new_set()}/uploads/a.zip", data))
+
+
+def test_the_header_of_an_exr_is_read_without_its_library(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    folders.write(path, np.zeros((40, 50, 3)))
+    assert uploads._size(path) == (50, 40)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(InputError, match=r"a\.exr: is no picture"):
+        uploads.check_pixels(path, uploads.Limits())
 
 
 def test_archives_leave_nothing_outside_and_do_not_explode(address: str, hills: Path) -> None:

@@ -285,6 +285,8 @@ def test_names_are_legal_and_unique():
     assert unique_names(["a", "b", "A", "a-1"]) == ["a-2", "b", "A-3", "a-1"]
     assert unique_names(["x"]) == ["x"]
     assert [natural_key(name) for name in image_names(1001)] == sorted(natural_key(n) for n in image_names(1001))
+    names = ["a", "9.png", "010.png", "1" * 5000, "²"]
+    assert sorted(reversed(names), key=natural_key) == [*names[1:4], *names[:1], *names[4:]]
     assert image_names(1001) == sorted(image_names(1001))
 
 

@@ -74,6 +74,15 @@ def test_the_card_tells_what_the_files_tell(tmp_path: Path, data: Path) -> None:
     assert {"type": "normal_mae", "value": 12.3456} in metrics
 
 
+@pytest.mark.parametrize("told", [{"step": "x"}, {"computed": [1]}, {"metrics": {"val_loss": []}}, {"scenes": "many"}])
+def test_a_card_of_weights_that_tell_nonsense_is_refused(told: dict, tmp_path: Path) -> None:
+    path = write_run(tmp_path, None)
+    model = load_weights(path)
+    save_weights(path, replace(model, metadata=model.metadata | told))
+    with pytest.raises(InputError, match=r"own\.safetensors: damaged or not weights that tell"):
+        render_card(path)
+
+
 def test_errors_of_lights_are_those_of_lights_that_were_found(tmp_path: Path) -> None:
     told = render_card(write_run(tmp_path / "told", None))
     found = render_card(write_run(tmp_path / "found", None, lights="lcnet"))

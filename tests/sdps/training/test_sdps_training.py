@@ -392,6 +392,13 @@ def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path
         (headless, "normals", "damaged header"),
         (foreign, "normals", "a model this version does not know"),
     ]
+    for number, (options, message) in enumerate((
+        ("abc", "damaged header"), ({"direction_classes": 10**12}, "do not fit"), ({"use_mask": {}}, "damaged header"),
+        ({"intensity_range": [[]]}, "damaged header"), ({"none": 1}, "damaged header .*unknown option"),
+    )):  # fmt: skip
+        odd = tmp_path / f"odd{number}.safetensors"
+        save_weights(odd, TrainedModel("lcnet", create("lcnet"), options, {"config": {"augmentation": {}}}))
+        cases.append((odd, "lighting", message))
     for path, role, message in cases:
         with pytest.raises(InputError, match=message) as error:
             load_weights(path, role)
