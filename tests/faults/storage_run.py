@@ -76,7 +76,7 @@ def trial(store: ObjectStore, folder: Path, number: int, away: float, where: Seq
     return {
         "kept": kept, "codes": [second.returncode, third.returncode], "waited": "trying again" in said,
         "same": whole == there, "twice": sum(count > 1 for count in Counter(line["id"] for line in lines).values()),
-        "scenes": len(whole) - 1, "left": left, "traceback": "Traceback" in said,
+        "scenes": len(whole) - 1, "left": left, "traceback": said.partition("Traceback")[2][-2000:],
     }  # fmt: skip
 
 

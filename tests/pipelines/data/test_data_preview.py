@@ -11,9 +11,9 @@ from data_folders import MATERIALS, good_folder, scene_of, sphere_shard, write_f
 from PIL import Image
 
 from pipelines.cli import main
-from pipelines.data import preview_plots
 from pipelines.data.data_preview import ON_PAGE, PER_SHEET, preview
-from pipelines.data.preview_page import BUDGET, gallery
+from pipelines.data.preview import preview_plots
+from pipelines.data.preview.preview_page import BUDGET, gallery
 from pipelines.shared import pictures
 from render.planning.composition import category, components, compose, family, light_directions
 from render.records.manifest import View

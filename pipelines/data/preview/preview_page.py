@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.data import preview_plots as plots
-from pipelines.data.preview_sample import STAGE_COLUMNS, Sample, Stage
+from pipelines.data.preview import preview_plots as plots
+from pipelines.data.preview.preview_sample import STAGE_COLUMNS, Sample, Stage
 from pipelines.shared import pictures
 from render.planning.composition import Composition, light_directions
 from render.records.manifest import SceneSpec
