@@ -213,3 +213,16 @@ def test_any_method_that_gives_normals_is_refined_by_its_name() -> None:
 def test_what_has_no_normals_is_not_refined(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         parse(text, pretrained.require)
+
+
+def test_what_is_clipped_is_left_out() -> None:
+    normals, mask = bumpy(48)
+    images, lights, intensities = lit(normals, 24, seed=3, gloss=2.0)
+    level = np.float32(np.quantile(images[:, mask].max(axis=-1), 0.95))
+    clipped = np.minimum(images, level)
+    found = [
+        errors(refine(clipped, mask, turned(normals, 8.0, 4) * mask[..., None], turned(lights, 6.0, 5), intensities,
+                      config=QUICK, saturation=saturation), normals, mask, lights)
+        for saturation in (float(level), float("inf"))
+    ]  # fmt: skip
+    assert found[0][0] < 0.6 * found[1][0], found
