@@ -66,7 +66,6 @@ def _wait(address: str) -> None:
 def _keep(png: bytes, path: Path) -> None:
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    print(path)
 
 
 def _photographs(page: Any, args: argparse.Namespace, address: str) -> None:

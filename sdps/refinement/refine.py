@@ -96,10 +96,9 @@ def refine(
         InputError: fewer than four images, shapes that do not fit, or an object that is black.
     """
     config = config or RefineConfig()
-    _check(len(images), mask, normals, lights, intensities)
+    gains = _checked(len(images), mask, normals, lights, intensities)
     scene = survey(images, mask, 0, stray=stray)
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
-    gains = np.broadcast_to(np.reshape(intensities, (len(images), -1)), (len(images), 3))
     values = _gathered(scene)
     problem = problem_of(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
@@ -130,7 +129,10 @@ def _advance(bar: Any) -> Callable[[], None]:
     return after
 
 
-def _check(count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> None:
+def _checked(
+    count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray
+) -> np.ndarray:
+    """Return the intensities (L, 3), if all sizes fit."""
     if count < _FEWEST:
         raise InputError(f"refinement needs at least {_FEWEST} images, got {count}")
     if normals.shape != (*mask.shape, 3):
@@ -139,6 +141,7 @@ def _check(count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray
         )
     if lights.shape != (count, 3) or len(intensities) != count:
         raise InputError(f"refinement: {count} images, but {len(lights)} lights and {len(intensities)} intensities")
+    return np.broadcast_to(np.reshape(intensities, (count, -1)), (count, 3))
 
 
 def _gathered(scene: ObjectImages) -> np.ndarray:  # (P, 3, L) float32
