@@ -36,7 +36,7 @@ def photograph(folder: Path, size: int, count: int) -> render.RenderedView:
 def main() -> None:
     """Load the photographs, infer normals and lights, write what follows from them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("photographs", type=Path, nargs="?", help="folder; see docs/capture.md")
+    parser.add_argument("photographs", type=Path, nargs="?", help="folder; see docs/guides/capture.md")
     parser.add_argument("--out", type=Path, default=Path("out/example-3"))
     parser.add_argument("--method", default="auto", help="sdps, pf14, ...; auto takes the best there is")
     parser.add_argument("--size", type=int, default=128, help="side of the photographs that are made")

@@ -44,9 +44,11 @@ DATA = Group("plan, check, preview, describe, export, relight and import data fo
     "preview": Command("data.data_preview",
                        "write contact sheets and a page with light, material and shape statistics", stores=True),
     "card": Command("data.data_card", "write the dataset card and Croissant JSON", stores=True),
-    "export": Command("data.data_export", "write the scenes in a layout that other loaders read", stores=True),
+    "export": Command("data.data_exchange", "write the scenes in a layout that other loaders read", stores=True),
     "relight": Command("data.data_relight", "mix images under environments and several lights from a light stage"),
-    "import": Command("data.data_import", "turn PS-FCN trees and DiLiGenT folders into shards"),
+    "import": Command("data.data_exchange", "turn PS-FCN trees and DiLiGenT folders into shards",
+                      "add_import_arguments", "import_main"),
+    "pack": Command("data.data_pack", "write the scenes into WebDataset tars, for training that streams", stores=True),
 })  # fmt: skip
 
 COMMANDS: dict[str, Command | Group] = {

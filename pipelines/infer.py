@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from pipelines.report import page as report
-from pipelines.report.sections import Section, SectionWriter, Table
+from pipelines.report.sections import Section, SectionWriter, Table, Tile
 from pipelines.shared import pictures, using
 from render.shared.errors import InputError
 
@@ -125,14 +124,14 @@ def _section(result: "Inference") -> SectionWriter:
     writer, box = SectionWriter(section), _box(mask)
     lit = photos[_brightest(result)][0]
     shown = pictures.tone_map(lit, pictures.auto_exposure(lit[None], mask))
-    tiles: list[tuple[str, np.ndarray | Figure]] = [
-        ("a photograph", shown[box]),
-        (f"mask ({photos.mask_origin})", _masked(shown, mask)[box]),
-        ("normals", pictures.normal_map(result.normals, mask)[box]),
-        ("depth, near is bright", depth_picture(result)[box]),
+    tiles = [
+        Tile("a photograph", shown[box]),
+        Tile(f"mask ({photos.mask_origin})", _masked(shown, mask)[box]),
+        Tile("normals", pictures.normal_map(result.normals, mask)[box], "normals"),
+        Tile("depth, near is bright", depth_picture(result)[box]),
     ]
     if len(result.light_directions):
-        tiles.append(("lights, seen from the camera", pictures.light_plot(result.light_directions, result.gains)))
+        tiles.append(Tile("lights, seen from the camera", pictures.light_plot(result.light_directions, result.gains)))
     writer.strip("Photograph, mask, normals, depth, lights", tiles)
     writer.strip("The surface from the left, the front and the right", [("", strip(result.depth, 360))], wide=True)
     relit = [(name.replace("-", " "), pictures.tone_map(view)[box]) for name, view in result.relit().items()]
@@ -150,7 +149,7 @@ def _box(mask: np.ndarray) -> tuple[slice, slice]:
     return rows, columns
 
 
-def _refinement_pictures(result: "Inference", box: tuple[slice, slice]) -> list[tuple[str, np.ndarray | Figure]]:
+def _refinement_pictures(result: "Inference", box: tuple[slice, slice]) -> list[Tile]:
     """Return how far normals moved, the error to expect, and what the model did not explain."""
     from sdps.core.metrics import angle_degrees
 
@@ -159,12 +158,12 @@ def _refinement_pictures(result: "Inference", box: tuple[slice, slice]) -> list[
     residual, expected = found["refined"].pixel_residual, found["trust"].normals
     most = float(np.percentile(residual[mask], 99))
     maps = (
-        ("normals before", pictures.normal_map(found["start"].normals, mask)),
         ("moved (yellow: 20 degrees)", pictures.error_map(np.where(mask, moved, np.nan), 20.0)),
         ("error to expect (yellow: 20 degrees)", pictures.error_map(np.where(mask, expected, np.nan), 20.0)),
         (f"not explained (yellow: {most:.2f})", pictures.error_map(np.where(mask, residual, np.nan), most)),
     )
-    return [(caption, picture[box]) for caption, picture in maps]
+    before = Tile("normals before", pictures.normal_map(found["start"].normals, mask)[box], "normals")
+    return [before, *(Tile(caption, picture[box]) for caption, picture in maps)]
 
 
 def _brightest(result: "Inference") -> slice:

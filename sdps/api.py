@@ -87,7 +87,9 @@ def infer(
         raise InputError(f"{photos.folder}: {grave.text} ({ANYWAY})")
     runner = _runner(method, photos.light_directions is not None, models, config, refine, len(photos))
     began = time.perf_counter()
-    found = runner.estimate(photos, photos.mask, photos.light_directions, photos.intensities)
+    found = runner.estimate(
+        photos, photos.mask, photos.light_directions, photos.intensities, saturation=photos.saturation
+    )
     seconds = time.perf_counter() - began
     return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
 
@@ -101,6 +103,7 @@ def estimate(
     intensities: np.ndarray | None = None,
     models: str | Path | None = None,
     config: InferenceConfig | None = None,
+    saturation: float = float("inf"),
 ) -> Estimate:
     """Estimate normals and lights of images in memory, by any method.
 
@@ -113,6 +116,7 @@ def estimate(
         intensities: (L,) or (L, 3) known intensities, of any overall scale.
         models: As for `infer`.
         config: As for `infer`.
+        saturation: Radiance from which on a channel is clipped; refinement leaves such observations out.
 
     Returns:
         Normals (H, W, 3) float32, unit, zero outside the mask; directions (L, 3) and intensities (L,), those given or
@@ -123,7 +127,7 @@ def estimate(
             wants lights that are not given.
     """
     runner = _runner(method, light_directions is not None, models, config)
-    return runner.estimate(images, mask, light_directions, intensities)
+    return runner.estimate(images, mask, light_directions, intensities, saturation=saturation)
 
 
 def available_methods(models: str | Path | None = None) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """Every example runs from the command line and writes what it says."""
 
+import json
 import os
 import subprocess
 import sys
@@ -60,3 +61,18 @@ def test_photographs_to_mesh(tmp_path, method):
     assert f"mesh of {faces} triangles" in said and faces > 300
     again = run("03_photographs_to_mesh.py", tmp_path / "photographs", "--out", tmp_path / "own", "--method", method)
     assert "normal_mae" not in again and (tmp_path / "own" / "mesh.ply").is_file()
+
+
+@pytest.mark.parametrize("method", ["pf14", pytest.param("auto", marks=pytest.mark.slow)])
+def test_the_notebook(method, capsys):
+    """Its cells in order, smaller, without Jupyter."""
+    notebook = json.loads((ROOT / "examples" / "04_scene_and_inference.ipynb").read_text())
+    shown = []
+    names = {"display": lambda *pictures: shown.extend(pictures)}
+    for cell in notebook["cells"]:
+        assert not cell.get("outputs"), "outputs do not belong into the repository"
+        if cell["cell_type"] == "code":
+            source = "".join(cell["source"]).replace('128, 32, 48, "auto"', f'32, 4, 12, "{method}"')
+            exec(compile(source, "notebook", "exec"), names)
+    assert "normal_mae: " in capsys.readouterr().out
+    assert [picture.size for picture in shown] == [(96, 96)] * 4

@@ -27,8 +27,8 @@ FOLDERS = [
     )),
     "sdps",
     *(f"pipelines.{name}" for name in (
-        "shared", "shared.cluster", "rendering", "data", "train", "report", "evaluate", "evaluate.figures",
-        "benchmarks", "bench",
+        "shared", "shared.cluster", "rendering", "data.preview", "data", "train", "report", "evaluate",
+        "evaluate.figures", "benchmarks", "bench",
     )),
     "pipelines", "pipelines.app.work", "pipelines.app.rooms", "pipelines.app",
 ]  # fmt: skip

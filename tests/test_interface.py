@@ -69,4 +69,6 @@ def test_nothing_that_users_rely_on_is_gone(kind: str) -> None:
 
 
 if __name__ == "__main__":
-    FILE.write_text(json.dumps({"commands": commands(), "keys": keys()}, indent=1) + "\n", encoding="utf-8")
+    FILE.write_text(
+        json.dumps({"commands": commands(), "keys": keys()}, indent=1, sort_keys=True) + "\n", encoding="utf-8"
+    )

@@ -1,11 +1,15 @@
-"""Trials of `--cluster`: workers killed while they render, and how much one client and one scheduler carry.
+"""Trials of `--cluster`: workers or the scheduler killed while scenes render, and what one client and scheduler carry.
 
     python docs/scripts/cluster_trials.py kills --times 10
+    python docs/scripts/cluster_trials.py schedulers --times 10
     python docs/scripts/cluster_trials.py plan --chunks 20000
     python docs/scripts/cluster_trials.py load --slots 1000 --seconds 5 --bytes 2000000 --chunks 4000
+    python docs/scripts/cluster_trials.py load --workers 50 --slots 50 --seconds 1 --bytes 1000 --chunks 400
 
 `kills` renders a tiny preset on two workers, kills one (-9) at a random moment of the rendering, and compares manifest
-and shards with an undisturbed local run. `load` has tasks that sleep instead of rendering and return random bytes.
+and shards with an undisturbed local run. `schedulers` kills the scheduler instead, and starts it and its workers anew
+three seconds later. `load` has tasks that sleep instead of rendering and return random bytes; with `--workers 50` the
+workers live in the process of the scheduler and the client, each with a connection and heartbeats of its own.
 `plan` tells what a scene of 64 lights takes in the manifest and in the memory of who reads it.
 """
 
@@ -14,13 +18,17 @@ import contextlib
 import os
 import random
 import signal
+import socket
+import subprocess
 import sys
 import tempfile
 import threading
 import time
 import tracemalloc
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import dask
 import distributed
 
 from pipelines.rendering.render_data import planned_scenes
@@ -40,8 +48,8 @@ from render.running.supervisor import render_supervised
 TINY = ["data.size=32", "data.spp=16", "data.light_count=8", "data.materials_per_view=4", "data.views=1"]
 
 
-def kills(times: int, seed: int) -> int:
-    """Kill a worker in each of several runs; return 1 if one of them differs from the local run."""
+def kills(times: int, seed: int, disturbed: Callable[[presets.Preset, Path, random.Random], int]) -> int:
+    """Disturb each of several runs; return 1 if one of them differs from the local run."""
     rng, preset, bad = random.Random(seed), presets.load("smoke", TINY), 0
     with tempfile.TemporaryDirectory() as temporary:
         plain = Path(temporary) / "plain"
@@ -50,10 +58,13 @@ def kills(times: int, seed: int) -> int:
         expected = content(plain)
         for number in range(times):
             folder = Path(temporary) / f"run-{number}"
-            done = killed_run(preset, folder, rng)
-            good = done == len(scenes) and content(folder) == expected and listed_once(folder, scenes)
-            bad += not good
-            said = "the bytes of the local run" if good else "DIFFERS"
+            done = disturbed(preset, folder, rng)
+            found = content(folder)
+            wrong = [name for name in sorted(expected | found) if found.get(name) != expected.get(name)]
+            if not listed_once(folder, scenes):
+                wrong.append("ledger")
+            bad += bool(wrong)
+            said = f"DIFFERS ({', '.join(wrong)})" if wrong else "the bytes of the local run"
             sys.stdout.write(f"run {number + 1}: {done} of {len(scenes)} scenes, {said}\n")
             sys.stdout.flush()
     return int(bad > 0)
@@ -79,6 +90,57 @@ def killed_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
         assert moments, "the run ended before a worker was killed; give it more scenes"
         killer.join()
     return summary.done
+
+
+def restarted_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
+    """Render while the scheduler is killed and, with its workers, started again; return how many scenes are done."""
+    scenes = planned_scenes(preset, folder)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+    with contextlib.ExitStack() as first, contextlib.ExitStack() as second:
+        (scheduler, *_) = first.enter_context(processes(address))
+        moments = []
+
+        def kill() -> None:
+            with distributed.Client(address, set_as_default=False) as client:
+                while not any(client.run(busy).values()):
+                    time.sleep(0.1)
+            time.sleep(rng.uniform(0.5, 4.0))
+            scheduler.kill()
+            moments.append(time.monotonic())
+            time.sleep(3.0)
+            second.enter_context(processes(address))
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        with dask_crew.crew_on(ClusterChoice(name=address), folder) as crew:
+            summary = render_supervised(scenes, folder, crew=crew)
+        assert moments, "the run ended before the scheduler was killed; give it more scenes"
+        killer.join()
+    return summary.done
+
+
+@contextlib.contextmanager
+def processes(address: str) -> Iterator[list["subprocess.Popen[bytes]"]]:
+    """Start a scheduler and two workers as an operator would; yield the processes, and end them."""
+    words = (["scheduler", "--port", address.rpartition(":")[2]], *[["worker", address, "--nthreads", "1"]] * 2)
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *part, "--no-dashboard"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for part in words
+    ]
+    try:
+        with distributed.Client(address, timeout=60, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+        yield started
+    finally:
+        for process in started:
+            process.terminate()
+            process.wait()
 
 
 def busy(dask_worker: distributed.Worker) -> bool:
@@ -107,7 +169,7 @@ def sleeping(task: Task) -> tuple[str, Rendered]:
     return distributed.get_worker().address, Rendered([Done(line)], {scene.id: os.urandom(int(size))})
 
 
-def load(slots: int, chunks: int, seconds: float, size: int) -> int:
+def load(slots: int, chunks: int, seconds: float, size: int, workers: int) -> int:
     """Send sleeping chunks through one client; print what it and the scheduler carry."""
     scenes = [
         SceneSpec(id=f"s{number}", seed=0, split="train", shape=f"{seconds}:{size}", material="none", view=View(),
@@ -116,9 +178,9 @@ def load(slots: int, chunks: int, seconds: float, size: int) -> int:
     ]  # fmt: skip
     parts = [Chunk(scene.shape, ((scene,),), frozenset([scene.id])) for scene in scenes]
     dask_crew.render_task = sleeping
-    processes = max(2, min(4, slots // 250))
-    with tempfile.TemporaryDirectory() as folder, cluster(processes, slots // processes) as (address, _):
-        before = resident_bytes() or 0
+    processes = workers or max(2, min(4, slots // 250))
+    with tempfile.TemporaryDirectory() as folder, cluster(processes, slots // processes, not workers) as (address, _):
+        before, idle = resident_bytes() or 0, idle_share()
         with dask_crew.crew_on(ClusterChoice(name=address), Path(folder)) as crew:
             assert crew is not None
             start, processor, done = time.monotonic(), time.process_time(), 0
@@ -129,13 +191,21 @@ def load(slots: int, chunks: int, seconds: float, size: int) -> int:
             crew.close()
         after = resident_bytes("VmHWM") or 0
     ideal = chunks * seconds / slots
+    who = "client, scheduler and workers" if workers else "client and scheduler"
     sys.stdout.write(
-        f"{done} chunks of {size / 1e6:g} MB, {slots} slots, {seconds:g} s each: {passed:.1f} s ({ideal:.1f} s without "
-        f"overhead), {done / passed:.0f} chunks/s, {done * size / passed / 1e6:.0f} MB/s; client and scheduler in one "
-        f"process: {1e3 * processor / done:.2f} ms of a core per chunk, {before / 1e6:.0f} MB before, "
-        f"{after / 1e6:.0f} MB at most\n"
+        f"{done} chunks of {size / 1e6:g} MB, {slots} slots of {processes} Dask workers, {seconds:g} s each: "
+        f"{passed:.1f} s ({ideal:.1f} s without overhead), {done / passed:.0f} chunks/s, "
+        f"{done * size / passed / 1e6:.0f} MB/s; {who} in one process: {1e3 * processor / done:.2f} ms of a core per "
+        f"chunk, {before / 1e6:.0f} MB before, {after / 1e6:.0f} MB at most; idle {100 * idle:.1f} % of a core\n"
     )
     return 0
+
+
+def idle_share(seconds: float = 20.0) -> float:
+    """Return the share of a core that this process takes while nothing is asked of it."""
+    before = time.process_time()
+    time.sleep(seconds)
+    return (time.process_time() - before) / seconds
 
 
 def plan(count: int) -> int:
@@ -160,11 +230,21 @@ def plan(count: int) -> int:
 
 
 @contextlib.contextmanager
-def cluster(processes: int, threads: int):
-    """Yield the address of a scheduler in this process with workers of their own, and a client."""
+def cluster(workers: int, threads: int, processes: bool = True):
+    """Yield the address of a scheduler in this process, with workers in theirs or in this one, and a client."""
+    # Of workers in this process only what the scheduler hears of is to be measured, not how they watch themselves.
+    quiet = {} if processes else {
+        "distributed.worker.profile.enabled": False, "distributed.admin.system-monitor.interval": "60s",
+    }  # fmt: skip
     with (
+        dask.config.set(quiet),
         distributed.LocalCluster(
-            n_workers=processes, threads_per_worker=threads, dashboard_address=":0", silence_logs=50
+            n_workers=workers,
+            threads_per_worker=threads,
+            processes=processes,
+            protocol="tcp://",
+            dashboard_address=":0",
+            silence_logs=50,
         ) as made,
         distributed.Client(made, set_as_default=False) as client,
     ):
@@ -173,16 +253,19 @@ def cluster(processes: int, threads: int):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("trial", choices=("kills", "load", "plan"))
+    parser.add_argument("trial", choices=("kills", "schedulers", "load", "plan"))
     parser.add_argument("--times", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--slots", type=int, default=1000)
+    parser.add_argument(
+        "--workers", type=int, default=0, help="Dask workers, in this process (default: a few processes)"
+    )
     parser.add_argument("--chunks", type=int, default=4000)
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--bytes", type=int, default=2_000_000)
     flags = parser.parse_args()
-    if flags.trial == "kills":
-        sys.exit(kills(flags.times, flags.seed))
+    if flags.trial in ("kills", "schedulers"):
+        sys.exit(kills(flags.times, flags.seed, killed_run if flags.trial == "kills" else restarted_run))
     if flags.trial == "plan":
         sys.exit(plan(flags.chunks))
-    sys.exit(load(flags.slots, flags.chunks, flags.seconds, flags.bytes))
+    sys.exit(load(flags.slots, flags.chunks, flags.seconds, flags.bytes, flags.workers))

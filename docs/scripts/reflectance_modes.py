@@ -56,7 +56,7 @@ def coefficients(material: Material, lights: np.ndarray) -> np.ndarray:  # (MODE
     for number, light in enumerate(lights):
         wi, wo = shading_frame(normals, light)
         images[:, :, number] = np.pi * evaluate(material, wi, wo) * np.maximum(wi[:, 2:], 0.0)
-    problem: Problem = problem_of(images, mask, 1, np.ones((len(lights), 3)))
+    problem: Problem = problem_of(images, mask, 1, np.ones((len(lights), 3)), np.full((3, len(lights)), np.inf))
     state: State = start_of(problem, normals, lights, np.ones((len(lights), 3)))
     free = frozenset({"log_albedo", "log_strength", "body", "lobes", "log_sharpness"})
     state = solve(problem, state, free=free, iterations=_ITERATIONS, boost=4.0, weights=Weights())

@@ -1,4 +1,7 @@
-"""The parts of `sdps bench` that concern whole runs: steady state, memory, processes and stages; `PARTS` lists all."""
+"""The parts of `sdps bench` that concern whole runs: steady state, memory, processes, stages and samples a pixel.
+
+`PARTS` lists all.
+"""
 
 import os
 import tempfile
@@ -10,18 +13,23 @@ from typing import Any
 import numpy as np
 
 from pipelines.bench.bench_relight import relight
+from pipelines.rendering.image_noise import NoiseConfig, measure
 from pipelines.shared import presets
 from pipelines.shared.charts import new_figure, tidy
 from pipelines.shared.memory import resident_bytes
 from render.planning import budget
-from render.planning.plan import plan
+from render.planning.data_config import DataConfig
+from render.planning.plan import material_pool, plan
 from render.records.manifest import SceneSpec
 from render.running.supervisor import RunOptions, RunSummary, render_supervised
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
+from render.shared.templates import markdown_table
 
 _WARM_UP = 12  # views, after which every kernel a run needs has been met
 _VIEWS = 40
+_SAMPLES = (16, 32, 64)
+_EVERY_MATERIAL = 7  # of the 100, in the measure of noise
 
 
 def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
@@ -116,8 +124,8 @@ def memory(scenes: int, out: Path | None) -> tuple[dict[str, Any], str]:
 def workers(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
     """Render the same part of the `paper` preset on one core and on all; profile its stages."""
     base = presets.load("paper").data
-    whole = sum(base.families.values()) * base.views * base.materials_per_view
-    planned = plan(replace(base, families={"blobby": 1, "sculpture": 2}, views=9, validation=0.0))
+    whole = _count(base)
+    planned = _part(base)
     cores = budget.cores()
     ways = {"1 process on 1 core": (1, 1), f"1 process on {cores} cores": (1, cores)}
     ways[f"{cores} processes on {cores} cores"] = (cores, cores)
@@ -140,6 +148,38 @@ def workers(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
     return values, "\n".join(lines) + "\n"
 
 
+def samples(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
+    """Time the `paper` preset at several samples a pixel, and measure the noise each leaves."""
+    base, cores = presets.load("paper").data, budget.cores()
+    hours, noise = {}, {}
+    for spp in _SAMPLES:
+        planned = _part(replace(base, spp=spp))
+        seconds = _run(planned, cores, cores).seconds
+        hours[str(spp)] = _count(base) / len(planned) * seconds / 3600
+    chosen = tuple(material_pool(("all",))[::_EVERY_MATERIAL])
+    rows = list(measure(NoiseConfig(materials=chosen, spp=_SAMPLES)))
+    for spp in _SAMPLES:
+        errors = np.array([row.error[spp] for row in rows])
+        noise[str(spp)] = {"median": float(np.median(errors)), "worst": float(errors.max())}
+    values = {"paper_hours": hours, "noise_percent": noise, "materials": list(chosen)}
+    table = [(k, f"{hours[k]:.1f}", f"{noise[k]['median']:.2f} %", f"{noise[k]['worst']:.2f} %") for k in hours]
+    heads = ("samples a pixel", f"hours for {_count(base):,} samples", "noise, median material", "worst")
+    about = (
+        f"Projected from {len(planned)} scenes of the `paper` preset, {cores} processes on {cores} cores, start "
+        f"included; noise of {len(chosen)} materials on the bunny, against {NoiseConfig().reference:,} samples.\n\n"
+    )
+    return values, about + markdown_table(heads, table) + "\n"
+
+
+def _count(base: DataConfig) -> int:
+    return sum(base.families.values()) * base.views * base.materials_per_view
+
+
+def _part(base: DataConfig) -> list[SceneSpec]:
+    """Plan as many scenes of each family as the whole has, in proportion."""
+    return plan(replace(base, families={"blobby": 1, "sculpture": 2}, views=9, validation=0.0))
+
+
 def _run(planned: Sequence[SceneSpec], processes: int, cores: int) -> RunSummary:
     """Render a plan into a temporary folder on the first `cores` of this machine's cores."""
     allowed = sorted(os.sched_getaffinity(0))
@@ -156,5 +196,6 @@ PARTS: dict[str, Callable[[int, Path | None], tuple[dict[str, Any], str]]] = {
     "steady": steady_state,
     "memory": memory,
     "workers": workers,
+    "samples": samples,
     "relight": relight,
 }

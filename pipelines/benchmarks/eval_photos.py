@@ -72,7 +72,7 @@ def main(args: argparse.Namespace) -> int:
     for item in items:
         pictures = tiles(item, found, shown, "reference, lights known")
         writer.strip(item.name, pictures)
-        flat = [(text, fitted(picture, _HEIGHT)) for text, picture in pictures if isinstance(picture, np.ndarray)]
+        flat = [(text, fitted(picture, _HEIGHT)) for text, picture, _ in pictures if isinstance(picture, np.ndarray)]
         with atomic_path(out / f"{item.name}.png") as temporary:
             contact_sheet(flat).save(temporary)
     objects = {

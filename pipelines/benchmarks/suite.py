@@ -3,15 +3,19 @@
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pipelines.benchmarks.object_tables import object_table, published_rows
+from pipelines.evaluate.elsewhere import evaluate_elsewhere
 from pipelines.evaluate.evaluation import Evaluation, TestObject
 from pipelines.evaluate.object_pictures import Found, tiles
 from pipelines.evaluate.results import publish, weights_of
 from pipelines.report.sections import Section, SectionWriter, Table
 from pipelines.shared import using
+from pipelines.shared.cluster import cluster_config
+from pipelines.shared.cluster.cluster_config import ClusterChoice
 from pipelines.shared.flags import add_out, picked, split_list
 from render.shared.config import to_plain
 from render.shared.progress import progress_bar
@@ -22,6 +26,12 @@ from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
 
 
+def _opened(item: TestObject) -> Any:
+    """Return an object's images, read whole, so that no method is blamed for a damaged file."""
+    images: Any = item.load()
+    return images.opened()
+
+
 def run(
     items: Sequence[TestObject],
     chosen: Sequence[Method],
@@ -29,6 +39,7 @@ def run(
     folder: Path,
     config: InferenceConfig,
     shown: Sequence[str],
+    cluster: ClusterChoice | None = None,
 ) -> tuple[Found, list[Runner]]:
     """Run methods on objects, or take their results from the cache in `folder`.
 
@@ -39,13 +50,16 @@ def run(
         folder: Where results are kept.
         config: How networks are used.
         shown: Methods whose normal maps are kept for pictures.
+        cluster: Whose workers run the methods; this process when omitted.
     """
     runners = [Runner(method, finder(models), config) for method in chosen]
     evaluation = Evaluation(folder)
     found: Found = {runner.method.name: {} for runner in runners}
-    for item in progress_bar(items, desc="evaluate", unit="object"):
-        opened = replace(item, load=lambda item=item: item.load().opened())
-        for runner, result in zip(runners, evaluation.results(opened, runners, shown), strict=True):
+    opened = [replace(item, load=partial(_opened, item)) for item in items]
+    if cluster is not None:
+        evaluate_elsewhere(cluster, evaluation, ((item, shown) for item in opened), len(opened), runners, config)
+    for item in progress_bar(opened, desc="evaluate", unit="object", disable=cluster is not None):
+        for runner, result in zip(runners, evaluation.results(item, runners, shown), strict=True):
             found[runner.method.name][item.name] = result
     return found, runners
 
@@ -98,7 +112,8 @@ def evaluate(
         command: The command that does it again, without `--out`.
     """
     config, shown, file = inference_config(args), pictured(chosen), args.out / bench.name / "results.json"
-    found, runners = run(items, chosen, select.runs_folder(args.models), file.parent / "cache", config, shown)
+    cluster = cluster_config.from_arguments(args)
+    found, runners = run(items, chosen, select.runs_folder(args.models), file.parent / "cache", config, shown, cluster)
     section = Section(
         name=bench.name, title=bench.title, text=text + using.describe(runners, config), order=bench.order,
         tables=build_tables(bench, items, found, chosen), command=f"{command} --out {args.out}",
@@ -173,6 +188,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="--out of `sdps train`, whose models are evaluated (default: shipped ones)")  # fmt: skip
     parser.add_argument("--objects", action="append", help="commas or repeat (default: all in the folder)")
     using.add_arguments(parser)
+    cluster_config.add_arguments(parser)
     add_out(parser, Path("out/real"))
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.data import preview_page
-from pipelines.data.preview_sample import Sample, caption, read_sample
+from pipelines.data.preview import preview_page
+from pipelines.data.preview.preview_sample import Sample, caption, read_sample
 from pipelines.shared import pictures
 from pipelines.shared.flags import add_cache_argument
 from render.planning.composition import compose

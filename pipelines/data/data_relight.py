@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from pipelines.data.data_export import exposure_flag, planned, report
+from pipelines.data.data_exchange import exposure_flag, planned, report
 from pipelines.shared.flags import add_fields, from_flags
 from render.exchange.rules import check_tree
 from render.exchange.samples import ExportOptions

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.evaluate.elsewhere import evaluate_elsewhere
 from pipelines.evaluate.merltest_tables import SceneScores, definition, lighting_table, normal_table, write
 from pipelines.evaluate.results import tables_text, weights_of
 from pipelines.evaluate.workbench import Workbench, lit_object
@@ -120,9 +121,18 @@ def evaluate(
     bench: Workbench, wanted: Sequence[SceneSpec], folder: Path, pictured: Sequence[str]
 ) -> Iterator[SceneScores]:
     """Score every scene, averaged over the draws of random intensities; normal maps of the first draw are kept."""
-    for scene in progress_bar(wanted, desc="evaluate", unit="scene"):
+    repeats = range(bench.config.repeats)
+    if bench.cluster is not None:
+        items = (
+            (lit_object(scene, folder, bench.config, repeat), () if repeat else pictured)
+            for scene in wanted
+            for repeat in repeats
+        )
+        total, config = len(wanted) * len(repeats), inference_config(bench.config)
+        evaluate_elsewhere(bench.cluster, bench.evaluation, items, total, bench.runners, config)
+    for scene in progress_bar(wanted, desc="evaluate", unit="scene", disable=bench.cluster is not None):
         draws: dict[str, list[dict[str, float]]] = {}
-        for repeat in range(bench.config.repeats):
+        for repeat in repeats:
             item = lit_object(scene, folder, bench.config, repeat)
             scored: dict[str, dict[str, float]] = {}
             results = bench.evaluation.results(item, bench.runners, () if repeat else pictured)

@@ -8,11 +8,11 @@ import hashlib
 import importlib.metadata
 import json
 import logging
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -114,6 +114,10 @@ class ScoreCache:
         """Return the result of a key, or None."""
         return self._found.get(key)
 
+    def items(self) -> Iterable[tuple[tuple[str, ...], Any]]:
+        """Return all keys with their results."""
+        return self._found.items()
+
     def add(self, key: tuple[str, ...], value: Any) -> None:
         """Keep a result, in memory and at the end of the file."""
         self._found[key] = value
@@ -153,15 +157,39 @@ class Evaluation:
         images, found = None, []
         lights: Found = {}
         for runner in runners:
-            key, kept = (runner.method.name, runner.identity(), item.name, item.digest), runner.method.name in keep
-            maps = self.folder / "maps" / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.npz"
-            known = self._cache.get(key)
-            if known is None or (kept and known["normals"] and not maps.is_file()):
+            key, kept = _key(item, runner), runner.method.name in keep
+            known = self._known(key, kept)
+            if known is None:
                 images = item.load() if images is None else images
-                known = self._run(item, images, runner, maps if kept else None, lights)
+                known = self._run(item, images, runner, self._maps(key) if kept else None, lights)
                 self._cache.add(key, known)
-            found.append(_result(known, maps))
+            found.append(_result(known, self._maps(key)))
         return found
+
+    def lacks(self, item: TestObject, runners: "Sequence[Runner]", keep: Collection[str] = ()) -> bool:
+        """Tell whether `results` would have to run a method."""
+        return any(self._known(_key(item, runner), runner.method.name in keep) is None for runner in runners)
+
+    def entries(self) -> Iterator["Entry"]:
+        """Yield all that is known, for another evaluation to `adopt`."""
+        for key, known in self._cache.items():
+            maps = self._maps(key)
+            yield Entry(key, known, maps.read_bytes() if maps.is_file() else b"")
+
+    def adopt(self, entry: "Entry") -> None:
+        """Keep what another evaluation found."""
+        if entry.maps:
+            with atomic_path(self._maps(entry.key)) as temporary:
+                temporary.write_bytes(entry.maps)
+        self._cache.add(entry.key, entry.known)
+
+    def _maps(self, key: tuple[str, ...]) -> Path:
+        return self.folder / "maps" / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.npz"
+
+    def _known(self, key: tuple[str, ...], kept: bool) -> dict[str, Any] | None:
+        """Return what is known of a method and an object, None where a normal map is to be kept that is not there."""
+        known = self._cache.get(key)
+        return None if known and kept and known["normals"] and not self._maps(key).is_file() else known
 
     def _run(
         self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: "Found"
@@ -186,6 +214,18 @@ class Evaluation:
             "gains": np.round(np.asarray(estimate.intensities, np.float64), 6).tolist(),
             "notes": {name: estimate.diagnostics[name] for name in _NOTES if name in estimate.diagnostics},
         }
+
+
+class Entry(NamedTuple):
+    """A result as it is kept: under which key, its line, and the file of the normal map, empty where there is none."""
+
+    key: tuple[str, ...]
+    known: dict[str, Any]
+    maps: bytes
+
+
+def _key(item: TestObject, runner: "Runner") -> tuple[str, ...]:
+    return runner.method.name, runner.identity(), item.name, item.digest
 
 
 @cache

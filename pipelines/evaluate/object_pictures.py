@@ -1,11 +1,11 @@
 """Pictures of an evaluated object: its input, its true normals, and what methods made of them."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from pipelines.evaluate.evaluation import Result, TestObject
+from pipelines.report.sections import Tile
 from pipelines.shared import pictures
 from sdps.core.metrics import normal_error_map
 
@@ -17,8 +17,8 @@ Found = dict[str, dict[str, Result]]
 """Results by method, then object."""
 
 
-def tiles(item: TestObject, found: Found, shown: Sequence[str], truth: str = "true normals") -> list[tuple[str, Any]]:
-    """Return (caption, picture) of an object: input, true normals, each method's normals, errors and lights.
+def tiles(item: TestObject, found: Found, shown: Sequence[str], truth: str = "true normals") -> list[Tile]:
+    """Return pictures of an object: input, true normals, each method's normals, errors and lights.
 
     Args:
         item: The object.
@@ -29,24 +29,24 @@ def tiles(item: TestObject, found: Found, shown: Sequence[str], truth: str = "tr
     mask = item.mask
     brightest = _brightest(item)
     exposure = pictures.auto_exposure(brightest[None], mask)
-    result: list[tuple[str, Any]] = [("input", _fit(pictures.tone_map(brightest, exposure)))]
+    result = [Tile("input", _fit(pictures.tone_map(brightest, exposure)), "beside")]
     if item.normals is not None:
-        result.append((truth, _fit(pictures.normal_map(item.normals, mask))))
+        result.append(Tile(truth, _fit(pictures.normal_map(item.normals, mask)), "truth"))
     for name in shown:
         if item.name not in found.get(name, {}):
             continue
         one = found[name][item.name]
         normals = one.normals()
         if normals is not None:
-            result.append((f"normals, {name}", _fit(pictures.normal_map(normals, mask))))
+            result.append(Tile(f"normals, {name}", _fit(pictures.normal_map(normals, mask)), "normals"))
             if item.normals is not None:
                 errors = normal_error_map(normals, item.normals, mask)
                 text = f"{name}: error {np.nanmean(errors):.1f}°"
-                result.append((text, _fit(pictures.error_map(errors, ERROR_LIMIT))))
+                result.append(Tile(text, _fit(pictures.error_map(errors, ERROR_LIMIT)), "beside"))
         if "direction_mae" in one.scores:
             gains = one.intensities if len(one.intensities) else np.ones(len(one.light_directions))
             text = f"{name}: lights, {one.scores['direction_mae']:.1f}° (lines: to the true ones)"
-            result.append((text, pictures.light_plot(one.light_directions, gains, item.light_directions)))
+            result.append(Tile(text, pictures.light_plot(one.light_directions, gains, item.light_directions)))
     return result
 
 

@@ -89,7 +89,7 @@ class Workbench:
         out: The run's folder; MERL-Test scenes are shared with `eval-merltest`.
         runners: The methods.
         draws: Random choices per point, where a figure makes any.
-        cluster: Where scenes are rendered; this process when omitted.
+        cluster: Where scenes are rendered and, by `eval-merltest`, scored; this process when omitted.
     """
 
     preset: Preset

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from pipelines.report.sections import Table, read_sections
+from pipelines.report.sections import Section, Table, read_sections
 from pipelines.shared import pictures
 from pipelines.shared.presets import Preset
 from render.records.manifest import read_manifest
@@ -21,6 +21,7 @@ CURVES = (
     ("loss", "training loss"),
 )
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
+_SCRIPT = Path(__file__).with_name("page.js")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,9 +70,16 @@ def render(path: Path, folders: Sequence[Path], title: str, description: str) ->
     headings = [*(section.title for _, section in sections), *(part[0] for part in training)]
     page = fill(
         _TEMPLATE, title=title, description=description, headings=headings, sections=sections, training=training,
-        column_styles=column_styles, source=_source,
+        column_styles=column_styles, source=_source, script=_script(sections),
     )  # fmt: skip
     write_text(path, page)
+
+
+def _script(sections: Sequence[tuple[Path, Section]]) -> str:
+    """Return the page's script, or nothing where no picture needs it."""
+    strips = (strip for _, section in sections for strip in section.strips)
+    needed = any(picture.kind for strip in strips for picture in strip.pictures)
+    return _SCRIPT.read_text(encoding="utf-8") if needed else ""
 
 
 def column_styles(table: Table) -> list[str]:

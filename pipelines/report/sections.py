@@ -7,6 +7,7 @@ the sections under a folder into one self-contained page.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,6 +19,15 @@ from render.shared.files import atomic_folder, is_plain_name, read_json, write_j
 
 FOLDER = "report"
 _FILE = "section.json"
+KINDS = ("", "normals", "truth", "beside")
+
+
+class Tile(NamedTuple):
+    """A picture of a row, (H, W, 3) uint8 or a figure, its caption, and its kind (`Picture.kind`)."""
+
+    caption: str
+    picture: np.ndarray | Image.Image | Figure
+    kind: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,13 +59,18 @@ class Picture:
         caption: What it shows; also its alternative text.
         file: Its file in the section's folder.
         wide: A chart or sheet, shown at its own width rather than as a tile of a strip.
+        kind: What the page can do with it: `normals` and `truth` are maps of normals, found and true; `beside` is of
+            the same pixels; empty for all else.
     """
 
     caption: str
     file: str
     wide: bool = False
+    kind: str = ""
 
     def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError(f"kind: {self.kind!r} is none of {', '.join(filter(None, KINDS))}")
         if not is_plain_name(self.file):
             raise InputError(f"file: {self.file!r} is not the name of a picture in the section's folder")
 
@@ -111,14 +126,14 @@ class SectionWriter:
         self._pictures: dict[str, np.ndarray | Image.Image | Figure] = {}
 
     def strip(
-        self, title: str, tiles: Sequence[tuple[str, np.ndarray | Image.Image | Figure]], *, wide: bool = False
+        self, title: str, tiles: Sequence[Tile | tuple[str, np.ndarray | Image.Image | Figure]], *, wide: bool = False
     ) -> None:
-        """Add a row of (caption, picture); arrays are (H, W, 3) uint8."""
+        """Add a row of tiles, or of (caption, picture); arrays are (H, W, 3) uint8."""
         pictures = []
-        for caption, picture in tiles:
+        for caption, picture, kind in (Tile(*tile) for tile in tiles):
             name = f"{len(self._pictures):03d}.png"
             self._pictures[name] = picture
-            pictures.append(Picture(caption=caption, file=name, wide=wide))
+            pictures.append(Picture(caption=caption, file=name, wide=wide, kind=kind))
         self._strips.append(Strip(title=title, pictures=tuple(pictures)))
 
     def write(self, out: Path) -> Path:

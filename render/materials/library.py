@@ -77,6 +77,13 @@ def load(name_or_path: str | Path) -> AnyMaterial:
     return _builtin(text)
 
 
+def own_file(name: str) -> Path | None:
+    """Return the file or folder of maps that a material's name stands for, None for one of this package."""
+    if textured.is_textured(name):
+        return textured.folder(name)
+    return Path(name) if Path(name).suffix.lower() in (".yaml", ".yml", merl.SUFFIX, ".bsdf") else None
+
+
 @lru_cache(maxsize=16)
 def _measured(path: str, changed: int) -> "MerlTable | RglMaterial":
     """Read a measured file; `changed` is the time of its last change, so that a rewritten one is read again."""

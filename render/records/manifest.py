@@ -13,7 +13,7 @@ import numpy as np
 
 from render.shared.config import build, to_plain
 from render.shared.errors import InputError
-from render.shared.files import is_plain_name, read_jsonl, read_whole_lines, write_jsonl
+from render.shared.files import is_plain_name, read_jsonl, read_whole_lines, write_text
 
 MANIFEST = "manifest.jsonl"
 FAILED = "failed.jsonl"
@@ -124,6 +124,10 @@ class SceneSpec:
         """Return the SHA-256 of the whole line, which its shard carries."""
         return hashlib.sha256(json.dumps(self.row(), sort_keys=True).encode()).hexdigest()
 
+    def line(self) -> str:
+        """Return the manifest line, with its end."""
+        return json.dumps(self.row()) + "\n"
+
     def row(self) -> dict[str, Any]:
         """Return the manifest line; what was added later stands in it only where it is used, so that bytes stay."""
         view = {key: value for key, value in to_plain(self.view).items() if value is not None}
@@ -147,7 +151,12 @@ class SceneSpec:
 
 def write_manifest(folder: str | Path, scenes: Sequence[SceneSpec]) -> None:
     """Write `manifest.jsonl` in `folder`, atomically."""
-    write_jsonl(Path(folder) / MANIFEST, [scene.row() for scene in scenes])
+    write_text(Path(folder) / MANIFEST, manifest_text(scenes))
+
+
+def manifest_text(scenes: Sequence[SceneSpec]) -> str:
+    """Return the content of `manifest.jsonl`: a line per scene."""
+    return "".join(scene.line() for scene in scenes)
 
 
 def claim(folder: str | Path, scenes: Sequence[SceneSpec]) -> None:

@@ -1,20 +1,23 @@
-"""A data folder in object storage, seen through a folder on this disk.
+"""A data folder in object storage, or a packed one anywhere, seen through a folder on this disk.
 
 The folder, the mirror, holds the small files (manifest, ledger, reports), a listing of the shards, and as many of the
-shards as `--cache-gb` allows, fetched when they are asked for. All that reads a data folder reads a mirror: it asks
-`shard_path` for a shard's file, and `finished` for which there are.
+shards as `--cache-gb` allows, fetched when they are asked for; of a packed set whole tars are, and unpacked. All that
+reads a data folder reads a mirror: it asks `shard_path` for a shard's file, and `finished` for which there are.
 """
 
 import json
 import os
+import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 from render.records.manifest import FAILED, MANIFEST, SceneSpec
+from render.records.packs import PACK, Plan, read_plan, unpacked
 from render.records.shards import file_hash, is_sealed
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, parse_json, read_bytes, write_text
@@ -54,20 +57,49 @@ class Mirror:
         with suppress(OSError):
             os.utime(path)  # the cache forgets what was not used for longest
             return path
-        for _ in range(2):  # damaged on the way: once more
-            data = self.store.read(scene.file)
-            if is_sealed(data):
-                break
-        else:
-            raise Damaged(f"{self.store.url}/{scene.file}: truncated or altered; remove it and render it again")
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(data)
+        name = self.holder(scene)
+        assert name is not None, scene.file
+        with _one_process(self.folder / f".{name.replace('/', '-')}.lock", only=name != scene.file):
+            if path.is_file():  # unpacked by another process meanwhile
+                return path
+            for id, data in self._shards(name, scene).items():
+                with atomic_path(self.folder / SHARDS / f"{id}.exr") as temporary:
+                    temporary.write_bytes(data)
         self._make_room()
         return path
 
+    def _shards(self, name: str, scene: SceneSpec) -> dict[str, bytes]:
+        """Return the shards of an object by scene, which is one shard or a tar."""
+        for _ in range(2):  # damaged on the way: once more
+            data = self.store.read(name)
+            if name != scene.file:
+                found = unpacked(data, self.plan[name])
+                if found is not None:
+                    return found
+            elif is_sealed(data):
+                return {scene.id: data}
+        again = "render it again" if name == scene.file else "pack it again"
+        raise Damaged(f"{self.store.url}/{name}: truncated or altered; remove it and {again}")
+
+    @cached_property
+    def plan(self) -> Plan:
+        """The tars of a packed set that are there; none of a folder of shards."""
+        tars = read_plan(self.folder) if PACK in self.objects else {}
+        return {name: scenes for name, scenes in tars.items() if name in self.objects}
+
+    @cached_property
+    def tars(self) -> dict[str, str]:
+        """The tar of every scene of a packed set."""
+        return {id: name for name, scenes in self.plan.items() for id in scenes}
+
+    def holder(self, scene: SceneSpec) -> str | None:
+        """Return the object that holds a shard: itself or a tar; None where there is none."""
+        return scene.file if scene.file in self.objects else self.tars.get(scene.id)
+
     def sizes(self) -> dict[str, int]:
         """Return the bytes of every shard in the store by scene id."""
-        return {
+        packed = {id: size for scenes in self.plan.values() for id, size in scenes.items()}
+        return packed | {
             name[len(SHARDS) + 1 : -4]: what.size
             for name, what in self.objects.items()
             if name.startswith(f"{SHARDS}/") and name.endswith(".exr")
@@ -79,7 +111,8 @@ class Mirror:
         for name in (SHARDS, "cache"):
             for entry in os.scandir(self.folder / name) if (self.folder / name).is_dir() else ():
                 # Shards that are not in the store yet must stay; another process may have removed a file meanwhile.
-                if not entry.name.startswith(".") and (name == "cache" or f"{name}/{entry.name}" in self.objects):
+                known = name == "cache" or f"{name}/{entry.name}" in self.objects or entry.name[:-4] in self.tars
+                if known and not entry.name.startswith("."):
                     with suppress(FileNotFoundError):
                         files.append((entry.stat(), entry.path))
         total = sum(status.st_size for status, _ in files)
@@ -96,6 +129,8 @@ class Mirror:
         stale = [name for name, what in before.items() if self.objects.get(name) != what]
         for name in stale:
             (self.folder / name).unlink(missing_ok=True)
+        if PACK in stale:
+            shutil.rmtree(self.folder / SHARDS, ignore_errors=True)
         small = [name for name in self.objects if "/" not in name or name.startswith(f"{LOG}/")]
         for path in self.folder.glob("*.*"):
             if path.is_file() and path.name not in self.objects and not path.name.startswith("."):
@@ -120,6 +155,9 @@ class Mirror:
         try:
             rows = [line.split(maxsplit=1) for line in self.store.read(CHECKSUMS).decode().splitlines()]
         except Missing as error:
+            if PACK in self.store.look([PACK]):
+                self._fetch_small(PACK)
+                return self.store.look([MANIFEST, PACK, *read_plan(self.folder)])
             raise InputError(
                 f"{self.store.url}: no {CHECKSUMS} there, and a web server has no listing; write it with `sdps data "
                 "card` before publishing, or name the data folder"
@@ -184,14 +222,14 @@ def _mirror_at(folder: Path, _: int, __: int) -> Mirror:
 
 @contextmanager
 def opened(place: str | Path, cache_gb: float = CACHE_GB, purpose: str = "read") -> Iterator[Path]:
-    """Yield a folder of this disk that stands for a data folder: itself, or a mirror of one in a store.
+    """Yield a folder of this disk that stands for a data folder: itself, or a mirror of one in a store, or packed.
 
     What a command writes into the mirror beside shards (a report, a card) is sent when it ends well.
 
     Raises:
         InputError: the store cannot be read; a cache of no size.
     """
-    url = address(place)
+    url = mirrored(place)
     if url is None:
         yield Path(place)
         return
@@ -202,10 +240,17 @@ def opened(place: str | Path, cache_gb: float = CACHE_GB, purpose: str = "read")
         known = mirror_of(folder)
         mirror = Mirror(folder, url, round(cache_gb * 1e9), known.objects if known else {})
         mirror.refresh()
+        if purpose == "run" and PACK in mirror.objects:
+            raise InputError(f"{url}: holds a packed set, which is only read; choose another --out")
         if purpose != "run" and MANIFEST not in mirror.objects:
             raise InputError(f"{url}: no {MANIFEST} there; name a data folder, such as s3://bucket/run/data")
         yield folder
         publish(folder)
+
+
+def mirrored(place: str | Path) -> str | None:
+    """Return the address of a data folder that is read through a mirror, which a packed one on this disk is, too."""
+    return address(place) or (f"file://{Path(place).resolve()}" if (Path(place) / PACK).is_file() else None)
 
 
 def publish(folder: Path) -> None:
@@ -218,20 +263,33 @@ def publish(folder: Path) -> None:
 @contextmanager
 def _alone(folder: Path, url: str) -> Iterator[None]:
     """Hold a mirror that shards are rendered into; a second run on this machine would send the first one's shards."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with _one_process(folder / ".lock", wait=False):
+            yield
+    except BlockingIOError as error:
+        raise InputError(
+            f"{url}: another run on this machine renders into it; wait for it, or give this one a cache of its own "
+            "(SDPS_CACHE=FOLDER)"
+        ) from error
+
+
+@contextmanager
+def _one_process(path: Path, *, wait: bool = True, only: bool = True) -> Iterator[None]:
+    """Hold a lock among the processes of this machine; with `only` false, or on Windows, hold none.
+
+    Raises:
+        BlockingIOError: with `wait` false, another process holds it.
+    """
     try:
         import fcntl
-    except ImportError:  # not on Windows
+    except ImportError:
+        only = False
+    if not only:
         yield
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / ".lock", "w") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise InputError(
-                f"{url}: another run on this machine renders into it; wait for it, or give this one a cache of its own "
-                "(SDPS_CACHE=FOLDER)"
-            ) from error
+    with open(path, "w") as handle:
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         yield
 
 
@@ -248,7 +306,7 @@ def shard_path(folder: Path, scene: SceneSpec) -> Path:
         InputError: the store cannot be read; `Damaged`: what it holds is not whole.
     """
     mirror = mirror_of(folder)
-    return mirror.fetch(scene) if mirror and scene.file in mirror.objects else folder / scene.file
+    return mirror.fetch(scene) if mirror and mirror.holder(scene) else folder / scene.file
 
 
 def kept(folder: Path, *paths: Path) -> bool:
@@ -268,7 +326,7 @@ def finished(folder: str | Path, scenes: Iterable[SceneSpec]) -> list[SceneSpec]
     folder = Path(folder)
     mirror = mirror_of(folder)
     if mirror:
-        return [scene for scene in scenes if scene.file in mirror.objects or (folder / scene.file).is_file()]
+        return [scene for scene in scenes if mirror.holder(scene) or (folder / scene.file).is_file()]
     return [scene for scene in scenes if (folder / scene.file).is_file()]
 
 
@@ -279,7 +337,26 @@ def stored_size(folder: Path, scene: SceneSpec) -> tuple[int, str]:
         FileNotFoundError: there is no such shard.
     """
     mirror = mirror_of(folder)
-    if mirror and scene.file in mirror.objects:
-        return mirror.objects[scene.file]
+    if mirror and (name := mirror.holder(scene)):
+        size, version = mirror.objects[name]
+        return (size if name == scene.file else mirror.plan[name][scene.id]), version
     status = (folder / scene.file).stat()
     return status.st_size, str(status.st_mtime_ns)
+
+
+class Packed(NamedTuple):
+    """How scenes of a packed set are stored and kept: the tar of each, the bytes of their shards, and the cache's."""
+
+    tars: list[str]
+    size: int
+    limit: int
+
+
+def packed_as(folder: Path, scenes: Sequence[SceneSpec]) -> Packed | None:
+    """Return how finished scenes are packed; None where they are files or objects of their own."""
+    mirror = mirror_of(folder)
+    if mirror is None or not mirror.tars:
+        return None
+    tars = [mirror.tars[scene.id] for scene in scenes]
+    sizes = (mirror.plan[tar][scene.id] for tar, scene in zip(tars, scenes, strict=True))
+    return Packed(tars, sum(sizes), mirror.limit)

@@ -65,6 +65,7 @@ class LocalCrew:
         threads: Threads of each; 0 shares the cores among them.
         memory: Bytes of memory each may take, where the system tells; 0: any.
         serve: What a process runs.
+        commit: The code's commit, for the shards' headers; None: that of this machine's copy.
     """
 
     note, chunk_bytes = "", 0
@@ -80,9 +81,10 @@ class LocalCrew:
         threads: int = 0,
         memory: int = 0,
         serve: Callable[..., None] = serve,
+        commit: str | None = None,
     ) -> None:
         self.folder, self.errors, self.timeout, self.recycle = folder, errors, timeout, recycle
-        self.threads, self.memory, self.serve = threads, memory, serve
+        self.threads, self.memory, self.serve, self.commit = threads, memory, serve, commit
         self.choice = variant.choose()
         self.slots = workers or budget.default_workers(self.choice.variant)
         self.count = 1
@@ -142,7 +144,7 @@ class LocalCrew:
             config = WorkerConfig(
                 folder=self.folder, number=self.started, threads=self.threads or max(1, budget.cores() // self.count),
                 variant=self.choice.variant, llvm=str(self.choice.llvm) if self.choice.llvm else None,
-                errors=self.errors / f"{self.started}.txt",
+                errors=self.errors / f"{self.started}.txt", commit=self.commit,
             )  # fmt: skip
             self.workers.append(Worker(self.serve, config))
             self.started += 1

@@ -33,11 +33,12 @@ def serve(connection: Connection, config: WorkerConfig) -> None:
         try:
             import drjit as dr
 
-            from render.running import worker
+            from render.running import rendered, worker
         except InputError as error:
             connection.send(Fatal(str(error)))
             return
         dr.set_thread_count(config.threads)
+        rendered.stamp(config.commit)
         connection.send(Ready())
         while (chunk := connection.recv()) is not None:
             try:

@@ -14,6 +14,7 @@ class WorkerConfig(NamedTuple):
         variant: Mitsuba variant, chosen by the parent.
         llvm: Path of libLLVM, chosen by the parent.
         errors: File that takes its standard error.
+        commit: The code's commit, for the shards' headers; None: that of this machine's copy.
     """
 
     folder: Path
@@ -22,6 +23,7 @@ class WorkerConfig(NamedTuple):
     variant: str
     llvm: str | None
     errors: Path
+    commit: str | None = None
 
 
 class Ready(NamedTuple):

@@ -8,23 +8,27 @@ import hashlib
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
-from functools import cache
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 import assets
+from render.materials import library
+from render.materials.textures import map_folder
 from render.planning import provenance
 from render.planning.chunks import Chunk
+from render.planning.composition import components
 from render.records.manifest import SceneSpec
+from render.records.shards import file_hash
 from render.running.crew import LocalCrew, News
 from render.running.isolation import serve
 from render.running.messages import Done, Fatal
 from render.shared.errors import InputError
 from render.shared.files import source_digest
 
+_FILE = "file "  # before the path of what is no part of the package
 IDLE = 60.0  # seconds after which a process without work ends: its run may be gone
-_OWN = (".yaml", ".yml", ".binary", ".bsdf", ".obj", ".ply", ".stl", ".gz")
 
 
 class Task(NamedTuple):
@@ -34,8 +38,9 @@ class Task(NamedTuple):
         run: Name of the run, for `stop`.
         chunk: What to render.
         digest: Of the manifest lines of its scenes, as planned.
-        needs: What the worker must have (`installed`), and the files the chunk names with their hashes.
+        needs: What the worker must have (`needed`).
         timeout: Seconds without a finished scene after which the process is stopped.
+        commit: The run's commit, for the shards' headers: workers of the same code may be no checkouts.
         serve: What the rendering process runs.
     """
 
@@ -44,6 +49,7 @@ class Task(NamedTuple):
     digest: str
     needs: dict[str, str]
     timeout: float
+    commit: str
     serve: Callable[..., None] = serve
 
 
@@ -70,14 +76,41 @@ def installed() -> dict[str, str]:
     return found | {"code of the renderer": code, "fitted materials": materials.hexdigest()[:12]}
 
 
-def own_files(chunk: Chunk) -> dict[str, str]:
-    """Return {path: hash} of the files that the chunk's shape and materials are; `missing` where there is none."""
-    names = {chunk.shape, *(scene.material for group in chunk.groups for scene in group)}
-    paths = {name: Path(name) for name in names if name.lower().endswith(_OWN)}
-    return {
-        f"file {name}": hashlib.sha256(path.read_bytes()).hexdigest()[:12] if path.is_file() else "missing"
-        for name, path in paths.items()
-    }
+def needed(shapes: Iterable[str], materials: Iterable[str]) -> dict[str, str]:
+    """Return what is `installed`, and {path: hash} of the meshes, material files and folders of maps that names are."""
+    from render.shapes import registry  # loads what meshes need
+
+    parts = {part for material in set(materials) for part in components(material)}
+    places = {*map(registry.own_file, shapes), *map(library.own_file, parts)}
+    return installed() | {f"{_FILE}{place}": _content(place) for place in places if place is not None}
+
+
+def _content(place: Path) -> str:
+    """Return the first digits of the hash of a file, or of a folder of maps."""
+    try:
+        files = sorted(map_folder.find(place).values()) if place.is_dir() else [place]
+        states = [(str(file), (state := file.stat()).st_mtime_ns, state.st_size) for file in files]
+        return _hashed(tuple(states))
+    except (OSError, InputError):
+        return "missing"
+
+
+@lru_cache(maxsize=4096)
+def _hashed(files: tuple[tuple[str, int, int], ...]) -> str:
+    """Return one hash of files, given with time of change and size, which tell when to read them again."""
+    whole = hashlib.sha256()
+    for path, _, _ in files:
+        whole.update(Path(path).name.encode() + bytes.fromhex(file_hash(path)))
+    return whole.hexdigest()[:12]
+
+
+@cache
+def _commit() -> str:
+    return provenance.commit()
+
+
+def _needs(chunk: Chunk) -> dict[str, str]:
+    return needed([chunk.shape], (scene.material for group in chunk.groups for scene in group))
 
 
 def lines_digest(scenes: Sequence[SceneSpec]) -> str:
@@ -87,7 +120,7 @@ def lines_digest(scenes: Sequence[SceneSpec]) -> str:
 
 def task_of(run: str, chunk: Chunk, timeout: float, serve: Callable[..., None] = serve) -> Task:
     """Return the task of a chunk, with what a worker must agree on."""
-    return Task(run, chunk, lines_digest(chunk.scenes()), installed() | own_files(chunk), timeout, serve)
+    return Task(run, chunk, lines_digest(chunk.scenes()), _needs(chunk), timeout, _commit(), serve)
 
 
 def check(task: Task) -> None:
@@ -96,10 +129,11 @@ def check(task: Task) -> None:
     Raises:
         Mismatch: the first thing that differs.
     """
-    here = installed() | own_files(task.chunk)
+    here = _needs(task.chunk)
     for name, there in task.needs.items():
-        if here.get(name) != there:
-            raise Mismatch(f"has {name} {here.get(name, 'of none')}, the run {there}; install the same sdps on both")
+        if (found := here.get(name, "missing")) != there:
+            remedy = "put it under the same path there" if name.startswith(_FILE) else "install the same sdps on both"
+            raise Mismatch(f"has {name} {found}, the run {there}; {remedy}")
     if lines_digest(task.chunk.scenes()) != task.digest:
         raise Mismatch("reads the plan otherwise than it was written; install the same sdps on both")
 
@@ -114,7 +148,7 @@ class Station:
 
     def __init__(self, folder: Path, memory: int = 0) -> None:
         self.folder, self.memory = folder, memory
-        self.idle: list[tuple[Callable[..., None], LocalCrew]] = []
+        self.idle: list[LocalCrew] = []
         self.lock = threading.Lock()
         self.stopped: set[str] = set()
         self.timer: threading.Timer | None = None
@@ -141,7 +175,7 @@ class Station:
             self._remove(crew)
             raise
         if ended:
-            self._give_back(task.serve, crew)
+            self._give_back(crew)
         else:
             self._remove(crew)
         return Rendered(news, shards)
@@ -155,27 +189,28 @@ class Station:
         """End the idle processes."""
         with self.lock:
             crews, self.idle = self.idle, []
-        for _, crew in crews:
+        for crew in crews:
             self._remove(crew)
 
     def _borrow(self, task: Task) -> LocalCrew:
         with self.lock:
             if self.timer is not None:
                 self.timer.cancel()
-            for entry in self.idle:
-                if entry[0] is task.serve:
-                    self.idle.remove(entry)
-                    entry[1].timeout = task.timeout
-                    return entry[1]
+            for crew in self.idle:
+                if crew.serve is task.serve and crew.commit == task.commit:
+                    self.idle.remove(crew)
+                    crew.timeout = task.timeout
+                    return crew
         self.folder.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(prefix="sdps-", dir=self.folder))
         return LocalCrew(
-            folder, folder, workers=1, timeout=task.timeout, threads=1, memory=self.memory, serve=task.serve
-        )
+            folder, folder, workers=1, timeout=task.timeout, threads=1, memory=self.memory, serve=task.serve,
+            commit=task.commit,
+        )  # fmt: skip
 
-    def _give_back(self, serve: Callable[..., None], crew: LocalCrew) -> None:
+    def _give_back(self, crew: LocalCrew) -> None:
         with self.lock:
-            self.idle.append((serve, crew))
+            self.idle.append(crew)
             self.timer = threading.Timer(IDLE, self.dismiss)
             self.timer.daemon = True
             self.timer.start()

@@ -30,6 +30,11 @@ def name_of(path: Path, up: str) -> str:
     return f"{OWN_MESHES}:{up}:{_digits(path)}:{path.as_posix()}"
 
 
+def path_of(name: str) -> Path:
+    """Return the file of a name."""
+    return Path(name.split(":", 3)[-1])
+
+
 def load_named(name: str) -> TriangleMesh:
     """Read the mesh of a name, y up, in the unit sphere.
 

@@ -53,6 +53,14 @@ def load(name: str) -> TriangleMesh:
         return _load(name)
 
 
+def own_file(name: str) -> Path | None:
+    """Return the mesh file that a name stands for, None for a shape of this package."""
+    base, colon, _ = name.partition(":")
+    if base == OWN_MESHES and colon:
+        return own_meshes.path_of(name)
+    return None if base in FAMILIES else Path(name)
+
+
 def _load(name: str) -> TriangleMesh:
     base, colon, text = name.partition(":")
     if base == OWN_MESHES and colon:

@@ -10,6 +10,7 @@ import hashlib
 import logging
 import os
 import re
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -27,6 +28,7 @@ _VERSIONS = ("ETag", "etag", "generation", "md5Hash", "mtime", "LastModified", "
 _DRIVERS = {"botocore", "aiobotocore", "aiohttp", "google", "gcsfs", "azure", "requests", "urllib3"}
 """Packages whose errors tell of the connection or the store; errors of others are defects."""
 _OPTIONS = {"s3": {"max_concurrency": 1}}  # else every read begins with a request for the size
+_INSTALL = {"s3": "sdps[storage]", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
 _HOPELESS = {errno.EINVAL, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EROFS}
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -86,7 +88,9 @@ class Store:
 
             return url_to_fs(self.url, **_OPTIONS.get(self.url.partition(":")[0], {}))
         except ImportError as error:
-            raise InputError(f"{self.url}: {error}; pip install 'sdps[storage]', or the driver it names") from error
+            python = f"{sys.executable} -m " if sys.executable else ""
+            driver = _INSTALL.get(self.url.partition(":")[0], _INSTALL["s3"])
+            raise InputError(f"{self.url}: needs a driver: {python}pip install '{driver}'") from error
         except ValueError as error:
             raise InputError(f"{self.url}: {error}; use s3://, gs://, az:// or https://") from error
 
@@ -127,20 +131,15 @@ class Store:
     def write(self, name: str, data: bytes) -> Stored:
         """Write an object, in place of what is there; its version is left to the next listing."""
         driver, root = self._open()
-        path = f"{root}/{name}"
-        if "file" in driver.protocol:
-            driver.makedirs(path.rpartition("/")[0], exist_ok=True)
-        self._patiently("write", name, lambda: driver.pipe_file(path, data))
+        self._patiently("write", name, lambda: _put(driver, f"{root}/{name}", data))
         self.sent += len(data)
         return Stored(len(data), "")
 
     def create(self, name: str, data: bytes) -> bool:
         """Write an object unless there is one; return whether it was written."""
         driver, root = self._open()
-        if "file" in driver.protocol:
-            driver.makedirs(root, exist_ok=True)
         try:
-            self._patiently("write", name, lambda: driver.pipe_file(f"{root}/{name}", data, mode="create"))
+            self._patiently("write", name, lambda: _put(driver, f"{root}/{name}", data, mode="create"))
         except FileExistsError:
             return False
         return True
@@ -178,6 +177,25 @@ class Store:
                 told = True
             self.stopped.wait(min(pause, left))
             pause = min(2 * pause, 20.0)
+
+
+def _put(driver: Any, path: str, data: bytes, **mode: str) -> None:
+    """Write an object whole or not at all, which a folder does not do by itself.
+
+    Raises:
+        FileExistsError: with mode `create`, there is one.
+    """
+    if "file" not in driver.protocol:
+        driver.pipe_file(path, data, **mode)
+        return
+    folder, _, name = path.rpartition("/")
+    part = f"{folder}/.{name}.{os.getpid()}.part"
+    driver.makedirs(folder, exist_ok=True)
+    try:
+        driver.pipe_file(part, data)
+        (os.link if mode else os.replace)(part, path)
+    finally:
+        Path(part).unlink(missing_ok=True)
 
 
 def _stored(info: dict[str, Any]) -> Stored:

@@ -4,7 +4,7 @@ The position in an endless stream of samples determines everything about a sampl
 augmentation, crop. So a run is resumed exactly by one integer, and no two workers share a random stream.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from torch.nn import functional
 from torch.utils.data import Dataset
 
 from render.records.manifest import SceneSpec
+from render.records.mirror import packed_as
 from render.shared.errors import InputError
 from render.shared.imaging.mixing import LightStage, mix, require_enough
 from render.shared.seeds import generator
@@ -24,6 +25,7 @@ from sdps.data.augment import Augmentation, augment
 from sdps.data.scene_store import PackedImages, SceneStore, StoredScene, finished_scenes, require_equal_counts
 
 _CROP_DRAWS = 8
+_WITH_DECODED = 2.5  # bytes of shards and decoded scenes together, over those of the shards
 
 
 class Batch(NamedTuple):
@@ -81,7 +83,7 @@ class SceneDataset(Dataset[Any]):
         folder: Data folder with a manifest and shards.
         split: `train`, `val` or `test`; the split also names the random stream.
         options: How samples are made.
-        cache: Keep decoded scenes in `<folder>/cache`.
+        cache: Keep decoded scenes in `<folder>/cache`, unless the folder is packed and larger than its cache.
         skip_missing: Leave out planned scenes that have no shard instead of refusing. Scenes that could not be
             rendered (`failed.jsonl`) are left out in any case, with a warning.
 
@@ -100,8 +102,11 @@ class SceneDataset(Dataset[Any]):
     ) -> None:
         self.split = split
         self.options = options
-        self.store = SceneStore(Path(folder), cache=cache)
         self.scenes = finished_scenes(Path(folder), split, skip_missing=skip_missing)
+        self.packed = packed_as(Path(folder), self.scenes)
+        # Scenes of a set that does not fit would leave the cache before they are used a second time.
+        fits = self.packed is None or self.packed.limit > _WITH_DECODED * self.packed.size
+        self.store = SceneStore(Path(folder), cache=cache and fits)
         require_lights(folder, self.scenes, options)
 
     def __len__(self) -> int:
@@ -225,35 +230,6 @@ def collate(samples: Sequence[Batch | InputError]) -> Batch | InputError:
             return sample
         whole.append(sample)
     return Batch(*(torch.stack(tensors) for tensors in zip(*whole, strict=True)))
-
-
-class SampleStream:
-    """Batches of sample keys, endlessly: every epoch a new permutation of the scenes, joined end to end.
-
-    Batches run across epoch borders, so the state of the stream is the number of samples already taken.
-
-    Args:
-        scenes: Number of scenes.
-        batch: Samples per batch.
-        seed: Root seed.
-        taken: Samples taken before this run.
-        part: Which samples of every batch to yield; all by default.
-    """
-
-    def __init__(self, scenes: int, batch: int, seed: int, taken: int = 0, part: slice = slice(None)) -> None:
-        self.scenes, self.batch, self.seed, self.taken, self.part = scenes, batch, seed, taken, part
-
-    def __iter__(self) -> Iterator[list[SampleKey]]:
-        epoch, position = divmod(self.taken, self.scenes)
-        keys = []
-        while True:
-            order = generator(self.seed, "order", epoch).permutation(self.scenes)
-            for place in range(position, self.scenes):
-                keys.append(SampleKey(int(order[place]), epoch, place))
-                if len(keys) == self.batch:
-                    yield keys[self.part]
-                    keys = []
-            epoch, position = epoch + 1, 0
 
 
 def _rescale(

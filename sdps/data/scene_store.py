@@ -75,6 +75,10 @@ class SceneStore:
         self.folder = folder
         self.cache = cache
 
+    def fetch(self, scene: SceneSpec) -> None:
+        """Bring a scene's shard to this disk, where the folder's shards lie elsewhere; InputError as in `load`."""
+        shard_path(self.folder, scene)
+
     def load(self, scene: SceneSpec) -> StoredScene:
         """Return one scene.
 
@@ -118,7 +122,7 @@ def finished_scenes(folder: Path, split: str, *, skip_missing: bool = False) -> 
     if not scenes or (missing - failed and not skip_missing):
         raise InputError(
             f"{folder}: {len(missing)} of {len(planned)} shards of split {split!r} are missing; finish it with "
-            "`sdps render-data` or set skip_missing"
+            "`sdps render-data` (a packed set with `sdps data pack`) or set skip_missing"
         )
     if failed:
         about = "%s: %d of %d scenes of split %r could not be rendered (%s) and are left out"

@@ -14,7 +14,8 @@ from render.records.manifest import MANIFEST
 from render.records.shards import file_hash
 from render.shared.errors import InputError
 from sdps.core.interrupts import leave_signals_to_parent
-from sdps.data.dataset import Batch, SampleStream, SceneDataset, collate
+from sdps.data.dataset import Batch, SceneDataset, collate
+from sdps.data.order import PackedOrder, SampleStream
 
 
 class BatchSource(Protocol):
@@ -80,9 +81,10 @@ class StoredScenes:
         pin_memory: Hand out page-locked tensors, which a GPU copies while it computes.
         rank: Number of this process among those that train together.
         world: Number of processes that train together.
+        window: Of a packed set, scenes among which the order is drawn (`sdps.data.order`).
 
     Raises:
-        InputError: `world` does not divide `batch`.
+        InputError: `world` does not divide `batch`, or the cache of a packed set is too small for the window.
     """
 
     def __init__(
@@ -94,10 +96,12 @@ class StoredScenes:
         pin_memory: bool = False,
         rank: int = 0,
         world: int = 1,
+        window: int = 1024,
     ) -> None:
         self.dataset, self.batch, self.workers, self.pin_memory = dataset, batch, workers, pin_memory
         self.scenes = len(dataset)
         self._part = share_of_batch(batch, rank, world)
+        self._packed = PackedOrder(dataset, dataset.packed, window) if dataset.packed else None
         self._running: Generator[Batch | InputError, None, None] | None = None
 
     def batches(self, taken: int) -> Iterator[Batch | InputError]:
@@ -107,10 +111,13 @@ class StoredScenes:
         return self._running
 
     def _load(self, taken: int) -> Generator[Batch | InputError, None, None]:
+        seed, packed = self.dataset.options.seed, self._packed
+        windows = packed.windows if packed else None
+        keys = SampleStream(self.scenes, self.batch, seed, taken, self._part, windows)
         # The generator alone holds the loader, so closing it ends the workers.
         yield from DataLoader(
             self.dataset,
-            batch_sampler=SampleStream(self.scenes, self.batch, self.dataset.options.seed, taken, self._part),
+            batch_sampler=packed.fetching(keys, self.batch) if packed else keys,
             num_workers=self.workers,
             collate_fn=collate,
             pin_memory=self.pin_memory,
@@ -119,8 +126,9 @@ class StoredScenes:
         )
 
     def identity(self) -> dict[str, Any]:
-        """Return the hash of the manifest and the number of scenes that have a shard."""
-        return {"data": file_hash(self.dataset.store.folder / MANIFEST), "scenes": self.scenes}
+        """Return the hash of the manifest, the number of scenes that have a shard, and how a packed set is shuffled."""
+        about = {"data": file_hash(self.dataset.store.folder / MANIFEST), "scenes": self.scenes}
+        return about | (self._packed.identity() if self._packed else {})
 
     def close(self) -> None:
         """End the loader's processes."""

@@ -84,6 +84,7 @@ class Runner:
         lights: np.ndarray | None,
         intensities: np.ndarray | None,
         found: Found | None = None,
+        saturation: float = float("inf"),
     ) -> Estimate:
         """Run the method; of the lights it sees what it is to be given.
 
@@ -93,6 +94,7 @@ class Runner:
             lights: (L, 3) directions, or None where the method is given none.
             intensities: (L,) or (L, 3), or None where they are not known.
             found: Lights that methods found of these very images, by what they depend on; read, and added to.
+            saturation: Radiance from which on a channel is clipped, which refinement then leaves out.
 
         Raises:
             InputError: images or lights the method cannot work with, in one line.
@@ -104,7 +106,7 @@ class Runner:
         if TRUE_LIGHTS in (method.lights, method.intensities) and intensities is not None:
             given["intensities"] = intensities
         estimate = self._estimate(images, mask, given, found)
-        return self._refine(images, mask, estimate, given) if method.refined else estimate
+        return self._refine(images, mask, estimate, given, saturation) if method.refined else estimate
 
     def _estimate(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
         """Run the method proper on what it is given."""
@@ -150,7 +152,9 @@ class Runner:
         normals[scene.rows, scene.columns] = estimate.normals
         return replace(estimate, normals=normals)
 
-    def _refine(self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any]) -> Estimate:
+    def _refine(
+        self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any], saturation: float
+    ) -> Estimate:
         """Refine an estimate, or keep it where refinement cannot be trusted; lights it was given stay."""
         from sdps.refinement.refine import refine
         from sdps.refinement.trust import trust
@@ -166,7 +170,7 @@ class Runner:
         refined = refine(
             images, mask, estimate.normals, estimate.light_directions, begun,
             known=frozenset(name for key, name in names.items() if given.get(key) is not None),
-            stray=self.config.stray_light,
+            stray=self.config.stray_light, saturation=saturation,
         )  # fmt: skip
         told = given.get("lights") is not None
         expected = trust(refined, mask, estimate.normals, estimate.light_directions, given=told)

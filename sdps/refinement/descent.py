@@ -138,13 +138,11 @@ def solve(
         if number % _TRIED_EVERY == 0:
             images = _explained(problem, state, made, free)
         loss = data_term(made, images, problem.kept)
-        misfit = min(max((float(loss.detach()) - _FITS) / (_MISFITS - _FITS), 0.0), 1.0)
-        held = weights.near * misfit + weights.dark * faint  # (P,)
+        held = weights.near * _misfit(float(loss.detach())) + weights.dark * faint  # (P,)
         loss = loss + (held * (1.0 - (made.normals * begun).sum(dim=1))).mean()
         loss = loss + _priors(state, made, beside, weights, part)
         if "directions" in free:
-            stretch, shift = anchor(state.directions, start)
-            loss = loss + stretch + _falling(weights.shift, part) * shift
+            loss = loss + _lights_prior(state.directions, start, weights, part)
         loss.backward()
         adam.step()
         _unit_length(state, free)
@@ -168,6 +166,11 @@ def _explained(problem: Problem, state: State, made: Factors, free: frozenset[st
     return problem.explained(made, state)
 
 
+def _misfit(data: float) -> float:
+    """Return how badly a model with this data term fits: from 0, well, to 1."""
+    return min(max((data - _FITS) / (_MISFITS - _FITS), 0.0), 1.0)
+
+
 def _faint(images: Tensor) -> Tensor:  # (P,)
     """Return how little the images tell of a pixel: 1 where it is dark in all, 0 where it is bright."""
     bright = torch.empty(len(images))
@@ -186,6 +189,11 @@ def _priors(
     loss = loss + weights.body * (state.body.pow(2).sum() + 0.01).sqrt()
     gloss = state.log_strength
     return loss + weights.gloss * (roughness(gloss, beside) + weights.gloss_size * (gloss**2).mean())
+
+
+def _lights_prior(directions: Tensor, start: Tensor, weights: Weights, part: float) -> Tensor:
+    stretch, shift = anchor(directions, start)
+    return stretch + _falling(weights.shift, part) * shift
 
 
 def _falling(weight: tuple[float, float], part: float) -> float:

@@ -40,7 +40,7 @@ CACHE_BYTES = 2**30
 
 @dataclass(frozen=True, kw_only=True)
 class RefineConfig:
-    """How an object is refined. The defaults were chosen on DiLiGenT's ball, buddha, cow and pot2.
+    """How an object is refined. How the defaults were chosen: docs/studies/refinement.md.
 
     Attributes:
         coarse_pixels: Pixels of the coarse grid, about.
@@ -77,6 +77,7 @@ def refine(
     known: frozenset[str] = frozenset(),
     config: RefineConfig | None = None,
     stray: bool = True,
+    saturation: float = float("inf"),
 ) -> Refined:
     """Refine normals and lights.
 
@@ -89,6 +90,8 @@ def refine(
         known: `directions`, `intensities` or both, where these are given and must stay.
         config: Iterations and rates.
         stray: Take stray light off the images.
+        saturation: Radiance from which on a channel is clipped. Observations that reach it count for nothing: the model
+            is to explain what was measured.
 
     Raises:
         InputError: fewer than four images, shapes that do not fit, or an object that is black.
@@ -99,7 +102,8 @@ def refine(
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
     gains = np.broadcast_to(np.reshape(intensities, (len(images), -1)), (len(images), 3))
     values = _gathered(scene)
-    problem = problem_of(values, scene.mask, stride, gains)
+    full = saturation - scene.stray.T  # (3, L)
+    problem = problem_of(values, scene.mask, stride, gains, full)
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
     free = frozenset(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
@@ -112,7 +116,7 @@ def refine(
             start = start._replace(log_albedo=_log_albedo(problem, start))
         state = move(problem, start, iterations=config.iterations)
         if stride > 1:
-            problem, state = _finer(values, scene.mask, problem, stride, state)
+            problem, state = _finer(values, scene.mask, problem, stride, state, full)
         if fine:
             weights = Weights(curl=(config.fine_curl, config.fine_curl))
             state = move(problem, state, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
@@ -148,8 +152,15 @@ def _gathered(scene: ObjectImages) -> np.ndarray:  # (P, 3, L) float32
     return values
 
 
-def problem_of(values: np.ndarray, mask: np.ndarray, stride: int, intensities: np.ndarray) -> Problem:
+def problem_of(values: np.ndarray, mask: np.ndarray, stride: int, intensities: np.ndarray, full: np.ndarray) -> Problem:
     """Return the grid of every `stride`-th pixel; at 1 the pixels `values` are divided in place, not copied.
+
+    Args:
+        values: (P, 3, L) radiance of the object's pixels.
+        mask: (H, W) bool.
+        stride: Of the grid.
+        intensities: (L, 3) or (L, 1).
+        full: (3, L), from where on a channel is clipped.
 
     Raises:
         InputError: they are black.
@@ -162,11 +173,12 @@ def problem_of(values: np.ndarray, mask: np.ndarray, stride: int, intensities: n
     if not mean > 0.0:
         raise InputError("refinement: the object is black in every image")
     gathered = torch.from_numpy(values)
-    gathered /= mean
     shares = torch.from_numpy((intensities.mean() / intensities).astype(np.float32)).T  # (3, L)
     kept = torch.from_numpy(_room((len(values), values.shape[2])))
     for part in _parts(len(values)):
-        kept[part] = (~shadowed(gathered[part] * shares)).float()
+        clipped = torch.from_numpy((values[part] >= full).any(axis=1))
+        gathered[part] /= mean
+        kept[part] = (~shadowed(gathered[part] * shares) & ~clipped).float()
     return Problem(mask[::stride, ::stride], gathered, kept, mean)
 
 
@@ -230,10 +242,12 @@ def _traced(problem: Problem, state: State, bounces: int) -> Problem:
     return problem._replace(kept=kept, bounced=torch.from_numpy(first), twice=twice)
 
 
-def _finer(values: np.ndarray, mask: np.ndarray, coarse: Problem, stride: int, state: State) -> tuple[Problem, State]:
+def _finer(
+    values: np.ndarray, mask: np.ndarray, coarse: Problem, stride: int, state: State, full: np.ndarray
+) -> tuple[Problem, State]:
     """Return every pixel, and the state there: interpolated between the coarse pixels, with an albedo of its own."""
     made = factors(state)
-    problem = problem_of(values, mask, 1, made.log_intensities.exp().numpy())
+    problem = problem_of(values, mask, 1, made.log_intensities.exp().numpy(), full)
     up = _interpolation(coarse.mask, mask, stride)
     normals = up(state.normals.numpy())
     normals /= normals.norm(dim=1, keepdim=True)

@@ -22,13 +22,13 @@ _WINDOW = 5  # pixels that a residual is averaged over
 _BEST, _LEAST = 0.008, 0.001  # the residual of a perfect model, and the least above it that is told apart
 _UPRIGHT, _STILL, _FAINT = 0.1, 0.3, 0.003
 
-NORMAL = (4.200, 0.569, -0.441, -0.128, 0.085, -0.367, 0.315)
+NORMAL = (4.804, 0.613, -0.505, 0.232, 0.016, -0.310, 0.298)
 """Of log degrees per pixel: constant, misfit, images, the lights' spread, residual of the pixel, its n_z, how far its
 normal has moved."""
-LIGHT = (5.173, 0.652, -0.466, -0.093, 0.033, 0.036)
+LIGHT = (5.172, 0.636, -0.477, -0.014, 0.147, 0.072)
 """Of log degrees per light: constant, misfit, images, the lights' spread, residual of its image, how far it has moved.
 """
-START = (0.348, 0.067, 0.992)
+START = (0.324, 0.065, 1.030)
 """Of the start's log mean degrees: constant, misfit, how far the normals have moved."""
 
 

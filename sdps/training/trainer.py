@@ -39,7 +39,7 @@ CHECKPOINT = "checkpoint.pt"
 METRICS = "metrics.jsonl"
 # What may differ between the parts of one run: how long, and how it is carried out, but not what is computed.
 _MAY_CHANGE = {
-    "epochs", "steps", "minutes", "workers", "cache",
+    "epochs", "steps", "minutes", "workers", "cache", "shuffle_window",  # the last is in the source's identity
     "log_every", "validate_every", "validation_scenes", "checkpoint_minutes", "precision", "channels_last",
 }  # fmt: skip
 
@@ -198,6 +198,7 @@ class Trainer:
             pin_memory=here.device.type == "cuda",
             rank=here.rank,
             world=here.world,
+            window=config.shuffle_window,
         )
         self.validation = None
         if config.validation_scenes and here.leads and any(scene.split == "val" for scene in read_manifest(data)):

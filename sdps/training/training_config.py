@@ -49,6 +49,8 @@ class TrainingConfig:
         channels_last: Keep feature maps channels-last, which is faster on every processor tried (docs/training.md).
         workers: Loader processes; 0 loads in the trainer's own.
         cache: Keep decoded scenes as memory-mapped arrays in `<data>/cache`.
+        shuffle_window: Of a packed set (`sdps data pack`), scenes among which the order is drawn; only about twice as
+            many are kept on this disk. With more than there are, the order is that of a data folder.
         rescale: Scenes larger than `size` are drawn at a random scale and cropped, instead of being shrunk whole.
         skip_missing: Train on the scenes that are there instead of refusing an incomplete folder.
         log_every: Steps between lines of metrics.
@@ -83,6 +85,7 @@ class TrainingConfig:
     channels_last: bool = True
     workers: int = 2
     cache: bool = True
+    shuffle_window: int = 1024
     rescale: bool = False
     skip_missing: bool = False
     log_every: int = 20
@@ -94,7 +97,7 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         for name in ("epochs", "steps", "minutes", "batch_scenes", "accumulate", "images", "validation_images",
-                     "learning_rate", "log_every", "checkpoint_minutes"):  # fmt: skip
+                     "learning_rate", "shuffle_window", "log_every", "checkpoint_minutes"):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not (value > 0 and math.isfinite(value)):
                 raise InputError(f"{name} must be positive, got {value}")

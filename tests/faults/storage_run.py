@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,10 +25,12 @@ from fault_run import SMALL, digests  # noqa: E402
 from object_store import BUCKET, ObjectStore, object_store  # noqa: E402
 
 
-def start(store: ObjectStore, out: str, cache: Path) -> "subprocess.Popen[bytes]":
-    """Start rendering."""
+def start(
+    store: ObjectStore, out: str, cache: Path, where: Sequence[str] = ("--workers", "1")
+) -> "subprocess.Popen[bytes]":
+    """Start rendering, on this machine or a cluster."""
     environment = os.environ | store.environment | {"PYTHONPATH": str(ROOT), "SDPS_CACHE": str(cache)}
-    words = ["render-data", *SMALL, "--set", "data.views=8", "--workers", "1", "--out", out]
+    words = ["render-data", *SMALL, "--set", "data.views=8", *where, "--out", out]
     return subprocess.Popen(
         [sys.executable, "-m", "pipelines.cli", *words], cwd=ROOT, env=environment, stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -43,22 +46,22 @@ def until(store: ObjectStore, prefix: str, count: int, process: "subprocess.Pope
         time.sleep(0.05)
 
 
-def trial(store: ObjectStore, folder: Path, number: int, away: float) -> dict[str, object]:
+def trial(store: ObjectStore, folder: Path, number: int, away: float, where: Sequence[str]) -> dict[str, object]:
     """Kill, take the store away, let it end; return what came of it."""
     rng, prefix = random.Random(number), f"run{number}"
     out, cache = f"s3://{BUCKET}/{prefix}", folder / f"cache{number}"
-    first = start(store, out, cache)
+    first = start(store, out, cache, where)
     until(store, prefix, rng.randrange(40), first)
     first.send_signal(signal.SIGKILL)
     first.communicate()
     kept = sum(name.endswith(".exr") for name in store.objects(prefix))
-    second = start(store, out, cache)
+    second = start(store, out, cache, where)
     until(store, prefix, rng.randrange(kept + 1, 85), second)
     store.stop()
     time.sleep(away)
     store.start()
     said = second.communicate(timeout=300)[1].decode()
-    third = start(store, out, cache)
+    third = start(store, out, cache, where)
     third.communicate(timeout=300)
     objects = store.objects(f"{prefix}/data")
     lines = [json.loads(row) for name, data in objects.items() if name.startswith("log/done-")
@@ -73,7 +76,7 @@ def trial(store: ObjectStore, folder: Path, number: int, away: float) -> dict[st
     return {
         "kept": kept, "codes": [second.returncode, third.returncode], "waited": "trying again" in said,
         "same": whole == there, "twice": sum(count > 1 for count in Counter(line["id"] for line in lines).values()),
-        "scenes": len(whole) - 1, "left": left, "traceback": "Traceback" in said,
+        "scenes": len(whole) - 1, "left": left, "traceback": said.partition("Traceback")[2][-2000:],
     }  # fmt: skip
 
 
@@ -82,6 +85,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=10)
     parser.add_argument("--away", type=float, default=30.0, help="seconds without a store")
+    parser.add_argument("--first", type=int, default=0, help="number of the first trial, its seed")
+    parser.add_argument("--cluster", help="render there, e.g. on local:2")
     args = parser.parse_args()
     bad = 0
     with tempfile.TemporaryDirectory() as name, object_store() as store:
@@ -89,8 +94,9 @@ def main() -> int:
         process = start(store, str(folder / "local"), folder / "cache")
         if process.wait() != 0:
             raise SystemExit("the undisturbed run failed")
-        for number in range(args.trials):
-            row = trial(store, folder, number, args.away)
+        where = ["--cluster", args.cluster] if args.cluster else ["--workers", "1"]
+        for number in range(args.first, args.first + args.trials):
+            row = trial(store, folder, number, args.away, where)
             wrong = not row["same"] or row["twice"] or row["left"] or row["traceback"] or row["codes"] != [0, 0]
             bad += bool(wrong)
             sys.stdout.write(f"{'BAD' if wrong else 'good'} {json.dumps(row)}\n")

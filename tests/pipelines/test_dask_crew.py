@@ -27,7 +27,7 @@ from render.planning.chunks import Chunk
 from render.records import ledger
 from render.records.ledger import Ledger
 from render.records.manifest import SceneSpec, View
-from render.records.shards import file_hash
+from render.records.shards import file_hash, read_shard
 from render.running import station
 from render.running.supervisor import RunOptions, RunSummary, render_supervised
 from render.shared.errors import InputError
@@ -114,15 +114,45 @@ def test_a_plan_that_is_read_otherwise_is_refused(tmp_path, address, monkeypatch
         run(planned([["ok"]]), tmp_path, address)
 
 
-def test_own_files_are_tied_to_their_content(tmp_path):
-    path = tmp_path / "mine.yaml"
+@pytest.mark.parametrize(
+    ("shape", "material", "file"),
+    [
+        ("sphere", "{0}/mine.yaml", "mine.yaml"),
+        ("sphere", "patches:7:chrome+{0}/mine.binary", "mine.binary"),
+        ("sphere", "procedural:wood:7:{0}/mine.bsdf+chrome", "mine.bsdf"),
+        ("sphere", "maps:2:{0}/maps", "maps/brick_diff.png"),
+        ("sphere", "{0}/maps", "maps/brick_diff.png"),
+        ("{0}/mine.glb", "chrome", "mine.glb"),
+        ("meshes:y:0123456789ab:{0}/mine.obj", "chrome", "mine.obj"),
+    ],
+)
+def test_own_files_are_tied_to_their_content(tmp_path, shape, material, file):
+    path = tmp_path / file
+    path.parent.mkdir(exist_ok=True)
     path.write_text("a")
-    (chunk,) = chunks.cut(planned([[str(path)]]), {"s0-m0"})
+    (scene,) = planned([["ok"]])
+    scene = replace(scene, shape=shape.format(tmp_path), material=material.format(tmp_path))
+    (chunk,) = chunks.cut([scene], {scene.id})
     task = station.task_of("run", chunk, 1.0)
     station.check(task)
-    path.write_text("b")
-    with pytest.raises(station.Mismatch, match=r"has file .*mine\.yaml"):
+    path.write_text("other")
+    with pytest.raises(station.Mismatch, match=rf"has file {tmp_path}.*put it under the same path there"):
         station.check(task)
+    path.unlink()
+    with pytest.raises(station.Mismatch, match=rf"has file {tmp_path}.* missing, the run"):
+        station.check(task)
+
+
+def test_shards_name_the_commit_of_the_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(station, "_commit", lambda: "the run's")
+    (scene,) = (replace(scene, shape="sphere", material="chrome", size=8) for scene in planned([["ok"]]))
+    (chunk,) = chunks.cut([scene], {scene.id})
+    crew = station.Station(tmp_path / "station")
+    rendered = crew.render(station.task_of("run", chunk, 60.0))
+    crew.dismiss()
+    (tmp_path / "shards").mkdir()
+    (tmp_path / scene.file).write_bytes(rendered.shards[scene.id])
+    assert read_shard(tmp_path / scene.file).provenance["commit"] == "the run's"
 
 
 def test_what_concerns_the_whole_run_stops_it(tmp_path, address):

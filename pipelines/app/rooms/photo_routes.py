@@ -48,13 +48,7 @@ async def upload(request: Request) -> Response:
     room = limits.bytes - session.taken
     if given.lower().endswith(".zip"):
         archive = folder.parent / uploads.safe_name(given, (".zip",))
-        try:
-            await uploads.receive(request.stream(), archive, room)
-            session.taken += await asyncio.to_thread(uploads.unpack, archive, folder, limits, room)
-            for path in folder.iterdir():
-                await asyncio.to_thread(uploads.check_pixels, path, limits)
-        finally:
-            archive.unlink(missing_ok=True)
+        session.taken += await uploads.receive_archive(request.stream(), archive, folder, limits, room)
     else:
         if len(os.listdir(folder)) >= limits.files:
             raise InputError(f"more than {limits.files} files; leave some out")

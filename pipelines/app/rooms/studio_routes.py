@@ -1,6 +1,8 @@
 """The room "Studio": scenes, uploads of meshes and materials, and files to keep."""
 
 import asyncio
+import shutil
+from pathlib import Path
 from typing import Any
 
 from starlette.requests import Request
@@ -13,7 +15,7 @@ from pipelines.app.work.uploads import Limits
 from render.shared.errors import InputError, unknown
 
 UPLOADS = "uploads"
-MESHES, MATERIALS = (".ply", ".obj", ".stl", ".off", ".glb"), (".yaml", ".yml", ".binary", ".bsdf")
+MESHES, MATERIALS = (".ply", ".obj", ".stl", ".off", ".glb"), (".yaml", ".yml", ".binary", ".bsdf", ".zip")
 _PLACE = "studio"
 _ASKED = ("shape", "material", "yaw", "pitch", "roll", "bounces", "size", "direct")
 _TASKS = ("gallery", "scene", "keep", "preset")
@@ -41,7 +43,7 @@ async def start(request: Request) -> Response:
 
 
 async def upload(request: Request) -> Response:
-    """Take a mesh or a material file."""
+    """Take a mesh, a material file, or a ZIP of PBR maps, which becomes a folder."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
     folder = session.folder / UPLOADS
@@ -49,9 +51,29 @@ async def upload(request: Request) -> Response:
     name = uploads.safe_name(request.path_params["name"], MESHES + MATERIALS)
     if len(list(folder.iterdir())) >= _MOST:
         raise InputError(f"more than {_MOST} files; load the page anew")
-    await asyncio.to_thread((folder / name).unlink, missing_ok=True)
-    session.taken += await uploads.receive(request.stream(), folder / name, limits.bytes - session.taken)
+    room = limits.bytes - session.taken
+    if name.lower().endswith(".zip"):
+        name = Path(name).stem
+        place, incoming = folder / name, session.folder / f"{_PLACE}.zip"
+        for old in (place, incoming):
+            await asyncio.to_thread(_remove, old)
+        place.mkdir()
+        try:
+            session.taken += await uploads.receive_archive(request.stream(), incoming, place, limits, room)
+        except BaseException:
+            shutil.rmtree(place, ignore_errors=True)
+            raise
+    else:
+        await asyncio.to_thread(_remove, folder / name)
+        session.taken += await uploads.receive(request.stream(), folder / name, room)
     return JSONResponse({"name": name})
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, or a folder of maps, of an earlier upload."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
 
 
 async def file(request: Request) -> Response:

@@ -140,9 +140,9 @@ def keep(place: str, **asked: Any) -> str:
         opened.writestr("scene.yaml", _test_preset(spec))
         opened.writestr("repeat.py", _program(spec, view.scene))
         opened.writestr("README.txt", _ABOUT)
-        for name in (spec["shape"], spec["material"]):
-            if Path(name).is_file():
-                opened.write(name, Path(name).name)
+        for name in (Path(spec["shape"]), Path(spec["material"])):
+            for file in [name] if name.is_file() else name.glob("*"):
+                opened.write(file, file.relative_to(name.parent))
     return "scene.zip"
 
 
@@ -181,6 +181,8 @@ def wanted(place: Path, **asked: Any) -> dict[str, Any]:
         raise InputError(f"shape {shape[:60]!r}: choose sphere, bunny, blobby:<seed>, sculpture:<seed> or load a mesh")
     if material not in loaded and (not _MATERIAL.fullmatch(material) or _FILES.search(material)):
         raise InputError(f"material {material[:60]!r}: give a name, lambertian:<albedo> or a pattern, or load a file")
+    if Path(loaded.get(shape, "")).is_dir() and shape in loaded:
+        raise InputError(f"shape {shape[:60]!r}: is a folder of maps; use it as a material, and load a mesh")
     shape, material = loaded.get(shape, shape), loaded.get(material, material)
     try:
         turn = [float(asked.get(name, 0.0)) for name in ("yaw", "pitch", "roll")]
@@ -199,7 +201,8 @@ def _arguments(spec: dict[str, Any]) -> dict[str, Any]:
 
 
 def _local(name: str) -> str:
-    return Path(name).name if Path(name).is_file() else name
+    path = Path(name)
+    return name if not path.is_absolute() else f"./{path.name}" if path.is_dir() else path.name
 
 
 def _coded(images: np.ndarray, exposure: float) -> bytes:

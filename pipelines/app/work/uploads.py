@@ -1,5 +1,6 @@
 """What may be uploaded: so many files, bytes and pixels, under harmless names, out of harmless archives."""
 
+import asyncio
 import re
 import stat
 import struct
@@ -68,6 +69,24 @@ async def receive(stream: AsyncIterator[bytes], path: Path, room: int) -> int:
         path.unlink(missing_ok=True)
         raise
     return size
+
+
+async def receive_archive(
+    stream: AsyncIterator[bytes], archive: Path, folder: Path, limits: Limits, room: int
+) -> int:  # fmt: skip
+    """Unpack a request's body, a ZIP, into a folder that is there, and return the bytes of its files.
+
+    Raises:
+        InputError: as `receive`, `unpack` and `check_pixels`.
+    """
+    try:
+        await receive(stream, archive, room)
+        size = await asyncio.to_thread(unpack, archive, folder, limits, room)
+        for path in folder.iterdir():
+            await asyncio.to_thread(check_pixels, path, limits)
+        return size
+    finally:
+        archive.unlink(missing_ok=True)
 
 
 async def settings(stream: AsyncIterator[bytes]) -> dict[str, Any]:

@@ -145,6 +145,14 @@ def load(name: str) -> Textured:
     return Textured(name, MAPS, maps=read(name), repeats=_REPEATS, category="texture-maps")
 
 
+def folder(name: str) -> Path | None:
+    """Return the folder of maps of a textured material's name, None for a procedural one."""
+    head, _, rest = name.partition(":")
+    if head == PROCEDURAL:
+        return None
+    return Path(rest.partition(":")[2] if head in (MAPS, UV) and not Path(name).is_dir() else name)
+
+
 def palette(kind: str, seed: int) -> np.ndarray:
     """Return (3, 5) of the regions of a procedural material: linear base colour, roughness, metallic."""
     return _PALETTES[kind](generator(seed, "procedural", kind, "palette"))

@@ -1,6 +1,5 @@
 """Every room of `sdps app` in Chromium, at two widths: it works, without console errors, and axe is content."""
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,16 +8,10 @@ import photo_folders as folders
 import pytest
 from app_data import write_run
 from app_server import serving
+from browser_pages import WIDTHS, launched, needs_browser, watched
 from sdps_scenes import hemisphere_lights
 
-playwright = pytest.importorskip("playwright.sync_api", reason="needs pip install sdps[browser]")
-axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="needs pip install sdps[browser]")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium"),
-]
-WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
+pytestmark = [pytest.mark.slow, needs_browser]
 PATIENCE = 120_000  # milliseconds; the first job loads torch and Mitsuba
 
 
@@ -32,31 +25,15 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[object]:
-    with playwright.sync_playwright() as started:
-        options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        opened = started.chromium.launch(executable_path=CHROMIUM, args=options)
+    with launched() as opened:
         yield opened
-        opened.close()
 
 
 @pytest.fixture(params=WIDTHS)
 def page(request: pytest.FixtureRequest, browser, address: str) -> Iterator[object]:
     """A page whose console must stay clean, and which may ask nobody but our server."""
-    width, height = WIDTHS[request.param]
-    context = browser.new_context(viewport={"width": width, "height": height})
-    opened, wrong = context.new_page(), []
-    opened.set_default_timeout(PATIENCE)
-    opened.on("console", lambda item: wrong.append(item.text) if item.type == "error" else None)
-    opened.on("pageerror", lambda error: wrong.append(str(error)))
-    opened.on(
-        "request", lambda item: wrong.append(item.url) if not item.url.startswith((address, "blob:", "data:")) else None
-    )
-    yield opened
-    assert opened.evaluate("document.documentElement.scrollWidth") <= width, "the page scrolls sideways"
-    found = axe.Axe().run(opened).response["violations"]
-    assert not found, [(item["id"], [node["target"] for node in item["nodes"]][:4]) for item in found]
-    context.close()
-    assert not wrong
+    with watched(browser, request.param, address, PATIENCE) as opened:
+        yield opened
 
 
 def test_photographs(page, address: str, tmp_path: Path) -> None:

@@ -1,10 +1,14 @@
 """Data folders in object storage: what is written there, read back, cached, and done when the store refuses."""
 
+import contextlib
 import errno
 import json
+import re
 import shutil
+import sys
 import threading
 import time
+import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -213,6 +217,44 @@ def test_commands_on_s3(s3: ObjectStore, tmp_path: Path, capsys: pytest.CaptureF
         assert main(["data", "status", wrong]) == 2
         text = capsys.readouterr().err
         assert said in text and wrong in text and text.count("\n") == 1
+
+
+@contextlib.contextmanager
+def strict(s3: ObjectStore) -> Iterator[None]:
+    """Let the server check keys, none of which it knows."""
+
+    def allowed(requests: str) -> None:
+        place = f"{s3.environment['AWS_ENDPOINT_URL']}/moto-api/reset-auth"
+        urllib.request.urlopen(urllib.request.Request(place, requests.encode(), {"Content-Type": "text/plain"})).close()
+
+    allowed("0")
+    try:
+        yield
+    finally:
+        allowed("inf")
+
+
+def test_wrong_keys_end_in_one_line(s3: ObjectStore, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    place = f"s3://{BUCKET}/locked"
+    with strict(s3):
+        for words in (["data", "status", place], ["render-data", "--preset", "smoke", "--out", place],
+                      ["train", "--preset", "smoke", "--out", str(tmp_path), "--data", place]):  # fmt: skip
+            assert main(words) == 2
+            text = capsys.readouterr().err
+            assert re.match(rf"sdps: {place}\S*: refused \(.*check the keys", text) and text.count("\n") == 1, text
+
+
+@pytest.mark.parametrize(("scheme", "package"), [("gs", "gcsfs"), ("az", "adlfs"), ("s3", "s3fs")])
+def test_a_missing_driver_is_one_line(
+    scheme: str, package: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    registry = pytest.importorskip("fsspec.registry")
+    monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
+    monkeypatch.delitem(registry._registry, scheme, raising=False)
+    assert main(["data", "status", f"{scheme}://bucket/run"]) == 2
+    text, install = capsys.readouterr().err, "sdps[storage]" if scheme == "s3" else package
+    assert f"sdps: {scheme}://bucket/run: needs a driver: " in text and text.endswith(f"pip install '{install}'\n")
+    assert text.count("\n") == 1
 
 
 def test_commands_that_want_a_folder_refuse_an_address(capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,12 +25,12 @@ from sdps.data.dataset import (
     Batch,
     SampleKey,
     SampleOptions,
-    SampleStream,
     SceneDataset,
     choose_images,
     collate,
     make_sample,
 )
+from sdps.data.order import SampleStream, Windows
 from sdps.data.scene_store import StoredScene
 from sdps.data.sources import StoredScenes
 
@@ -219,6 +219,19 @@ def test_stream_resumes_where_it_stopped(taken: int) -> None:
     for _ in range(taken // 2):
         next(whole)
     assert [next(whole) for _ in range(6)] == [next(rest) for _ in range(6)]
+
+
+def test_the_order_of_a_packed_set_is_a_permutation_that_uses_few_tars_at_a_time() -> None:
+    tars = [np.arange(start, start + 20) for start in range(0, 2000, 20)]
+    stream = SampleStream(2000, 8, seed=1, windows=Windows(tars, 200))
+    first, second = stream.order(0), stream.order(1)
+    for order in (first, second):
+        assert sorted(order) == list(range(2000))
+        places = [np.flatnonzero(np.isin(order, tar)) for tar in tars]
+        alive = sum((np.arange(2000) >= found[0]) & (np.arange(2000) <= found[-1]) for found in places)
+        assert alive.max() <= 200 / 20 + 2
+        assert np.mean([found[-1] - found[0] for found in places]) > 100  # no tar comes in one piece
+    assert not np.array_equal(first, second) and np.array_equal(first, stream.order(0))
 
 
 def test_crops_hold_enough_of_the_object(folder: Path) -> None:

@@ -142,7 +142,7 @@ def test_a_corrupted_image_among_good_ones_does_not_matter_and_is_told() -> None
     found = refine(images, mask, start, turned(lights, 8.0, seed=3), np.ones(24), config=QUICK)
     good, begun = np.arange(24) != 7, turned(lights, 8.0, seed=3)
     without = refine(images[good], mask, start, begun[good], np.ones(23), config=QUICK)
-    assert float(angle_degrees(found.normals[mask], without.normals[mask]).mean()) < 1.0
+    assert float(angle_degrees(found.normals[mask], without.normals[mask]).mean()) < 1.2
     assert found.image_residual.argmax() == 7
 
 
@@ -213,3 +213,16 @@ def test_any_method_that_gives_normals_is_refined_by_its_name() -> None:
 def test_what_has_no_normals_is_not_refined(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         parse(text, pretrained.require)
+
+
+def test_what_is_clipped_is_left_out() -> None:
+    normals, mask = bumpy(48)
+    images, lights, intensities = lit(normals, 24, seed=3, gloss=2.0)
+    level = np.float32(np.quantile(images[:, mask].max(axis=-1), 0.95))
+    clipped = np.minimum(images, level)
+    found = [
+        errors(refine(clipped, mask, turned(normals, 8.0, 4) * mask[..., None], turned(lights, 6.0, 5), intensities,
+                      config=QUICK, saturation=saturation), normals, mask, lights)
+        for saturation in (float(level), float("inf"))
+    ]  # fmt: skip
+    assert found[0][0] < 0.6 * found[1][0], found

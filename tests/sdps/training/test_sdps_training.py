@@ -13,6 +13,9 @@ import torch
 from safetensors.torch import load_file
 from sdps_scenes import write_data
 
+from pipelines.cli import main
+from render.records import mirror
+from render.records.mirror import opened
 from render.shared.config import build
 from render.shared.errors import InputError
 from sdps.data.augment import Augmentation
@@ -88,6 +91,41 @@ def test_interrupted_and_resumed_run_is_the_uninterrupted_one(
     assert resumed.steps == 8
     assert not resumed.interrupted
     assert_same_run(uninterrupted[0], tmp_path)
+
+
+@pytest.fixture
+def tars(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a packed set of the folder in tars of two scenes or so."""
+    pytest.importorskip("webdataset", reason="the tars' library, of sdps[storage], is missing")
+    monkeypatch.setenv("SDPS_CACHE", str(tmp_path / "cache"))
+    assert main(["data", "pack", str(folder), "--out", str(tmp_path / "tars"), "--tar-mb", "0.05"]) == 0
+    return tmp_path / "tars"
+
+
+def test_a_packed_set_gives_the_losses_of_the_folder(folder: Path, tars: Path, uninterrupted: tuple) -> None:
+    with opened(tars) as data:
+        train(NormalStage(replace(QUICK, workers=1)), data, tars / "run", loggers=[StopAt(3)])
+        train(NormalStage(QUICK), data, tars / "run")
+    assert_same_run(uninterrupted[0], tars / "run")
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_packed_set_larger_than_its_cache_goes_on_as_if_uninterrupted(
+    tars: Path, tmp_path: Path, workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mirror, "_IN_USE", -1.0 if workers == 0 else 0.5)
+    config = replace(QUICK, workers=workers, shuffle_window=1, steps=12)  # five scenes, in pairs
+    with opened(tars, cache_gb=75e-6) as data:
+        train(NormalStage(config), data, tmp_path / "whole")
+        assert not list(data.glob("cache/sphere_00[0-4]*"))  # decoded, they would leave it before they are used again
+        assert train(NormalStage(config), data, tmp_path / "parts", loggers=[StopAt(5)]).interrupted
+        shutil.rmtree(data / "shards")  # the next part is on another machine
+        train(NormalStage(config), data, tmp_path / "parts")
+        assert_same_run(tmp_path / "whole", tmp_path / "parts")
+        with pytest.raises(InputError, match=r"of another run \(shuffle_window was 1, now 2\)"):
+            train(NormalStage(replace(config, shuffle_window=2)), data, tmp_path / "parts")
+    with opened(tars, cache_gb=20e-6) as data, pytest.raises(InputError, match="shuffling among 1 scenes keeps"):
+        train(NormalStage(config), data, tmp_path / "none")
 
 
 def test_lights_that_are_given_have_no_errors(folder: Path, uninterrupted: tuple) -> None:

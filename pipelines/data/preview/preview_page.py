@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.data import preview_plots as plots
-from pipelines.data.preview_sample import Sample
+from pipelines.data.preview import preview_plots as plots
+from pipelines.data.preview.preview_sample import STAGE_COLUMNS, Sample, Stage
 from pipelines.shared import pictures
 from render.planning.composition import Composition, light_directions
 from render.records.manifest import SceneSpec
@@ -17,8 +17,9 @@ from render.shared.files import read_json, read_jsonl
 from render.shared.templates import fill
 
 QUALITIES = (85, 70, 50)  # JPEG, the first that fits the budget
-BUDGET = 4_000_000  # bytes of all pictures of scenes
+BUDGET = 4_000_000  # bytes of the scenes' strips, and of their sheets
 _TEMPLATE = Path(__file__).with_name("preview.html.j2")
+_SCRIPT = Path(__file__).with_name("preview.js")
 
 
 def render(
@@ -51,6 +52,8 @@ def render(
         sample=sample,
         failures=_failures(folder),
         scenes=gallery(shown),
+        stages=_stages(sample.stages),
+        script=_SCRIPT.read_text(encoding="utf-8"),
     )
 
 
@@ -105,11 +108,36 @@ def _plots(directions: np.ndarray, counts: Composition, sample: Sample) -> dict[
 
 def gallery(shown: Sequence[tuple[SceneSpec, np.ndarray]]) -> list[tuple[str, str, int, int]]:
     """Return (caption, data URI, width, height) of the scenes, of the best quality that keeps the page small."""
-    captions = [f"{scene.id}: {scene.shape}, {scene.material} ({scene.split})" for scene, _ in shown]
+    uris = _encoded([strip for _, strip in shown])
+    return [
+        (_caption(scene), uri, strip.shape[1], strip.shape[0]) for (scene, strip), uri in zip(shown, uris, strict=True)
+    ]
+
+
+def _stages(stages: Sequence[Stage]) -> list[dict[str, Any]]:
+    """Return what the page's script needs of scenes that are shown under each light."""
+    uris = _encoded([stage.sheet for stage in stages])
+    return [
+        {
+            "caption": _caption(stage.scene),
+            "sheet": uri,
+            "columns": STAGE_COLUMNS,
+            "height": stage.size[0],
+            "width": stage.size[1],
+            "lights": stage.lights.astype(float).round(3).tolist(),
+        }
+        for stage, uri in zip(stages, uris, strict=True)
+    ]
+
+
+def _caption(scene: SceneSpec) -> str:
+    return f"{scene.id}: {scene.shape}, {scene.material} ({scene.split})"
+
+
+def _encoded(shown: Sequence[np.ndarray]) -> list[str]:
+    """Return data URIs of the best quality that keeps all of them below the budget."""
     for quality in QUALITIES:
-        uris = [pictures.data_uri(strip, quality=quality) for _, strip in shown]
+        uris = [pictures.data_uri(picture, quality=quality) for picture in shown]
         if sum(map(len, uris)) <= BUDGET:
             break
-    return [
-        (text, uri, strip.shape[1], strip.shape[0]) for text, uri, (_, strip) in zip(captions, uris, shown, strict=True)
-    ]
+    return uris

@@ -1,4 +1,4 @@
-"""`sdps data export`: scenes in a layout that other photometric-stereo code reads, and checks of such trees."""
+"""`sdps data export` and `sdps data import`: trees that other photometric-stereo code reads, and their checks."""
 
 import argparse
 import sys
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from pipelines.shared.flags import add_cache_argument
+from render.exchange.ingest import READERS, ImportOptions, ingest
 from render.exchange.layouts import LAYOUTS
 from render.exchange.rules import RuleReport, check_tree
 from render.exchange.samples import ExportOptions
@@ -14,6 +15,7 @@ from render.records.mirror import finished, opened
 from render.shared.errors import InputError
 
 _SHOWN = 20
+_MARGIN = 15  # pixels; the margin SDPS-Net crops DiLiGenT with
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -120,3 +122,30 @@ def report(found: RuleReport, tree: str) -> int:
     verdict = f"{len(found.violations)} violations" if found.violations else "every rule of its loaders holds"
     sys.stdout.write(f"{tree}: {found.samples} samples of {lights} lights; {verdict}\n")
     return 1 if found.violations else 0
+
+
+def add_import_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps data import`."""
+    parser.add_argument("tree", help="root of the tree to import")
+    parser.add_argument("--layout", required=True, help=f"{' or '.join(READERS)}")
+    parser.add_argument("--out", required=True, help="data folder to write; an interrupted import goes on there")
+    parser.add_argument("--split", default=None, choices=("train", "val", "test"),
+                        help="split of all scenes (default: psfcn by its lists, diligent 'test')")  # fmt: skip
+    parser.add_argument("--crop", type=int, nargs="?", const=_MARGIN, default=None, metavar="MARGIN",
+                        help="crop to the mask's bounding box and a margin in pixels (15 if none is given), sides "
+                        "rounded up to multiples of 4")  # fmt: skip
+    parser.add_argument("--y-down", action="store_true", help="normals and lights of the source have y pointing down")
+    parser.add_argument("--limit", type=int, default=None, help="only the first so many samples")
+
+
+def import_main(args: argparse.Namespace) -> int:
+    """Import, and tell what looks flipped."""
+    options = ImportOptions(layout=args.layout, split=args.split, crop=args.crop, y_down=args.y_down, limit=args.limit)
+    report = ingest(args.tree, args.out, options)
+    sys.stdout.write(
+        f"{args.out}: {len(report.scenes)} scenes from {args.layout}, {report.written} written now, {report.kept} "
+        "kept; depth is unknown (zeros)\n"
+    )
+    for name, found in report.suspicions.items():
+        sys.stdout.write(f"{name}: {'; '.join(found)}; if y points down in the source, import it with --y-down\n")
+    return 0
