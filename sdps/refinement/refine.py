@@ -77,7 +77,7 @@ def refine(
     known: frozenset[str] = frozenset(),
     config: RefineConfig | None = None,
     stray: bool = True,
-    saturation: float = float("inf"),
+    saturation: float = np.inf,
 ) -> Refined:
     """Refine normals and lights.
 
@@ -90,26 +90,22 @@ def refine(
         known: `directions`, `intensities` or both, where these are given and must stay.
         config: Iterations and rates.
         stray: Take stray light off the images.
-        saturation: Radiance from which on a channel is clipped. Observations that reach it count for nothing: the model
-            is to explain what was measured.
+        saturation: Radiance from which on a channel is clipped; such observations count for nothing.
 
     Raises:
         InputError: fewer than four images, shapes that do not fit, or an object that is black.
     """
     config = config or RefineConfig()
-    _check(len(images), mask, normals, lights, intensities)
+    gains = _checked(len(images), mask, normals, lights, intensities)
     scene = survey(images, mask, 0, stray=stray)
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
-    gains = np.broadcast_to(np.reshape(intensities, (len(images), -1)), (len(images), 3))
     values = _gathered(scene)
-    full = saturation - scene.stray.T  # (3, L)
-    problem = problem_of(values, scene.mask, stride, gains, full)
+    problem = problem_of(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
     free = frozenset(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
-    total = before + config.iterations + fine
-    with progress_bar(None, total=total, desc="refine", unit="iteration") as bar:
-        move = partial(solve, free=free, boost=config.boost, weights=Weights(), after=_advance(bar, total))
+    with progress_bar(None, total=before + config.iterations + fine, desc="refine", unit="iteration") as bar:
+        move = partial(solve, free=free, boost=config.boost, weights=Weights(), after=_advance(bar))
         start = start_of(problem, begun, lights, gains)
         if before:
             problem = _traced(problem, move(problem, start, iterations=before), config.bounces)
@@ -123,17 +119,20 @@ def refine(
     return _result(scene, problem, state)
 
 
-def _advance(bar: Any, total: int) -> Callable[[], None]:
+def _advance(bar: Any) -> Callable[[], None]:
     """Return what moves the bar on by an iteration, and says so."""
 
     def after() -> None:
         bar.update()
-        stage("refinement", bar.n, total)
+        stage("refinement", bar.n, bar.total)
 
     return after
 
 
-def _check(count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> None:
+def _checked(
+    count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray
+) -> np.ndarray:
+    """Return the intensities (L, 3), if all sizes fit."""
     if count < _FEWEST:
         raise InputError(f"refinement needs at least {_FEWEST} images, got {count}")
     if normals.shape != (*mask.shape, 3):
@@ -142,6 +141,7 @@ def _check(count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray
         )
     if lights.shape != (count, 3) or len(intensities) != count:
         raise InputError(f"refinement: {count} images, but {len(lights)} lights and {len(intensities)} intensities")
+    return np.broadcast_to(np.reshape(intensities, (count, -1)), (count, 3))
 
 
 def _gathered(scene: ObjectImages) -> np.ndarray:  # (P, 3, L) float32

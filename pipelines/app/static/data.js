@@ -11,7 +11,7 @@ async function begin() {
   const { root, rows } = await ask("/data/list");
   $("root").textContent = rows.length ? `What lies in ${root}.` : `There is no data folder and no run in ${root}. Render some (sdps render-data), or name another folder: sdps app FOLDER.`;
   $("folders").replaceChildren(...rows.map(({ folder, kind }) => {
-    const button = element("button", { type: "button", "aria-pressed": "false" }, `${kind}: ${folder}`);
+    const button = element("button", { type: "button", "aria-pressed": "false" }, `${kind}: ${folder === "." ? root.split("/").pop() || root : folder}`);
     button.addEventListener("click", () => {
       for (const other of $("folders").children) other.setAttribute("aria-pressed", other === button);
       open(folder, kind);
@@ -45,9 +45,9 @@ async function scenes() {
 function matching() {
   const words = $("find").value.toLowerCase().split(/\s+/).filter(Boolean), key = $("sort").value;
   const rows = state.rows.filter((row) => words.every((word) => `${row.id} ${row.shape} ${row.material} ${row.split} ${row.state}`.toLowerCase().includes(word)));
-  const order = { failed: 0, planned: 1, rendered: 2 };
-  return rows.sort((one, two) => key === "radiance" ? (two.radiance ?? -1) - (one.radiance ?? -1) : key === "state" ? order[one.state] - order[two.state]
-    : one[key].localeCompare(two[key], "en", { numeric: true }));
+  const order = { failed: 0, rendered: 1, planned: 2 }, planned = (row) => row.state === "planned"; // what can be seen comes first
+  return rows.sort((one, two) => planned(one) - planned(two) || (key === "radiance" ? (two.radiance ?? -1) - (one.radiance ?? -1)
+    : key === "state" ? order[one.state] - order[two.state] : one[key].localeCompare(two[key], "en", { numeric: true })));
 }
 
 const seen = new IntersectionObserver((entries) => {
@@ -96,7 +96,7 @@ async function light(row) {
 function scrub() {
   const number = Number($("scrub").value), [x, y, z] = state.stage.about.lights[number];
   state.pad.set(x, y);
-  $("scrub-note").textContent = `Light ${number} of ${state.stage.about.lights.length}: ${[x, y, z].map((v) => v.toFixed(3)).join(", ")}. Between the lights, images are mixed.`;
+  $("scrub-note").textContent = `Light ${number + 1} of ${state.stage.about.lights.length}: ${[x, y, z].map((v) => v.toFixed(3)).join(", ")}. Between the lights, images are mixed.`;
 }
 
 // ---- Learning curves ----
