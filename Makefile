@@ -25,6 +25,8 @@ WORKERS ?= 2
 INPUTS ?= 100000
 MINUTES ?= 120
 KILLS ?= 100
+LOCK ?= requirements.lock
+UV ?= uv
 
 VENV := .venv
 SDPS := $(VENV)/bin/sdps
@@ -35,7 +37,7 @@ APP_READY := $(VENV)/.app-ready
 SETTINGS := $(foreach item,$(SET),--set $(item))
 
 .PHONY: help setup app doctor data-plan render-data data-status data-validate data-preview data-card train eval-merltest \
-	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow test-gpu fuzz faults lint bench bench-train bench-classical bench-infer bench-surface docs clean
+	regenerate models study eval-classical eval-photos eval-diligent eval-lights eval-figures infer report ship shipped-results demo test test-slow test-gpu fuzz faults lock lint bench bench-train bench-classical bench-infer bench-surface docs clean
 .DEFAULT_GOAL := help
 
 help:
@@ -51,13 +53,15 @@ help:
 	@echo "make infer PHOTOS=folder [METHOD=pf14 RUNS=trained]   normals, lights, meshes and a page from photographs"
 	@echo "make data-plan | data-status | data-validate | data-preview | data-card   PRESET=... OUT=folder"
 	@echo "make fuzz INPUTS=100000 MINUTES=120 SEED=0   mutated files into every reader; a stopped run goes on"
-	@echo "make faults KILLS=100   kill -9, SIGTERM and full disks during render, export, train, evaluate, infer"
+	@echo "make faults KILLS=100   kills, Ctrl-C, full disks, lost folders during render, export, import, train, ship, ..."
 	@echo "make regenerate   SHAPES=bunny MATERIALS=chrome,lambertian:0.5 LIGHTS=merltest OUT=folder [MITSUBA=1]"
 
-$(READY): pyproject.toml constraints.txt
+# LOCK= goes without hashes, where an index has files of its own.
+$(READY): pyproject.toml constraints.txt requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "$(PYTHON) is older than 3.11; name a newer one: make PYTHON=python3.12"; exit 2; }
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
+	$(if $(LOCK),$(VENV)/bin/python -m pip install --quiet --no-deps --require-hashes --requirement $(LOCK))
 	$(VENV)/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
 	@touch $@
 
@@ -166,10 +170,19 @@ fuzz: OUT = out/fuzz
 fuzz: $(ASSETS_READY)
 	$(VENV)/bin/python tests/fuzz/fuzz_run.py --out $(OUT) --seed $(SEED) --inputs $(INPUTS) --minutes $(MINUTES)
 
-# kill -9, SIGTERM and full disks at random moments of long commands, KILLS times each; results are compared.
+# Kills, Ctrl-C, full disks, lost folders and more at random moments of long commands, KILLS times each; results are compared.
 faults: OUT = out/faults
 faults: $(ASSETS_READY)
 	$(VENV)/bin/python tests/faults/fault_run.py --out $(OUT) --seed $(SEED) --kills $(KILLS)
+
+# The hashes of what the set-up installs, but torch and what comes with it; needs uv.
+UNHASHED := torch triton setuptools cuda-bindings cuda-pathfinder cuda-toolkit $(addprefix nvidia-,cublas cuda-cupti cuda-nvrtc \
+	cuda-runtime cudnn-cu13 cufft cufile curand cusolver cusparse cusparselt-cu13 nccl-cu13 nvjitlink nvshmem-cu13 nvtx)
+lock:
+	head -2 requirements.lock > requirements.new
+	$(UV) pip compile pyproject.toml --extra test --extra app --constraint constraints.txt --universal --python-version 3.11 \
+		--generate-hashes --no-emit-index-url --no-annotate --no-header $(addprefix --no-emit-package ,$(UNHASHED)) >> requirements.new
+	mv requirements.new requirements.lock
 
 lint: $(READY)
 	$(VENV)/bin/ruff check --no-cache .

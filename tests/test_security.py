@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,6 +67,21 @@ def test_neither_checkpoints_nor_yaml_run_code(tmp_path: Path) -> None:
     assert not ran.exists()
 
 
+def test_the_lock_file_agrees_with_the_versions_and_names_no_server() -> None:
+    text = (ROOT / "requirements.lock").read_text()
+    pinned = re.findall(r"^([\w.-]+)==([^\s;\\]+)", text, re.MULTILINE)
+    listed = re.findall(r"^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    versions = {re.sub(r"[._]", "-", name).lower(): version for name, version in listed}
+    assert len(pinned) > 70 and all(versions[name] == version for name, version in pinned)
+    assert "torch" not in dict(pinned) and "://" not in text
+    parts = re.split(r"^(?=[\w.-]+==)", text, flags=re.MULTILINE)[1:]
+    assert all("--hash=sha256:" in part for part in parts)
+    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = [re.match(r"[\w.-]+", line)[0].lower().replace("_", "-")
+              for line in (*wanted["dependencies"], *wanted["optional-dependencies"]["test"])]  # fmt: skip
+    assert set(needed) - set(dict(pinned)) == {"torch"}
+
+
 @pytest.mark.parametrize("text", ["1" * 256, f"[{'9' * 400}]", f"a: 0x{'f' * 300}", f"a: {'59:' * 200}1"])
 def test_numbers_that_no_float_holds_are_refused_where_they_are_read(text: str) -> None:
     with pytest.raises(InputError, match="a number of more than 255 digits"):
@@ -78,6 +94,15 @@ def test_half_a_surrogate_pair_is_no_text() -> None:
     assert parse_json(r'"\ud83d\ude00"') == "\U0001f600"
     with pytest.raises(ValueError, match="surrogate"):
         parse_json(r'{"a": "\ud83d"}')
+
+
+def test_a_damaged_validation_is_left_out_of_card_and_preview(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_folder(tmp_path, [sphere_shard(count=3)])
+    (tmp_path / "validation.json").write_text(
+        '{"checked": Infinity, "planned": 1, "errors": 0, "warnings": 0, "checks": []}'
+    )
+    for command in ("card", "preview"):
+        assert main(["data", command, str(tmp_path)]) == 0, capsys.readouterr().err
 
 
 def test_damaged_lines_of_ledgers_count_as_torn(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

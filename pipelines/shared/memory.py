@@ -8,6 +8,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from render.backend.orphans import end_with_parent
 from render.shared.errors import InputError
 
 
@@ -45,7 +46,7 @@ def apart(work: Callable[..., Any], *arguments: Any) -> Any:
         InputError: the function's own, or the process died.
     """
     # Spawned: a forked child would count its parent's memory as its own.
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
         try:
             return pool.submit(work, *arguments).result()
         except BrokenProcessPool as error:

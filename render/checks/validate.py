@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from render.backend.orphans import end_with_parent
 from render.checks.folder_checks import CHECKSUMS, check_folder, find_duplicates, read_checksums
 from render.checks.known_checks import CHECKS, ERROR, WARNING, Finding, check_shard
 from render.checks.shard_checks import Limits
@@ -177,7 +178,8 @@ def _results(tasks: Sequence[tuple[str, SceneSpec, Limits, str | None]], workers
     if workers == 1 or len(tasks) < 2:
         yield from map(check_one, tasks)
         return
-    with ProcessPoolExecutor(min(workers, len(tasks)), multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(tasks)), context, initializer=end_with_parent) as pool:
         try:
             yield from pool.map(check_one, tasks, chunksize=max(1, min(16, len(tasks) // (4 * workers))))
         except BrokenProcessPool as error:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from render.backend.orphans import end_with_parent
 from render.materials import library, surfaces
 from render.materials.textures import textured
 from render.planning import light_sets
@@ -126,7 +127,7 @@ def _mapping(processes: int) -> Iterator[Any]:
         yield map
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context) as executor:
+    with ProcessPoolExecutor(processes, mp_context=context, initializer=end_with_parent) as executor:
         try:
             yield partial(executor.map, chunksize=4)
         except BaseException:

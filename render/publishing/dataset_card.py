@@ -145,5 +145,5 @@ def _validation(folder: Path) -> dict[str, Any]:
             "stale": report["manifest_sha256"] != file_hash(folder / MANIFEST),
             "findings": [(row["name"], row["level"], row["findings"], row["about"]) for row in checks],
         }
-    except (InputError, ValueError, KeyError, TypeError):
+    except (InputError, ValueError, KeyError, TypeError, OverflowError):
         return {}

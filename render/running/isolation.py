@@ -8,15 +8,14 @@ import faulthandler
 import os
 import signal
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from multiprocessing import parent_process
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from typing import Any
 
+from render.backend.orphans import end_with_parent
 from render.planning.chunks import Chunk
 from render.records.ledger import now
 from render.records.manifest import SceneSpec
@@ -59,7 +58,7 @@ def settle(config: WorkerConfig) -> None:
         import resource
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent(GRACE)
     descriptor = os.open(config.errors, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     os.dup2(descriptor, 2)
     os.close(descriptor)
@@ -67,17 +66,6 @@ def settle(config: WorkerConfig) -> None:
     os.environ["SDPS_VARIANT"] = config.variant
     if config.llvm:
         os.environ["DRJIT_LIBLLVM_PATH"] = config.llvm
-
-
-def _end_with_parent() -> None:
-    """End when the parent is gone, killed perhaps: a process that hangs would stay for ever."""
-    parent = parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        with suppress(AttributeError, OSError):
-            os.kill(os.getpid(), signal.SIGTERM)  # unwinds, if it still can
-        time.sleep(GRACE)
-        os._exit(1)
 
 
 class Work:

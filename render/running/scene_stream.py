@@ -16,12 +16,12 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, islice
-from multiprocessing import parent_process
 from multiprocessing.connection import Connection
 from typing import NamedTuple
 
 import numpy as np
 
+from render.backend.orphans import end_with_parent
 from render.planning.chunks import view_groups
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
@@ -118,7 +118,7 @@ def serve(connection: Connection, config: StreamWorkerConfig) -> None:
     """Render as configured, sending each scene through `connection`; end with the parent, whatever it ends by."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()  # whatever the renderer is doing
     outbox: queue.Queue[_Message | None] = queue.Queue(config.depth)
     sender = threading.Thread(target=_send, args=(connection, outbox), daemon=True)
     sender.start()
@@ -153,11 +153,3 @@ def _send(connection: Connection, outbox: queue.Queue[_Message | None]) -> None:
             connection.send(message)
         except OSError:
             os._exit(1)  # nobody listens any more
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent is gone, even killed, and whatever the renderer is doing."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

@@ -49,7 +49,7 @@ def shaded(view, lights: np.ndarray, albedo: float = 1.0) -> str:
 
 
 def infer(images: np.ndarray, mask: np.ndarray, lights: np.ndarray | None, method: str):
-    """Write images as a folder of photographs and infer from it."""
+    """Write images as a folder of photographs and infer from it, without the refinement (minutes, of 1,000)."""
     import sdps
     from pipelines.evaluate.workbench import write_photographs
 
@@ -58,7 +58,7 @@ def infer(images: np.ndarray, mask: np.ndarray, lights: np.ndarray | None, metho
         if lights is not None:
             (folder / "light_directions.txt").write_text("".join("{} {} {}\n".format(*row) for row in lights))
         photos = sdps.load(folder, lights=None if lights is None else "folder", gamma="linear")
-        found = sdps.infer(photos, method)
+        found = sdps.infer(photos, method, refine=False)
         assert np.isfinite(found.normals).all()
         return found
 
@@ -180,9 +180,9 @@ SCENES: dict[str, Callable[[], str]] = {
     "one light": one_light,
     "one light, inferred": infer_one_light,
     "1,000 lights, inferred with them known": thousand_lights,
-    "1,000 lights, inferred by networks": thousand_lights_network,
+    "1,000 lights, inferred by networks, not refined": thousand_lights_network,
     "16x16 pixels, inferred with known lights": smallest,
-    "16x16 pixels, inferred by networks": smallest_network,
+    "16x16 pixels, inferred by networks, not refined": smallest_network,
     "object of one pixel": one_pixel,
     "albedo 0": black,
     "albedo 1": white,

@@ -229,7 +229,7 @@ _LONG = ("bench", "bench-train", "bench-classical", "bench-checks", "bench-infer
 def _stop(words: tuple[str, ...], actions: list[Any]) -> list[str]:
     """Return flags that end a command which needs no other, before anything long is begun."""
     stops = {
-        "noise": ["--reference", "0"],
+        "noise": ["--reference", "0", "--size", "0"],
         "materials": ["--materials", "missing"],
         "app": ["--max-files", "0", "--max-megabytes", "0"],
     }

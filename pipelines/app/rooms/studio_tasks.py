@@ -187,7 +187,7 @@ def wanted(place: Path, **asked: Any) -> dict[str, Any]:
     try:
         turn = [float(asked.get(name, 0.0)) for name in ("yaw", "pitch", "roll")]
         bounces, size = int(asked.get("bounces", 1)), int(asked.get("size", 256))
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError("the pose, bounces and size must be numbers") from error
     if not np.isfinite(turn).all() or not 0 <= bounces <= 8 or size not in _SIZES:
         raise InputError("bounces must be 0 to 8 and the size 128 or 256")

@@ -13,6 +13,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from render.backend.orphans import end_with_parent
 from render.shared.errors import InputError
 from render.shared.progress import listening
 
@@ -33,6 +34,7 @@ _STEP = 0.004  # smallest advance of a share that is told
 def serve(pipe: Connection) -> None:
     """Run jobs until the other end of the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
+    end_with_parent()
     _warm()
     while True:
         try:

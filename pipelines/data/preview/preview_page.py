@@ -71,7 +71,7 @@ def _validation(folder: Path) -> dict[str, Any]:
         report = read_json(folder / "validation.json", "validate the folder again")
         found = {key: int(report[key]) for key in ("checked", "errors", "warnings")}
         return found | {"time": str(report["time"])[:10], "sound": bool(report.get("sound"))}
-    except (InputError, ValueError, KeyError, TypeError):
+    except (InputError, ValueError, KeyError, TypeError, OverflowError):
         return {}
 
 

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from render import shapes
+from render.shapes.geometry import mesh as mesh_module
 from render.shapes.geometry.mesh import TriangleMesh, load_mesh, vertex_normals
 from render.shared.errors import InputError
 from render.shared.seeds import generator
@@ -208,3 +209,10 @@ def test_a_compressed_file_that_unpacks_to_too_much_is_refused(tmp_path, monkeyp
     path.write_bytes(gzip.compress(bytes((1 << 20) + 1)))
     with pytest.raises(InputError, match=r"bomb.ply.gz: unpacks to more than a file of this size"):
         load_mesh(path)
+
+
+def test_the_bounding_centre_is_the_same_however_many_points_are_looked_at_together(monkeypatch) -> None:
+    points = np.random.default_rng(0).normal(0, 1, (5000, 3)).astype(np.float32)
+    whole = mesh_module.bounding_centre(points)
+    monkeypatch.setattr(mesh_module, "_BLOCK", 700)
+    np.testing.assert_array_equal(mesh_module.bounding_centre(points), whole)

@@ -1,0 +1,163 @@
+"""Do the same work many times in one process and watch what it holds: `python tests/faults/endurance_run.py`.
+
+Tasks: `infer` (a folder of photographs, with networks and the files of `sdps infer`), `render` (small scenes, each of
+another shape and light). After every round memory, open files, threads and child processes are noted; printed as a
+Markdown table and, with --plot, drawn.
+"""
+
+import argparse
+import ctypes
+import gc
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+for place in (ROOT, ROOT / "tests" / "support"):
+    if str(place) not in sys.path:
+        sys.path.insert(0, str(place))
+
+
+class Held(NamedTuple):
+    """What a process holds.
+
+    Attributes:
+        memory: MiB resident.
+        files: Open file descriptors.
+        threads: Threads.
+        children: Child processes.
+        seconds: Of the round.
+    """
+
+    memory: float
+    files: int
+    threads: int
+    children: int
+    seconds: float
+
+
+def held(seconds: float = 0.0) -> Held:
+    """Look at this process, after what lies unused has gone back to the system."""
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
+    process = Path("/proc/self")
+    tasks = list((process / "task").iterdir())
+    children = sum(len((task / "children").read_text().split()) for task in tasks)
+    pages = int((process / "statm").read_text().split()[1])
+    return Held(
+        pages * os.sysconf("SC_PAGE_SIZE") / 2**20, len(os.listdir(process / "fd")), len(tasks), children, seconds
+    )
+
+
+def infer(folder: Path) -> Callable[[int], Any]:
+    """Return what infers once, the folder of photographs made here."""
+    import photo_folders
+    from data_folders import light_directions
+
+    import sdps
+
+    images, mask = photo_folders.matte(light_directions(12).astype(float), size=48)
+    photo_folders.write_folder(folder / "photos", images, mask, bits=16)
+
+    def once(number: int) -> None:
+        found = sdps.infer(sdps.load(folder / "photos"), "sdps", refine=False)
+        found.save(folder / "out")
+
+    return once
+
+
+def render(folder: Path) -> Callable[[int], Any]:
+    """Return what renders one small scene."""
+    from render import api
+
+    materials = ("chrome", "pink-plastic", "lambertian:0.8")
+    lights = np.array([[0.3, 0.2, 0.9], [-0.5, 0.1, 0.8]])
+
+    def once(number: int) -> None:
+        view = api.render_view(f"blobby:{number}", materials[number % 3], lights, size=16, spp=1, seed=number)
+        assert np.isfinite(view.images).all()
+
+    return once
+
+
+TASKS = {"infer": infer, "render": render}
+
+
+def watch(task: str, count: int, folder: Path) -> list[Held]:
+    """Do a task `count` times; return what was held before, and after every round."""
+    once = TASKS[task](folder)
+    rows = [held()]
+    for number in range(count):
+        began = time.perf_counter()
+        once(number)
+        rows.append(held(time.perf_counter() - began))
+    return rows
+
+
+def table(task: str, rows: list[Held]) -> str:
+    """Lay out about eight of the rounds as Markdown."""
+    chosen = sorted({1, 2, *np.linspace(0, len(rows) - 1, 7).astype(int).tolist()})
+    lines = [
+        f"| {task}, round | memory | open files | threads | child processes | seconds |",
+        "|---|---|---|---|---|---|",
+    ]
+    for number in chosen:
+        row = rows[number]
+        cells = (
+            number or "before",
+            f"{row.memory:.0f} MiB",
+            row.files,
+            row.threads,
+            row.children,
+            f"{row.seconds:.2f}",
+        )
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def plot(path: Path, rows: list[Held]) -> None:
+    """Draw memory, files and children over the rounds."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    for axes, field, unit in zip(figure.subplots(1, 3), ("memory", "files", "children"), ("MiB", "", ""), strict=True):
+        axes.plot([getattr(row, field) for row in rows])
+        axes.set(title=f"{field} {unit}", xlabel="round", ylim=(0, None))
+    figure.savefig(path, dpi=100)
+
+
+def main() -> int:
+    """Run a task; 1 where it holds more at the end than after a fifth of the rounds."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--task", choices=TASKS, default="infer")
+    parser.add_argument("--count", type=int, default=50)
+    parser.add_argument("--plot", type=Path, help="picture of memory, files and children")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        rows = watch(args.task, args.count, Path(name))
+    sys.stdout.write(table(args.task, rows))
+    if args.plot:
+        plot(args.plot, rows)
+    return int(grown(rows))
+
+
+def grown(rows: list[Held], slack: float = 1.05) -> bool:
+    """Tell whether the last fifth of the rounds holds more than the second, beyond 5 % of memory."""
+    fifth = max(len(rows) // 5, 1)
+    early, late = rows[fifth : 2 * fifth], rows[-fifth:]
+    memory = np.median([row.memory for row in late]) > slack * np.median([row.memory for row in early])
+    counts = any(
+        max(getattr(row, field) for row in late) > max(getattr(row, field) for row in early)
+        for field in ("files", "threads", "children")
+    )
+    return bool(memory or counts)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
