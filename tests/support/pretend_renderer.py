@@ -15,8 +15,24 @@ def pretend(connection, config: WorkerConfig) -> None:
     connection.send(Ready())
     while (chunk := connection.recv()) is not None:
         for scene in chunk.scenes():
+            if scene.material == "die unbegun":
+                os._exit(4)
             connection.send(Begun((scene.id,)))
+            told = scene.digest()
             match scene.material:
+                case "garbage":
+                    connection.send_bytes(b"no pickle")
+                case "other type":
+                    connection.send({"done": scene.id})
+                case "other scene":
+                    connection.send(Failed(("nobody",), "ValueError: no", "", 0.1))
+                case "no shard":
+                    connection.send(_done(scene, config, scene.digest()))
+                    time.sleep(60)
+                case "other plan":
+                    told = "0" * 64
+                case "torn line":
+                    connection.send(Done({"id": scene.id}))
                 case "hang":
                     time.sleep(60)
                 case "slow":
@@ -38,10 +54,13 @@ def pretend(connection, config: WorkerConfig) -> None:
             path = config.folder / scene.file
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(scene.digest().encode())
-            line = {"id": scene.id, "spec": scene.digest(), "bytes": 64, "seconds": 0.5, "stages": {"render": 0.5},
-                    "time": ledger.now(), "worker": config.number}  # fmt: skip
-            connection.send(Done(line))
+            connection.send(_done(scene, config, told))
         connection.send(Ended(True))
+
+
+def _done(scene, config: WorkerConfig, spec: str) -> Done:
+    return Done({"id": scene.id, "spec": spec, "bytes": 64, "seconds": 0.5, "stages": {"render": 0.5},
+                 "time": ledger.now(), "worker": config.number})  # fmt: skip
 
 
 def stillborn(connection, config: WorkerConfig) -> None:
