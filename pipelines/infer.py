@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--discontinuities", action="store_true", help="let the depth jump where slopes disagree")
     parser.add_argument("--refine", action=argparse.BooleanOptionalAction, default=None,
                         help="refine normals and lights until a simple model explains the photographs (default: where "
-                        "networks find both)")  # fmt: skip
+                        "a network finds the normals)")  # fmt: skip
     parser.add_argument("--anyway", action="store_true",
                         help="go on where a check of the photographs stops (the report says which)")  # fmt: skip
     using.add_arguments(parser)

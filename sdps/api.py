@@ -69,7 +69,7 @@ def infer(
         models: Folder of trained runs (`out` of `train`) to take weights from before the pretrained ones.
         config: How networks are used; the defaults are those of every command.
         refine: Refine normals and lights by inverse rendering (`sdps.refinement`); the same as `+refine` at the end of
-            `method`. None: where networks find both, from eight images on.
+            `method`. None: where a network finds the normals, from eight images on.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
         anyway: Go on where the checks found an error. The method may still find that it cannot.

@@ -69,6 +69,7 @@ def _keep(png: bytes, path: Path) -> None:
 
 
 def _photographs(page: Any, args: argparse.Namespace, address: str) -> None:
+    page.set_viewport_size({"width": 1280, "height": _HEIGHT})
     page.goto(f"{address}/photographs")
     page.click("#example")
     page.wait_for_selector("#findings li")
@@ -78,6 +79,7 @@ def _photographs(page: Any, args: argparse.Namespace, address: str) -> None:
     page.locator("#mesh canvas").wait_for()
     page.locator("#relit-light input").first.fill("135")
     page.locator(".hover").focus()
+    page.keyboard.press("ArrowDown")
     page.wait_for_timeout(3000)
     _keep(page.locator("#results").screenshot(), args.out / "app_results.jpg")
 

@@ -12,15 +12,17 @@ import drjit as dr
 import numpy as np
 
 from render.backend import variant
-from render.backend.arrays import opaque
+from render.backend.arrays import Columns, opaque
 from render.kernel import highlights
-from render.kernel.paths import Paths, Vertices, take
+from render.kernel.paths import Paths, Vertices
 from render.kernel.visibility import WORD
 from render.materials.kernels import bsdf
 from render.materials.kernels.bsdf import PackedMaterials
 from render.materials.kernels.packed import PackedSurfaces
 
 mi = variant.load()
+
+_BLOCK = 128  # pixels whose vertices stay in a core's cache while all lights pass over them
 
 
 def shade(paths: Paths, surfaces: PackedSurfaces, wanted: Iterable[int]) -> Iterator[tuple[int, np.ndarray]]:
@@ -73,7 +75,7 @@ def _of_one_normal(vertices: Vertices, numbers: list[int], fast: list[int]) -> l
 
 
 class _Lanes(NamedTuple):
-    """One lane per (light, pixel with vertices)."""
+    """One lane per (light, pixel with vertices): all lights of a block of pixels, then those of the next."""
 
     light: Any
     start: Any
@@ -85,9 +87,12 @@ class _Lanes(NamedTuple):
 
 def _lanes(paths: Paths, vertices: Vertices) -> _Lanes:
     pixels, count = opaque(mi.UInt32(dr.width(vertices.pixels))), opaque(mi.UInt32(vertices.count))
-    lane = dr.arange(mi.UInt32, paths.lights * dr.width(vertices.pixels))
-    light = lane // pixels
-    pixel = lane - light * pixels
+    lane, lights = dr.arange(mi.UInt32, paths.lights * dr.width(vertices.pixels)), opaque(mi.UInt32(paths.lights))
+    first = lane // (_BLOCK * lights) * _BLOCK  # pixel of the block
+    within = lane - first * lights
+    width = dr.minimum(pixels - first, _BLOCK)
+    light = within // width
+    pixel = first + within - light * width
     return _Lanes(
         light=light,
         start=dr.gather(mi.UInt32, vertices.start, pixel),
@@ -119,19 +124,20 @@ def _accumulate(images: list, vertices: Vertices, lanes: _Lanes, reflect: Any) -
 
 def _add_vertices(image: Any, paths: Paths, vertices: Vertices, surfaces: PackedSurfaces, number: int) -> None:
     """Add the light reflected at one depth, by any kind of material."""
-    lanes, throughput, weights = _lanes(paths, vertices), vertices.throughput[number], vertices.weights[number]
-    weigh, normals = _partition(paths, vertices, lanes, surfaces, number), vertices.normal_of(number)
+    lanes, weights = _lanes(paths, vertices), vertices.weights[number]
+    weigh = _partition(paths, vertices, lanes, surfaces, number)
+    hits = Columns(vertices.normal_of(number), vertices.wi, vertices.throughput[number], *(weights or ()))
     reach = paths.emitters.reach(lanes.light, vertices.position)
 
     def reflect(at: Any) -> Any:
         direction, strength = reach(at)
-        normal = dr.gather(mi.Vector3f, normals, at)
+        normal, wi, throughput, *shares = hits.at(at)
+        normal = mi.Vector3f(*normal)
         frame = mi.Frame3f(normal)
-        wi = frame.to_local(take(mi.Vector3f, vertices.wi, at))
-        here = None if weights is None else tuple(take(mi.Float, weight, at) for weight in weights)
-        value = surfaces.eval(number, wi, frame.to_local(direction), here)
+        here = None if weights is None else tuple(shares)
+        value = surfaces.eval(number, frame.to_local(mi.Vector3f(*wi)), frame.to_local(direction), here)
         value = dr.select(_carrier_faces(vertices, number, at, direction), value, 0)
-        return (take(mi.Color3f, throughput, at) * value * weigh(at, normal) * strength,)
+        return (mi.Color3f(*throughput) * value * weigh(at, normal) * strength,)
 
     _accumulate([image], vertices, lanes, reflect)
 
@@ -156,15 +162,17 @@ def _add_camera_hits(
     vector and theta_d are constant: the tables shrink to a row over theta_h per light (`PackedMaterials.rows`), and the
     factor of theta_i to one per hit.
     """
-    lanes, wi, normals = _lanes(paths, vertices), mi.Vector3f(vertices.wi), vertices.normal_of(numbers[0])
+    lanes, wi = _lanes(paths, vertices), mi.Vector3f(vertices.wi)
     direction = dr.gather(mi.Vector3f, paths.directions, lanes.light)
     half = dr.normalize(wi + direction)
     cos_d = dr.minimum(dr.dot(wi, half), 1)
     weighs = [_partition(paths, vertices, lanes, surfaces, number) for number in numbers]
     materials = [_camera_rows(paths, vertices, surfaces, number, wi) for number in numbers]
+    hits = Columns(vertices.normal_of(numbers[0]), *(scale for parts in materials for *_, scale in parts))
 
     def reflect(at: Any) -> Any:
-        normal = dr.gather(mi.Vector3f, normals, at)
+        normal, *scales = hits.at(at)
+        normal, left = mi.Vector3f(*normal), iter(scales)
         cos_i, cos_o = dr.dot(normal, wi), dr.dot(normal, direction)
         sin2_h = dr.squared_norm(dr.cross(normal, half))
         entry = bsdf.half_cell(sin2_h, dr.dot(normal, half))
@@ -175,9 +183,9 @@ def _add_camera_hits(
         values = []
         for parts, weigh in zip(materials, weighs, strict=True):
             total = mi.Color3f(0)
-            for family, rows, shadow_row, scale in parts:
-                value = family.eval_row(rows, lanes.light, entry, azimuth) * family.eval_shadow(shadow_row, shadow)
-                total += value * dr.gather(mi.Color3f, scale, at)
+            for family, index, rows, _ in parts:
+                value = family.eval_row(rows, lanes.light, entry, azimuth) * family.shadow(index, shadow)
+                total += value * mi.Color3f(*next(left))
             values.append(total * lit * weigh(at, normal))
         return tuple(values)
 
@@ -185,15 +193,14 @@ def _add_camera_hits(
 
 
 def _camera_rows(paths: Paths, vertices: Vertices, surfaces: PackedSurfaces, number: int, wi: Any) -> list[tuple]:
-    """Return per material of a surface its family, rows, factor S, and S(theta_i) times its weight at the hits."""
+    """Return per material of a surface its family, number, rows, and S(theta_i) times its weight at the hits."""
     parts, weights = [], vertices.weights[number]
     for k, part in enumerate(surfaces.parts[number]):
         family, index = surfaces.families[part.family], opaque(mi.UInt32(part.member))
         scale = family.shadow(index, bsdf.shadow_cell(dr.dot(vertices.normal_of(number), wi)))
         if weights is not None:
             scale *= weights[k]
-        dr.eval(scale)
-        parts.append((family, family.rows(index, wi, paths.directions), family.shadow_row(index), scale))
+        parts.append((family, index, family.rows(index, wi, paths.directions), scale))
     return parts
 
 

@@ -9,11 +9,13 @@ import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 import assets
+from render.backend import variant
 from render.materials import library
 from render.materials.textures import map_folder
 from render.planning import provenance
@@ -141,6 +143,8 @@ def check(task: Task) -> None:
 class Station:
     """The rendering processes of a worker, one per task at a time, kept while there is work.
 
+    Where there is a GPU, tasks take turns on it: side by side they would fill its memory.
+
     Args:
         folder: Folder for what is on its way.
         memory: Bytes of memory each process may take; 0: any.
@@ -149,7 +153,7 @@ class Station:
     def __init__(self, folder: Path, memory: int = 0) -> None:
         self.folder, self.memory = folder, memory
         self.idle: list[LocalCrew] = []
-        self.lock = threading.Lock()
+        self.lock, self.gpu = threading.Lock(), threading.Lock()
         self.stopped: set[str] = set()
         self.timer: threading.Timer | None = None
 
@@ -160,6 +164,13 @@ class Station:
             Mismatch: this machine would give other bytes.
         """
         check(task)
+        with self._turn():
+            return self._rendered(task)
+
+    def _turn(self) -> AbstractContextManager[object]:
+        return self.gpu if variant.choose().variant == "cuda_ad_rgb" else nullcontext()
+
+    def _rendered(self, task: Task) -> Rendered:
         crew = self._borrow(task)
         news: list[News] = []
         try:

@@ -169,14 +169,17 @@ class _Run:
         try:
             with self.bar:
                 crew.give(cut(self.scenes, self.wanted, crew.slots, crew.chunk_bytes))
+                told = ""
                 while crew.busy():
                     while self.ledger.crowded:  # shards that wait for their store fill the disk: make no more of them
                         time.sleep(0.1)
                     for news in crew.step():
                         self._take(news)
                     self.workers = crew.count
-                    if crew.note:
-                        self.bar.set_postfix_str(crew.note)
+                    if crew.note != told:
+                        told = crew.note
+                        self.bar.set_postfix_str(told)
+                    self.bar.update(0)  # the time, as often as the bar is shown anew
         finally:
             crew.close()
 

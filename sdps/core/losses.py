@@ -4,6 +4,7 @@ All are means over equal shares (images of a scene, scenes of a batch), so that 
 a batch is the loss of the whole: parts may be accumulated, or spread over processes.
 """
 
+import torch
 from torch import Tensor
 from torch.nn import functional
 
@@ -42,3 +43,39 @@ def masked_normal_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
     cosine = (normals * truth).sum(dim=1, keepdim=True)  # (B, 1, H, W)
     sums = ((1.0 - cosine) * mask).sum(dim=(1, 2, 3))  # (B,)
     return (sums / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)).mean()
+
+
+def normal_gradient_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean over scenes of the mean error of the step from a pixel to its neighbour, |x| + |y| + |z|.
+
+    Only pairs of pixels that both lie on the object count.
+
+    Args:
+        normals: (B, 3, H, W) unit estimates.
+        truth: (B, 3, H, W) unit normals.
+        mask: (B, 1, H, W), 0 or 1; a scene without pairs adds zero.
+    """
+    error = (normals - truth) * mask  # of (B, 3, H, W), whose steps are the errors of the steps
+    sums, pairs = torch.zeros_like(mask[:, 0, 0, 0]), torch.zeros_like(mask[:, 0, 0, 0])
+    for axis in (2, 3):
+        both = mask.narrow(axis, 1, mask.shape[axis] - 1) * mask.narrow(axis, 0, mask.shape[axis] - 1)
+        sums = sums + (error.diff(dim=axis).abs() * both).sum(dim=(1, 2, 3))
+        pairs = pairs + both.sum(dim=(1, 2, 3))
+    return (sums / pairs.clamp(min=1.0)).mean()
+
+
+def shading_loss(shading: Tensor, truth: Tensor, mask: Tensor, directions: Tensor) -> Tensor:
+    """Return the mean over scenes of the mean squared error of max(n . l, 0) over images and the object's cells.
+
+    Args:
+        shading: (B, Q, 1, h, w) estimates, in cells of H/h x W/w pixels.
+        truth: (B, 3, H, W) unit normals.
+        mask: (B, 1, H, W), 0 or 1; a cell counts by its share of object pixels, whose mean it is compared with.
+        directions: (B, Q, 3) true ones, unit.
+    """
+    side = truth.shape[-1] // shading.shape[-1]
+    lit = torch.einsum("bchw,bqc->bqhw", truth * mask, directions).clamp(min=0.0)
+    share = functional.avg_pool2d(mask, side)  # (B, 1, h, w)
+    wanted = functional.avg_pool2d(lit, side) / share.clamp(min=1e-6)
+    sums = ((shading[:, :, 0].float() - wanted).square() * share).sum(dim=(1, 2, 3))  # (B,)
+    return (sums / (share.sum(dim=(1, 2, 3)) * shading.shape[1]).clamp(min=1.0)).mean()

@@ -1,7 +1,8 @@
 """Networks applied to a scene's images chunk by chunk, with the result of seeing them all at once.
 
-Maximum and mean over the images are all that networks share between them, so running ones suffice. Of every image only
-a lighting network's local feature is kept: 64 kB, half of that in bfloat16.
+Maximum and mean over the images are all that most networks share between them, so running ones suffice. Of every image
+only a lighting network's local feature is kept: 64 kB, half of that in bfloat16; and, for normal networks that attend
+to the lights of a pixel, 16 bytes per pixel.
 
 Legend: L images, P pixels of the object, (h, w) the sides of what the network sees.
 """
@@ -16,6 +17,7 @@ from torch.nn import functional
 
 from render.shared.progress import stage
 from sdps.inference.turned_views import AnyView
+from sdps.models.attention import AttentionNet
 from sdps.models.base import LightingNetwork, Lights, NormalNetwork, divide
 from sdps.models.observation_maps import predict_normals
 
@@ -61,29 +63,41 @@ def normal_map(network: NormalNetwork, view: AnyView, lights: Lights | None, aut
         lights: Of all images, (1, L, ...); None for networks that are not told the lights.
         autocast: Makes the context in which the network runs.
     """
-    mean_square = _mean_square(network, view, lights) if network.per_pixel else None
+    brightness = None if network.division == "none" else _brightness(network, view, lights)
     mask = view.mask
     feature: Tensor | None = None
+    kept: list[Tensor] = []
     for part, images in view:
         some = None if lights is None else Lights(lights.directions[:, part], lights.intensities[:, part])
-        seen = network.observe(images, mask, some, mean_square)
+        seen = network.observe(images, mask, some, brightness)
         with autocast():
-            feature = _maximum(feature, network.encode(seen))
+            if isinstance(network, AttentionNet):
+                kept.append(network.kept(seen))
+            else:
+                feature = _maximum(feature, network.encode(seen))
         stage("normals", part.stop, len(view))
-    assert feature is not None  # a view has an image
     with autocast():
+        if isinstance(network, AttentionNet):
+            feature = network.fused(kept)
+        assert feature is not None  # a view has an image
         return network.regress(feature).float()
 
 
-def _mean_square(network: NormalNetwork, view: AnyView, lights: Lights | None) -> Tensor:
-    """Return the mean over all images and channels of the squares of what the network sees, (1, 1, 1, h, w)."""
-    total = torch.zeros((), device=view.mask.device)
+def _brightness(network: NormalNetwork, view: AnyView, lights: Lights | None) -> Tensor:
+    """Return `network.brightness` of all images, (1, 1, 1, h, w)."""
+    total: Tensor | None = None
     for part, images in view:
         if network.needs_lights:
             assert lights is not None
             images = divide(images, lights.intensities[:, part])
-        total = total + network.mean_square(images) * images.shape[1]
-    return total / len(view)
+        found = network.brightness(images)
+        if network.division == "max":
+            total = _maximum(total, found)
+        else:
+            found = found * (images.shape[1] / len(view))
+            total = found if total is None else total + found
+    assert total is not None  # a view has an image
+    return total
 
 
 def pixel_normal_map(

@@ -100,8 +100,8 @@ def refined(method: Method) -> Method:
 
 
 def by_networks(method: Method) -> bool:
-    """Tell whether networks find both the lights and the normals."""
-    return method.lights not in (NONE, TRUE_LIGHTS) and method.normals not in (NONE, *CLASSICAL)
+    """Tell whether a network finds the normals, under lights that a network finds or that are given."""
+    return method.lights != NONE and method.normals not in (NONE, *CLASSICAL)
 
 
 def model_of(name: str, find: Callable[[str], Path]) -> str:

@@ -33,6 +33,8 @@ NORMAL_ROWS = (  # lighting, normals, second, row of the paper
     ("lcnet-soft", "psfcn", NONE, ""),
     ("lcnet-soft", "nenet-plus", NONE, ""),
     ("lcnet-soft", "nenet-plus", "lcnet-second", ""),
+    ("lcnet-soft", "attention", NONE, ""),
+    (TRUE_LIGHTS, "attention", NONE, ""),
     ("lcnet", "least-squares", NONE, ""),
     (TRUE_LIGHTS, "least-squares", NONE, ""),
 )

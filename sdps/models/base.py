@@ -4,7 +4,7 @@ Legend: B scenes, Q images of a scene, H and W the image's sides.
 """
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -12,9 +12,13 @@ from torch import Tensor, nn
 from sdps.core.lighting import LightClasses, ReadOut
 from sdps.models.blocks import max_over_images
 
+Division = Literal["none", "norm", "max"]
+"""What each pixel of the images is divided by; see `NormalNetwork`."""
+DIVISIONS: tuple[Division, ...] = get_args(Division)
+
 _TINY = 1e-8
 _SCALE_FLOOR = 1e-4
-"""Added to a pixel's norm over the lights: far below any lit pixel, but keeps black ones from dividing by zero."""
+"""Added to what a pixel is divided by: far below any lit pixel, but keeps black ones from dividing by zero."""
 
 
 class Lights(NamedTuple):
@@ -96,18 +100,20 @@ class NormalNetwork(nn.Module, ABC):
     """Estimates normals from any number of images, in any order, by the maximum over their features.
 
     `encode` followed by `regress` lets a caller keep a running maximum, so that memory does not grow with the number
-    of images. A network with `per_pixel` also needs each pixel's norm over all images beforehand.
+    of images. A network with a `division` also needs each pixel's `brightness` over all images beforehand. One with
+    attention across lights needs the features of all images at once (`sdps.models.attention`).
 
     Attributes:
         needs_lights: The network is told directions, and its images are divided by the intensities.
         needs_mask: The mask is an input channel.
-        per_pixel: Images are divided by each pixel's norm over all lights and channels (PS-FCN (Norm.), Chen et al.,
-            TPAMI 2020), which takes albedo away and leaves shading.
+        division: Images are divided by each pixel's `norm` over all lights and channels (PS-FCN (Norm.), Chen et al.,
+            TPAMI 2020), or by its `max`imum (ESSENCE-Net), which takes albedo away and leaves shading.
+        size_multiple: Sides of images must be multiples of it.
     """
 
     needs_lights: bool = True
     needs_mask: bool = False
-    per_pixel: bool = False
+    division: Division = "none"
     size_multiple: int = 4
 
     def observe(
@@ -115,7 +121,7 @@ class NormalNetwork(nn.Module, ABC):
         images: Tensor,  # (B, Q, 3, H, W)
         mask: Tensor,  # (B, 1, H, W)
         lights: Lights | None,
-        mean_square: Tensor | None = None,  # (B, 1, 1, H, W)
+        brightness: Tensor | None = None,  # (B, 1, 1, H, W)
     ) -> Observations:
         """Prepare images for `encode`.
 
@@ -123,22 +129,27 @@ class NormalNetwork(nn.Module, ABC):
             images: Exposed images, under lights of the intensities in `lights`.
             mask: 0 or 1.
             lights: May be None for networks that are not told the lights.
-            mean_square: `mean_square(...)` over all images of the scene where `images` are only some; see `per_pixel`.
+            brightness: `brightness(...)` of all images of the scene where `images` are only some; see `division`.
         """
         directions = None
         if self.needs_lights:
             assert lights is not None
             images, directions = divide(images, lights.intensities), lights.directions
-        if self.per_pixel:
-            squares = mean_square if mean_square is not None else self.mean_square(images)
-            # The published norm of 32 images of 3 channels, whatever the number of images here.
-            images = images / ((32 * 3 * squares).sqrt() + _SCALE_FLOOR)
+        if self.division != "none":
+            found = brightness if brightness is not None else self.brightness(images)
+            # The published norm is that of 32 images of 3 channels, whatever the number of images here.
+            scale = (32 * 3 * found).sqrt() if self.division == "norm" else found
+            images = images / (scale + _SCALE_FLOOR)
         return Observations(images, directions, mask if self.needs_mask else None)
 
-    @staticmethod
-    def mean_square(images: Tensor) -> Tensor:
-        """Return the mean over images and channels of the squares, (B, 1, 1, H, W), of (B, Q, 3, H, W)."""
+    def brightness(self, images: Tensor) -> Tensor:
+        """Return what a pixel is divided by, (B, 1, 1, H, W), of images (B, Q, 3, H, W) over their intensities.
+
+        The mean over images and channels of the squares where the division is by the `norm`, the maximum otherwise.
+        """
         # Before any autocast region: squares of bfloat16 would carry errors of a per cent.
+        if self.division == "max":
+            return images.float().amax(dim=(1, 2), keepdim=True).clamp(min=0.0)
         # The tiny floor keeps the square root's gradient finite at pixels that are black under every light.
         return images.float().square().mean(dim=(1, 2), keepdim=True).clamp(min=1e-14)
 

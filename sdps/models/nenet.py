@@ -47,9 +47,10 @@ class MaxFusionNet(NormalNetwork):
         )
         self.normal = nn.Conv2d(full, 3, 3, padding=1, bias=False)
 
-    def local(self, seen: Observations) -> Tensor:
-        """Return the feature of every image, (B, Q, F, H/2, W/2)."""
-        scenes, count, _, height, width = seen.images.shape
+    @staticmethod
+    def inputs(seen: Observations) -> Tensor:
+        """Return the input channels of every image, (B, Q, C, H, W)."""
+        _, count, _, height, width = seen.images.shape
         assert height % SIZE_MULTIPLE == 0 and width % SIZE_MULTIPLE == 0, seen.images.shape
         parts = [seen.images]
         if seen.directions is not None:
@@ -57,8 +58,11 @@ class MaxFusionNet(NormalNetwork):
             parts.append(lights.expand(-1, -1, -1, height, width))
         if seen.mask is not None:
             parts.append(seen.mask[:, None].expand(-1, count, -1, -1, -1))
-        inputs = torch.cat(parts, dim=2) if len(parts) > 1 else seen.images
-        return self.extractor(inputs.flatten(0, 1)).unflatten(0, (scenes, count))
+        return torch.cat(parts, dim=2) if len(parts) > 1 else seen.images
+
+    def local(self, seen: Observations) -> Tensor:
+        """Return the feature of every image, (B, Q, F, H/2, W/2)."""
+        return self.extractor(self.inputs(seen).flatten(0, 1)).unflatten(0, seen.images.shape[:2])
 
     def encode(self, seen: Observations) -> Tensor:
         """Return the maximum (B, F, H/2, W/2) over the features of the given images."""
@@ -83,5 +87,5 @@ class NENet(MaxFusionNet):
 
     def __init__(self, *, per_pixel: bool = False) -> None:
         super().__init__(6)
-        self.per_pixel = per_pixel
+        self.division = "norm" if per_pixel else "none"
         initialise(self)

@@ -14,6 +14,7 @@ from torch import nn
 
 from render.shared.config import read_yaml
 from render.shared.errors import InputError, unknown
+from sdps.models.attention import AttentionNet
 from sdps.models.cnnps import CNNPS
 from sdps.models.lcnet import LCNet
 from sdps.models.lighting_variants import LCNetReg, LCNetSecond, LCNetSoft
@@ -95,7 +96,8 @@ def _entries() -> tuple[dict[str, ModelEntry], dict[str, Combination]]:
 
 
 NETWORKS: dict[str, type[nn.Module]] = {
-    kind.__name__: kind for kind in (LCNet, LCNetReg, LCNetSoft, LCNetSecond, NENet, UPSFCN, UPSFCNLight, CNNPS)
+    kind.__name__: kind
+    for kind in (LCNet, LCNetReg, LCNetSoft, LCNetSecond, NENet, AttentionNet, UPSFCN, UPSFCNLight, CNNPS)
 }
 MODELS, COMBINATIONS = _entries()
 

@@ -21,6 +21,7 @@ _FLAT = 0.1
 _WINDOW = 5  # pixels that a residual is averaged over
 _BEST, _LEAST = 0.008, 0.001  # the residual of a perfect model, and the least above it that is told apart
 _UPRIGHT, _STILL, _FAINT = 0.1, 0.3, 0.003
+_GIVEN = 0.5  # share of the error that is left where the lights' directions are given, as rendered scenes have it
 
 NORMAL = (4.804, 0.613, -0.505, 0.232, 0.016, -0.310, 0.298)
 """Of log degrees per pixel: constant, misfit, images, the lights' spread, residual of the pixel, its n_z, how far its
@@ -56,17 +57,19 @@ def trust(found: Refined, mask: np.ndarray, normals: np.ndarray, lights: np.ndar
         mask: (H, W) bool.
         normals: (H, W, 3) unit, its start.
         lights: (L, 3) unit, its start.
-        given: The lights were given. The formulas know of lights that were found; they then expect too much error, and
-            are no reason to keep the start.
+        given: The lights' directions were given: half the error is expected of normals, none of lights, and the start
+            is kept for no error that is expected.
     """
     of_normals, of_lights, moved = features(found, mask, normals, lights)
     expected = np.zeros(mask.shape, np.float32)
-    expected[mask] = np.exp(of_normals @ NORMAL)
+    share = _GIVEN if given else 1.0
+    expected[mask] = share * np.exp(of_normals @ NORMAL)
     start = float(np.exp(moved @ START))
     doubt = _doubt(mask, normals, lights)
     if not doubt and not given and (mean := float(expected[mask].mean())) > start:
         doubt = f"the model does not explain the photographs: {mean:.1f} degrees expected, {start:.1f} without it"
-    return Trust(expected, np.exp(of_lights @ LIGHT).astype(np.float32), start, doubt)
+    of_light = np.zeros(len(lights)) if given else np.exp(of_lights @ LIGHT)
+    return Trust(expected, of_light.astype(np.float32), start, doubt)
 
 
 def features(

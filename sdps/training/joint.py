@@ -7,13 +7,23 @@ import torch
 from torch import Tensor, nn
 
 from render.shared.errors import InputError
-from sdps.core.losses import faithful_normal_loss, masked_normal_loss
+from sdps.core.losses import masked_normal_loss
 from sdps.data.dataset import Batch, SampleOptions
-from sdps.models.base import LightingNetwork, Lights, NormalNetwork
+from sdps.models.base import LightingNetwork, Lights, NormalNetwork, Observations
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.lcnet import INPUT_SIZE, resize_input
 from sdps.models.lighting_variants import LCNetSecond
-from sdps.training.stages import LightingStage, Part, Stage, crop, described, freeze, light_errors, normal_error
+from sdps.training.stages import (
+    LightingStage,
+    Part,
+    Stage,
+    crop,
+    described,
+    freeze,
+    light_errors,
+    normal_error,
+    normal_loss,
+)
 from sdps.training.training_config import JointTraining, LightingTraining
 
 
@@ -103,27 +113,27 @@ class JointStage(Stage):
     def sample_options(self) -> SampleOptions:
         return replace(super().sample_options(), crop=self.config.crop, min_object=self.config.min_object)
 
-    def _pass(self, batch: Batch, side: int) -> tuple[Any, Lights, Tensor]:
-        """Return the lighting prediction, its lights, and normals of the crops."""
+    def _pass(self, batch: Batch, side: int) -> tuple[Any, Lights, Observations]:
+        """Return the lighting prediction, its lights, and what the normal network sees of the crops."""
         lighting, normals = self.network["lighting"], self.network["normals"]
         prediction = lighting(*resize_input(batch.images, batch.mask))
         lights = lighting.lights(prediction, self.config.read_out)
         images, mask = (crop(part, batch.corner, side) for part in (batch.images, batch.mask))
-        return prediction, lights, normals(normals.observe(images, mask, lights))
+        return prediction, lights, normals.observe(images, mask, lights)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the weighted sum of both stages' losses."""
         side = self.config.crop or self.config.size
-        prediction, _, normals = self._pass(batch, side)
+        prediction, _, seen = self._pass(batch, side)
         mask, truth = (crop(part, batch.corner, side) for part in (batch.mask, batch.normals))
-        masked = masked_normal_loss(normals, truth, mask)
-        loss = masked if self.config.loss == "masked" else faithful_normal_loss(normals, truth)
+        loss, terms = normal_loss(self.config, self.network["normals"], seen, truth, mask, batch.directions)
         lighting = self.network["lighting"].loss(prediction, batch.directions, batch.intensities)["total"]
         total = self.config.normal_weight * loss + self.config.lighting_weight * lighting
-        return total, {"masked_loss": masked, "lighting_loss": lighting}
+        return total, terms | {"lighting_loss": lighting}
 
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return the normal MAE on whole images and the errors of the lights."""
-        _, lights, normals = self._pass(batch, batch.images.shape[-1])
+        _, lights, seen = self._pass(batch, batch.images.shape[-1])
+        normals = self.network["normals"](seen)
         values = {"loss": float(masked_normal_loss(normals, batch.normals, batch.mask))}
         return values | {"normal_mae": normal_error(normals, batch)} | light_errors(lights, batch, "")

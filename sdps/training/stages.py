@@ -14,11 +14,12 @@ from torch.nn import functional
 
 from render.shared.seeds import derived_seed, generator
 from sdps.core.lighting import ReadOut
-from sdps.core.losses import faithful_normal_loss, masked_normal_loss
+from sdps.core.losses import faithful_normal_loss, masked_normal_loss, normal_gradient_loss, shading_loss
 from sdps.core.metrics import angle_degrees, direction_mae, intensity_error
 from sdps.data.dataset import Batch, SampleOptions
 from sdps.models import registry
-from sdps.models.base import LightingNetwork, Lights, NormalNetwork
+from sdps.models.attention import AttentionNet
+from sdps.models.base import LightingNetwork, Lights, NormalNetwork, Observations
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.lcnet import resize_input
 from sdps.models.registry import TRUE_LIGHTS
@@ -153,9 +154,9 @@ class NormalStage(Stage):
         name: str | None = None,
     ) -> None:
         model = model or self.usual
-        options = {"intensity_range": list(config.augmentation.intensity_range)}
-        known = registry.network_options(model)
-        super().__init__(name or model, model, config, options if "intensity_range" in known else {})
+        ranged = "intensity_range" in registry.network_options(model)
+        decided = {"intensity_range": list(config.augmentation.intensity_range)} if ranged else {}
+        super().__init__(name or model, model, config, decided | config.options)
         self.source = config.lights or registry.entry(model).lights
         assert lighting is not None or self.source in (TRUE_LIGHTS, ""), f"{model} needs a trained lighting model"
         self.lighting = freeze(lighting) if lighting and self.source not in (TRUE_LIGHTS, "") else None
@@ -199,18 +200,12 @@ class NormalStage(Stage):
         side = self.config.crop or self.config.size
         images, mask, truth = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
         seen = self.network.observe(images, mask, lights)
-        if isinstance(self.network, UPSFCNLight):
-            normals, logits = self.network.with_lights(seen)
-        else:
-            normals, logits = self.network(seen), None
-        masked = masked_normal_loss(normals, truth, mask)
-        loss = masked if self.config.loss == "masked" else faithful_normal_loss(normals, truth)
-        terms = {"masked_loss": masked}
-        if logits is not None:
-            learner = cast(UPSFCNLight, self.network)
-            terms["lighting_loss"] = learner.lighting_loss(logits, batch.directions, batch.intensities)
-            loss = loss + self.config.lighting_weight * terms["lighting_loss"]
-        return loss, terms
+        if not isinstance(self.network, UPSFCNLight):
+            return normal_loss(self.config, self.network, seen, truth, mask, batch.directions)
+        normals, logits = self.network.with_lights(seen)
+        loss, terms = plain_normal_loss(self.config, normals, truth, mask)
+        terms["lighting_loss"] = self.network.lighting_loss(logits, batch.directions, batch.intensities)
+        return loss + self.config.lighting_weight * terms["lighting_loss"], terms
 
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return the normal MAE on whole images, and the errors of lights that a model found."""
@@ -225,6 +220,39 @@ class NormalStage(Stage):
     def light_scores(self, lights: Lights | None, batch: Batch) -> dict[str, float]:
         """Return the errors of the lights the network is given; none of those that are the true ones."""
         return {} if lights is None or self.lighting is None else light_errors(lights, batch, "")
+
+
+def normal_loss(
+    config: NormalTraining, network: NormalNetwork, seen: Observations, truth: Tensor, mask: Tensor, directions: Tensor
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the scalar to minimise of a normal network, and named parts.
+
+    Args:
+        config: Names the loss, and weighs the others beside it.
+        network: In training.
+        seen: What it is shown.
+        truth: (B, 3, H, W) unit normals.
+        mask: (B, 1, H, W), 0 or 1.
+        directions: (B, Q, 3), the true ones.
+    """
+    if not (isinstance(network, AttentionNet) and network.shades and config.shading_weight):
+        return plain_normal_loss(config, network(seen), truth, mask)
+    normals, maps = network.with_shading(seen)
+    loss, terms = plain_normal_loss(config, normals, truth, mask)
+    terms["shading_loss"] = torch.stack([shading_loss(shading, truth, mask, directions) for shading in maps]).mean()
+    return loss + config.shading_weight * terms["shading_loss"], terms
+
+
+def plain_normal_loss(
+    config: NormalTraining, normals: Tensor, truth: Tensor, mask: Tensor
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the loss of estimated normals alone, and named parts; see `normal_loss`."""
+    masked = masked_normal_loss(normals, truth, mask)
+    loss, terms = masked if config.loss == "masked" else faithful_normal_loss(normals, truth), {"masked_loss": masked}
+    if config.gradient_weight:
+        terms["gradient_loss"] = normal_gradient_loss(normals, truth, mask)
+        loss = loss + config.gradient_weight * terms["gradient_loss"]
+    return loss, terms
 
 
 def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:

@@ -189,6 +189,9 @@ class NormalTraining(TrainingConfig):
         crop: Side of the random crop the network sees (0: the whole image); the lighting model always sees the whole.
         min_object: Least share of object pixels a crop should have; the best of a few draws is taken.
         lighting_weight: Weight of the lighting loss beside the normal loss, for models that learn both.
+        gradient_weight: Weight of the error of the normals' steps from pixel to pixel.
+        shading_weight: Weight of the errors of the shading maps, for models that learn them.
+        options: Options of the network over those of its registry entry, for variants of a model.
     """
 
     epochs: float = 10.0
@@ -201,6 +204,9 @@ class NormalTraining(TrainingConfig):
     crop: int = 0
     min_object: float = 0.3
     lighting_weight: float = 0.1
+    gradient_weight: float = 0.0
+    shading_weight: float = 0.0
+    options: dict[str, bool | int | float | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -210,7 +216,7 @@ class NormalTraining(TrainingConfig):
             raise InputError(f"light_blend must be in [0, 1], got {self.light_blend}")
         if not 0.0 <= self.min_object < 1.0:
             raise InputError(f"min_object must be in [0, 1), got {self.min_object}")
-        check_fields(self, "not negative", "lighting_weight")
+        check_fields(self, "not negative", "lighting_weight", "gradient_weight", "shading_weight")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,6 +266,8 @@ class JointTraining(NormalTraining):
         super().__post_init__()
         if self.read_out != "expectation":
             raise InputError(f"read_out must be expectation, the only one with a gradient, got {self.read_out}")
+        if self.options:
+            raise InputError("options must be empty: the networks are those of the pair")
         if self.light_blend:
             raise InputError("light_blend must be 0: the normals' error reaches the lighting model through its lights")
         check_fields(self, "positive", "normal_weight")

@@ -12,6 +12,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from pipelines import cli
 from pipelines.shared.cluster import link
 from pipelines.shared.cluster.cluster_config import ClusterChoice, ClusterConfig
 from pipelines.shared.cluster.dask_crew import crew_on
+from render.backend import variant
 from render.planning import chunks
 from render.planning.chunks import Chunk
 from render.records import ledger
@@ -29,6 +31,7 @@ from render.records.ledger import Ledger
 from render.records.manifest import SceneSpec, View
 from render.records.shards import file_hash, read_shard
 from render.running import station
+from render.running.crew import LocalCrew
 from render.running.supervisor import RunOptions, RunSummary, render_supervised
 from render.shared.errors import InputError
 
@@ -257,6 +260,19 @@ def test_a_process_that_takes_too_much_memory_costs_its_scene(tmp_path):
     crew.dismiss()
     assert set(rendered.shards) == {"s0-m0", "s0-m2"}
     assert [news.reason for news in rendered.news if not hasattr(news, "line")] == ["took more than 315 MB of memory"]
+
+
+def test_a_worker_with_a_gpu_renders_on_it_one_chunk_at_a_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(variant, "choose", lambda: variant.Choice("cuda_ad_rgb", None, "a GPU"))
+    crew, together = station.Station(tmp_path), []
+    step = LocalCrew.step
+    monkeypatch.setattr(LocalCrew, "step", lambda local: (together.append(crew.gpu.locked()), step(local))[1])
+    parts = [chunks.cut(planned([["variant"], ["variant"]]), {id})[0] for id in ("s0-m0", "s1-m0")]
+    with ThreadPoolExecutor(2) as pool:
+        rendered = list(pool.map(lambda part: crew.render(station.task_of("run", part, 60.0, pretend)), parts))
+    assert len(crew.idle) == 1 and all(together)  # one process did both
+    crew.dismiss()
+    assert [list(each.shards.values()) for each in rendered] == [[b"cuda_ad_rgb"]] * 2
 
 
 def test_chunks_of_a_cluster_are_bounded_in_bytes():

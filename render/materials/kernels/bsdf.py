@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 
 from render.backend import variant
-from render.backend.arrays import table
+from render.backend.arrays import interleaved, packet, packets
 from render.materials import model
 from render.materials.kernels import plugin
 from render.materials.kernels.lobes import HalfVectorLobes, cell, half_cell
@@ -22,6 +22,7 @@ from render.shared.errors import InputError
 mi = variant.load()
 
 _ROWS, _COLUMNS, _SHADOW = model.HALF_KNOTS, model.DIFFERENCE_KNOTS, model.SHADOWING_KNOTS
+_ROW = 8  # floats of an entry of `PackedMaterials.rows`
 
 
 class Coordinates(NamedTuple):
@@ -53,8 +54,8 @@ class PackedMaterials(HalfVectorLobes):
         if not materials:
             raise InputError("materials: at least one is needed")
         super().__init__(tuple(material.name for material in materials), list(materials))
-        self.tables = table(np.stack([_packed_tables(material) for material in materials]))
-        self.shadowing = table(np.stack([_packed_shadowing(material) for material in materials]))
+        self.tables = packets(np.stack([_packed_tables(material) for material in materials]))
+        self.shadowing = packets(np.stack([_packed_shadowing(material) for material in materials]))
 
     @staticmethod
     def prepare(wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True) -> Coordinates:
@@ -77,11 +78,10 @@ class PackedMaterials(HalfVectorLobes):
 
     def eval_at(self, index: "mi.UInt32", at: Coordinates) -> "mi.Color3f":
         """Evaluate f cos(theta_o) of the materials `index` at prepared coordinates."""
-        base = 2 * dr.fma(index, _ROWS * _COLUMNS, at.corner)
+        base = dr.fma(index, _ROWS * _COLUMNS, at.corner)
         value = mi.Color3f(0)
         for offset, weight in zip((0, 1, _COLUMNS, _COLUMNS + 1), at.weights, strict=True):
-            zero = load_rgb(self.tables, base + 2 * offset, at.active)
-            one = load_rgb(self.tables, base + 2 * offset + 1, at.active)
+            zero, one = _two_colours(self.tables, base + offset, at.active)
             value += weight * dr.fma(at.azimuth, one - zero, zero)
         for place in (at.shadow_i, at.shadow_o):
             value *= self.shadow(index, place, at.active)
@@ -89,12 +89,10 @@ class PackedMaterials(HalfVectorLobes):
 
     def shadow(self, index: "mi.UInt32", cell: tuple, active: "mi.Bool | bool" = True) -> "mi.Color3f":
         """Return the factor S of the materials `index` at a `shadow_cell`."""
-        entry = 2 * dr.fma(index, _SHADOW - 1, cell[0])
-        lower = load_rgb(self.shadowing, entry, mi.Bool(active))
-        slope = load_rgb(self.shadowing, entry + 1, mi.Bool(active))
+        lower, slope = _two_colours(self.shadowing, dr.fma(index, _SHADOW - 1, cell[0]), active)
         return dr.fma(cell[1], slope, lower)
 
-    def rows(self, index: "mi.UInt32", wi: "mi.Vector3f", directions: "mi.Vector3f") -> list:
+    def rows(self, index: "mi.UInt32", wi: "mi.Vector3f", directions: "mi.Vector3f") -> "mi.Float":
         """Reduce the table of one material to a row over theta_h for each of L light directions seen from one side.
 
         Args:
@@ -103,42 +101,25 @@ class PackedMaterials(HalfVectorLobes):
             directions: (L) unit vectors to the lights, any common frame.
 
         Returns:
-            Six Float arrays (L * 32): RGB at e = 0, then RGB at e = 1.
+            Flat Float array (L * 32 * 16) for `packet`: RGB at e = 0 and at e = 1, then both of the next theta_h.
         """
-        lane = dr.arange(mi.UInt32, dr.width(directions) * _ROWS)
+        count = dr.width(directions) * _ROWS
+        lane = dr.arange(mi.UInt32, count)
         light = lane // _ROWS
         direction = dr.gather(mi.Vector3f, directions, light)
         column, b = _difference_cell(dr.minimum(dr.dot(wi, dr.normalize(wi + direction)), 1))
-        corner = 2 * (dr.fma(index, _ROWS, lane - light * _ROWS) * _COLUMNS + column)
-        values = []
-        for azimuth_end in range(2):
-            left = load_rgb(self.tables, corner + azimuth_end, mi.Bool(True))
-            right = load_rgb(self.tables, corner + azimuth_end + 2, mi.Bool(True))
-            values += [left[c] + b * (right[c] - left[c]) for c in range(3)]
-        dr.eval(values)
-        return values
+        corner = dr.fma(index, _ROWS, lane - light * _ROWS) * _COLUMNS + column
+        left, right = (_two_colours(self.tables, corner + offset) for offset in (0, 1))
+        values = [left[e][c] + b * (right[e][c] - left[e][c]) for e in range(2) for c in range(3)]
+        return interleaved(values, _ROW)
 
     @staticmethod
-    def eval_row(rows: list, light: "mi.UInt32", cell: tuple, azimuth: "mi.Float") -> "mi.Color3f":
+    def eval_row(rows: "mi.Float", light: "mi.UInt32", cell: tuple, azimuth: "mi.Float") -> "mi.Color3f":
         """Evaluate T in the rows of `rows` at a `half_cell`, without the factors S and the cosine."""
         entry = light * _ROWS + cell[0]
-        lower = [dr.gather(mi.Float, row, entry) for row in rows]
-        upper = [dr.gather(mi.Float, row, entry + 1) for row in rows]
-        ends = [low + cell[1] * (high - low) for low, high in zip(lower, upper, strict=True)]
+        lower, upper = packet(rows, entry, _ROW), packet(rows, entry + 1, _ROW)
+        ends = [lower[k] + cell[1] * (upper[k] - lower[k]) for k in range(6)]
         return mi.Color3f(*(dr.fma(azimuth, ends[c + 3] - ends[c], ends[c]) for c in range(3)))
-
-    def shadow_row(self, index: "mi.UInt32") -> list:
-        """Return the factor S of one material as six short Float arrays (8): RGB at the cells, and its change."""
-        entry = 2 * dr.fma(index, _SHADOW - 1, dr.arange(mi.UInt32, _SHADOW - 1))
-        values = [*load_rgb(self.shadowing, entry, mi.Bool(True)), *load_rgb(self.shadowing, entry + 1, mi.Bool(True))]
-        dr.eval(values)
-        return values
-
-    @staticmethod
-    def eval_shadow(row: list, cell: tuple) -> "mi.Color3f":
-        """Evaluate S in a `shadow_row` at a `shadow_cell`."""
-        values = [dr.gather(mi.Float, entry, cell[0]) for entry in row]
-        return mi.Color3f(*(dr.fma(cell[1], values[c + 3], values[c]) for c in range(3)))
 
 
 def shadow_cell(cosine: "mi.Float") -> tuple:
@@ -156,16 +137,10 @@ def _difference_cell(cos_d: "mi.Float") -> tuple:
     return cell(dr.sqrt(dr.maximum(1 - cos_d, 0)), _COLUMNS)
 
 
-def load_rgb(source: "mi.Float", entry: "mi.UInt32", active: "mi.Bool") -> "mi.Color3f":
-    """Load one RGB entry of four floats.
-
-    One packet load on the GPU. On the CPU three plain loads, which are as fast: Dr.Jit compiles a packet load into
-    different code by the alignment of the array, so kernels would be compiled again for other materials.
-    """
-    if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
-        packet = dr.gather(mi.Vector4f, source, entry, active)
-        return mi.Color3f(packet.x, packet.y, packet.z)
-    return mi.Color3f(*(dr.gather(mi.Float, source, 4 * entry + channel, active) for channel in range(3)))
+def _two_colours(source: "mi.Float", entry: "mi.UInt32", active: "mi.Bool | bool" = True) -> tuple:
+    """Return the two colours of an entry of eight floats."""
+    found = packet(source, entry, 8, active)
+    return mi.Color3f(found[0], found[1], found[2]), mi.Color3f(found[4], found[5], found[6])
 
 
 def register() -> None:

@@ -10,10 +10,9 @@ import drjit as dr
 import numpy as np
 
 from render.backend import variant
-from render.backend.arrays import table
+from render.backend.arrays import packet, packets
 from render.materials import merl, model
 from render.materials.kernels import plugin
-from render.materials.kernels.bsdf import load_rgb
 from render.materials.kernels.lobes import HalfVectorLobes
 from render.materials.kernels.plugin import FamilyBSDF
 from render.materials.library import load
@@ -61,7 +60,7 @@ class PackedMerl(HalfVectorLobes):
         packed = np.zeros((len(tables), _ENTRIES, 4), np.float32)
         for slot, merl_table in zip(packed, tables, strict=True):
             slot[:, :3] = merl.knots(merl_table.values).reshape(3, -1).T
-        self.tables = table(packed)
+        self.tables = packets(packed)
 
     @staticmethod
     def prepare(wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True) -> MerlCoordinates:
@@ -92,8 +91,8 @@ class PackedMerl(HalfVectorLobes):
         first, second = (index * _ENTRIES + entry for entry in at.entries)
         value = mi.Color3f(0)
         for offset, weight in zip((0, _STEP_D, _STEP_H, _STEP_H + _STEP_D), at.weights, strict=True):
-            zero, one = (load_rgb(self.tables, entry + offset, at.active) for entry in (first, second))
-            value += weight * dr.fma(at.fraction, one - zero, zero)
+            zero, one = (packet(self.tables, entry + offset, 4, at.active) for entry in (first, second))
+            value += weight * mi.Color3f(*(dr.fma(at.fraction, one[c] - zero[c], zero[c]) for c in range(3)))
         return value * at.cos_o
 
 

@@ -50,6 +50,32 @@ def failures(folder: Path) -> list[dict]:
     return [json.loads(line) for line in (folder / "failed.jsonl").read_text().splitlines()]
 
 
+class Waiting:
+    """A crew that waits for a while and then has done its only scene."""
+
+    slots = count = 1
+    chunk_bytes, note = 0, ""
+
+    def give(self, chunks) -> None:
+        self.notes = ["waits for workers"] * 3 + ["", ""]
+
+    def busy(self) -> bool:
+        return bool(self.notes)
+
+    def step(self) -> list:
+        self.note = self.notes.pop(0)
+        return []
+
+    def close(self) -> None:
+        pass
+
+
+def test_what_a_crew_waits_for_is_told_once_and_taken_back(tmp_path, capsys):
+    render_supervised(planned([["ok"]]), tmp_path, crew=Waiting())
+    said = capsys.readouterr().err
+    assert said.count("waits for workers") == 1 and "waits" not in said.rpartition("render:")[2]
+
+
 # ---- Isolation -------------------------------------------------------------------------------------
 
 

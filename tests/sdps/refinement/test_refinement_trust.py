@@ -92,8 +92,8 @@ def test_a_doubted_refinement_leaves_what_the_method_found(monkeypatch: pytest.M
     assert (estimate.normals is start.normals) == bool(expected.doubt)
 
 
-def test_refinement_is_the_default_where_networks_find_both() -> None:
-    cases = {("auto", False): True, ("lcnet+psfcn", False): True, ("auto", True): False, ("pf14", False): False}
+def test_refinement_is_the_default_where_a_network_finds_the_normals() -> None:
+    cases = {("auto", False): True, ("lcnet+psfcn", False): True, ("auto", True): True, ("pf14", False): False}
     for (method, lit), wanted in cases.items():
         assert _runner(method, lit, None, None, None, images=FEWEST_IMAGES).method.refined == wanted, method
     assert not _runner("auto", False, None, None, None, images=FEWEST_IMAGES - 1).method.refined

@@ -186,6 +186,8 @@ def test_names_break_no_table(tmp_path: Path) -> None:
         ("lcnet-reg", "this project decided: heads and loss"),
         ("upsfcn", "does not apply"),
         ("nenet-norm", "pixel's norm"),
+        ("attention", "pixel's maximum"),
+        ("attention", "3 blocks of self-attention"),
     ],
 )
 def test_models_differ(tmp_path: Path, model: str, fact: str) -> None:
