@@ -85,12 +85,12 @@ def _writing(path: Path) -> Iterator[None]:
 def read_runs(folder: Path) -> list[list[dict[str, Any]]]:
     """Return the ledger lines of every run that finished a shard; a damaged line counts as torn."""
     paths = sorted((folder / LOG).glob("done-*.jsonl"))
-    runs = ([line for line in read_events(path) if _is_finished(line)] for path in paths)
+    runs = ([line for line in read_events(path) if is_finished(line)] for path in paths)
     return [lines for lines in runs if lines]
 
 
-def _is_finished(line: dict[str, Any]) -> bool:
-    """Tell whether a line has a time of a known zone, and numbers where it must."""
+def is_finished(line: dict[str, Any]) -> bool:
+    """Tell whether a finished shard's line has a time of a known zone, and numbers where it must."""
     try:
         zone = datetime.fromisoformat(line["time"]).tzinfo
     except ValueError:

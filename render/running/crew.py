@@ -1,7 +1,8 @@
 """Who renders the chunks of a run: processes of this machine, or others that take chunks and tell what came of them.
 
 `render.running.supervisor` keeps the books of a run and asks its crew for news. The processes here are watched: one
-that hangs, dies or takes too much memory costs the view it works on, and another takes over the rest of its chunk.
+that hangs, dies, sends nonsense or takes too much memory costs the view it works on, and another takes over the rest of
+its chunk.
 """
 
 import time
@@ -108,9 +109,13 @@ class LocalCrew:
         ready = wait([worker.connection for worker in self.workers], timeout=self._patience())
         for worker in [worker for worker in self.workers if worker.connection in ready]:
             try:
-                message = worker.connection.recv()
+                message = worker.hear(self.folder)
             except (EOFError, OSError):
                 news += self._lost(worker, worker.exit_reason())
+                continue
+            if message is None:
+                worker.abort()
+                news += self._lost(worker, "worker sent a damaged or wrong message")
                 continue
             worker.since = time.monotonic()
             news += self._take(worker, message)
@@ -204,7 +209,7 @@ class LocalCrew:
         if not worker.ready:
             said = f": {tail.splitlines()[-1]}" if tail else ""
             return [Fatal(f"a rendering process did not start ({reason}){said}; run `sdps doctor`")]
-        current = worker.current
+        current = worker.to_blame()  # of nobody, the next process would end in the same way, for ever
         for id in current:
             worker.finished(id)
         if worker.left:

@@ -8,10 +8,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
 
 from render.planning.chunks import Chunk
+from render.records.ledger import is_finished
 from render.running.isolation import TAIL
-from render.running.messages import WorkerConfig
+from render.running.messages import Begun, Done, Ended, Failed, Fatal, Message, Ready, WorkerConfig
 
 _STARTING = threading.Lock()
 
@@ -28,15 +31,56 @@ class Worker:
             self.process.start()
         theirs.close()
         self.ready, self.busy, self.rendered = False, False, 0
+        self.given: Chunk | None = None
         self.left: Chunk | None = None  # of the chunk it works on
         self.current: tuple[str, ...] = ()
         self.since = self.view_start = time.monotonic()
 
     def take(self, chunk: Chunk) -> None:
         """Give it a chunk to render."""
-        self.left, self.busy, self.since = chunk, True, time.monotonic()
+        self.given = self.left = chunk
+        self.busy, self.since = True, time.monotonic()
         with suppress(OSError):  # if it is dead, reading tells
             self.connection.send(chunk)
+
+    def hear(self, folder: Path) -> Message | None:
+        """Read a message; None where it is none, or tells of scenes or shards that are not those it was given.
+
+        Raises:
+            EOFError, OSError: the process has ended.
+        """
+        try:
+            message = self.connection.recv()
+        except (EOFError, OSError):
+            raise
+        except Exception:  # whatever unpickling raises
+            return None
+        try:
+            return message if self._may_say(message, folder) else None
+        except (TypeError, ValueError, KeyError, AttributeError, OSError):
+            return None
+
+    def _may_say(self, message: Any, folder: Path) -> bool:
+        """Tell whether a sound process can send this; values of a wrong type may raise."""
+        given = self.left.wanted if self.left else frozenset()
+        match message:
+            case Ready() | Ended() | Fatal():
+                return True
+            case Begun(ids) | Failed(ids):
+                return set(ids) <= given
+            case Done(line) if line["id"] in given and self.left:
+                scene = next(scene for scene in self.left.scenes() if scene.id == line["id"])
+                path = folder / scene.file
+                there = path.stat().st_size if path.parent.is_dir() else line["bytes"]  # or the folder is gone
+                return (line["spec"], line["bytes"]) == (scene.digest(), there) and is_finished(line)
+        return False
+
+    def to_blame(self) -> tuple[str, ...]:
+        """Return the scenes it was at when it ended; where it had not begun its chunk, those of the first view."""
+        if self.current or not self.left or self.left is not self.given:
+            return self.current
+        view = self.left.groups[0]
+        return tuple(scene.id for scene in view if scene.id in self.left.wanted)
 
     def finished(self, id: str) -> None:
         """Note that a scene is done or failed."""

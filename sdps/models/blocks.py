@@ -44,6 +44,8 @@ def initialise(network: nn.Module) -> None:
     """Draw every weight with `kaiming_normal_` (its defaults, as the authors' code does) and zero the biases."""
     for module in network.modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+            if module.weight.is_meta:  # shapes only; drawing nothing would load torch's compiler, for seconds
+                continue
             nn.init.kaiming_normal_(module.weight)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)

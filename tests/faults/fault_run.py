@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT / "tests" / "support"))
 FAULTS = {
     "kill -9": "the process alone is killed; its children must end by themselves",
     "SIGTERM": "as a queue ends a job",
@@ -61,9 +62,25 @@ JOBS: dict[str, Job] = {
     "import": Job(lambda out, given: ["data", "import", str(given / "tree"), "--layout", "psfcn", "--out",
                                       str(out / "data")], ("data/manifest.jsonl", "data/shards/*.exr"), "export"),
     "train --stream": Job(lambda out, _: ["train", *SMALL, "--stream", "--out", str(out)], ()),
-    "evaluate": Job(lambda out, _: ["eval-classical", "--out", str(out), "--preset", "smoke"], ()),
-    "infer": Job(lambda out, _: ["infer", "--self-test", "--method", "pf14", "--out", str(out)], ()),
+    "evaluate": Job(lambda out, _: ["eval-classical", "--out", str(out), "--preset", "smoke", "--set", "test.size=32",
+                                    "--set", "test.spp=1", "--methods", "least-squares,pf14", "--light-sets",
+                                    "near-uniform:12"], ("*/manifest.jsonl", "*/shards/*.exr")),
+    "infer": Job(lambda out, given: ["infer", str(photographs(given)), "--method", "pf14", "--out", str(out / "found")],
+                 ("found/*.exr", "found/*.npy", "found/mesh.*", "found/lights.json")),
 }  # fmt: skip
+
+
+def photographs(folder: Path) -> Path:
+    """Return a folder of twelve small pictures of a matte object below `folder`, made where it is not there."""
+    place = folder / "photographs"
+    if not place.is_dir():
+        import photo_folders
+        from data_folders import light_directions
+
+        images, mask = photo_folders.matte(light_directions(12).astype(float), size=32)
+        photo_folders.write_folder(folder / "new", images, mask)
+        (folder / "new").rename(place)
+    return place
 
 
 def start(words: list[str], fault: str, rng: random.Random) -> subprocess.Popen[bytes]:

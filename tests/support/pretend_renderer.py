@@ -15,8 +15,24 @@ def pretend(connection, config: WorkerConfig) -> None:
     connection.send(Ready())
     while (chunk := connection.recv()) is not None:
         for scene in chunk.scenes():
+            if scene.material == "die unbegun":
+                os._exit(4)
             connection.send(Begun((scene.id,)))
+            told = scene.digest()
             match scene.material:
+                case "garbage":
+                    connection.send_bytes(b"no pickle")
+                case "other type":
+                    connection.send({"done": scene.id})
+                case "other scene":
+                    connection.send(Failed(("nobody",), "ValueError: no", "", 0.1))
+                case "no shard":
+                    connection.send(_done(scene, config, scene.digest()))
+                    time.sleep(60)
+                case "other plan":
+                    told = "0" * 64
+                case "torn line":
+                    connection.send(Done({"id": scene.id}))
                 case "hang":
                     time.sleep(60)
                 case "slow":
@@ -37,12 +53,15 @@ def pretend(connection, config: WorkerConfig) -> None:
                     return
             path = config.folder / scene.file
             path.parent.mkdir(parents=True, exist_ok=True)
-            variant = scene.material == "variant"
-            path.write_bytes((os.environ["SDPS_VARIANT"] if variant else scene.digest()).encode())
-            line = {"id": scene.id, "spec": scene.digest(), "bytes": 64, "seconds": 0.5, "stages": {"render": 0.5},
-                    "time": ledger.now(), "worker": config.number}  # fmt: skip
-            connection.send(Done(line))
+            text = os.environ["SDPS_VARIANT"] if scene.material == "variant" else scene.digest()
+            path.write_bytes(text.encode())
+            connection.send(_done(scene, config, told, len(text)))
         connection.send(Ended(True))
+
+
+def _done(scene, config: WorkerConfig, spec: str, size: int = 64) -> Done:
+    return Done({"id": scene.id, "spec": spec, "bytes": size, "seconds": 0.5, "stages": {"render": 0.5},
+                 "time": ledger.now(), "worker": config.number})  # fmt: skip
 
 
 def stillborn(connection, config: WorkerConfig) -> None:

@@ -103,6 +103,23 @@ def test_failing_hanging_and_dying_scenes_cost_only_themselves(tmp_path):
     assert run(mended[:1], tmp_path).skipped == 0
 
 
+def test_processes_that_send_nonsense_cost_only_their_scenes(tmp_path):
+    bad = ["garbage", "other type", "other scene", "other plan", "torn line", "no shard"]
+    scenes = planned([["ok", *bad[:3], "ok"], [*bad[3:], "ok"]])
+    (tmp_path / "shards").mkdir()
+    summary = run(scenes, tmp_path)
+    assert (summary.done, [line["id"] for line in summary.lines]) == (3, ["s0-m0", "s0-m4", "s1-m3"])
+    assert [line["material"] for line in failures(tmp_path)] == bad
+    assert {line["reason"] for line in failures(tmp_path)} == {"worker sent a damaged or wrong message"}
+    assert not active_children()
+
+
+def test_a_process_that_dies_before_it_begins_costs_the_first_view_of_its_chunk(tmp_path):
+    summary = run(planned([["die unbegun", "ok"], ["ok"]]), tmp_path)
+    assert (summary.done, len(summary.failed)) == (1, 2)
+    assert failures(tmp_path)[0]["reason"] == "worker died, exit code 4"
+
+
 def test_attempts_are_counted(tmp_path):
     scenes = planned([["raise"]])
     run(scenes, tmp_path)

@@ -46,6 +46,13 @@ def test_weights_are_drawn_as_kaiming_normal_with_zero_biases() -> None:
     assert float(network.extractor[4][0].bias.detach().abs().max()) == 0.0
 
 
+def test_shapes_alone_draw_no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.nn.init, "kaiming_normal_", None)  # on this device it loads torch's compiler
+    with torch.device("meta"):
+        network = create("lcnet")
+    assert all(parameter.is_meta for parameter in network.parameters())
+
+
 def test_convolutions_leave_autocast_for_single_pixels_only() -> None:
     layer, plain = conv(4, 8), torch.nn.Conv2d(4, 8, 3, padding=1)
     assert layer[0].state_dict().keys() == plain.state_dict().keys()
