@@ -202,6 +202,28 @@ def test_a_killed_worker_costs_no_scene(tmp_path, monkeypatch):
     assert all((tmp_path / scene.file).read_bytes() == scene.digest().encode() for scene in scenes)
 
 
+def test_a_line_that_is_cut_costs_no_scene(tmp_path, address, monkeypatch):
+    scenes, add, connect = planned([["slow"] * 3] * 6), Ledger.add, link.Link.connect
+    clients, lines = [], []
+
+    def remember(line: link.Link) -> object:
+        clients.append(connect(line))
+        return clients[-1]
+
+    def cut(ledger: Ledger, line: dict) -> None:
+        add(ledger, line)
+        lines.append(line["id"])
+        if len(lines) == 4:
+            clients[0].loop.add_callback(clients[0].scheduler_comm.comm.abort)  # scheduler and workers go on
+
+    monkeypatch.setattr(link.Link, "connect", remember)
+    monkeypatch.setattr(Ledger, "add", cut)
+    summary = run(scenes, tmp_path, address)
+    assert len(clients) == 2 and summary.done == 18 and not summary.failed
+    assert sorted(lines) == sorted(scene.id for scene in scenes)
+    assert all((tmp_path / scene.file).read_bytes() == scene.digest().encode() for scene in scenes)
+
+
 @pytest.mark.slow
 def test_a_lost_scheduler_is_waited_for(tmp_path, monkeypatch):
     scenes, add = planned([["slow"] * 2] * 8), Ledger.add

@@ -234,14 +234,34 @@ def strict(s3: ObjectStore) -> Iterator[None]:
         allowed("inf")
 
 
-def test_wrong_keys_end_in_one_line(s3: ObjectStore, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    place = f"s3://{BUCKET}/locked"
+def commands(place: str, out: Path) -> list[list[str]]:
+    """Return every command that takes an address, told to use one."""
+    train = ["train", "--preset", "smoke", "--out"]
+    return [
+        *(["data", verb, place] for verb in ("status", "validate", "preview", "card")),
+        ["data", "export", place, "--layout", "unips", "--out", str(out / "tree")],
+        ["data", "pack", place, "--out", str(out / "tars")],
+        ["render-data", "--preset", "smoke", "--out", place],
+        [*train, str(out / "trained"), "--data", place],
+        [*train, place],
+    ]  # fmt: skip
+
+
+def test_wrong_keys_and_a_missing_bucket_end_every_command_in_one_line(
+    s3: ObjectStore, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    missing, locked = "s3://no-such-bucket/run", f"s3://{BUCKET}/locked"
+    for words in commands(missing, tmp_path):
+        assert main(words) == 2, words
+        text = capsys.readouterr().err
+        assert re.match(rf"sdps: {missing}\S*: .*bucket does not exist", text) and text.count("\n") == 1, (words, text)
     with strict(s3):
-        for words in (["data", "status", place], ["render-data", "--preset", "smoke", "--out", place],
-                      ["train", "--preset", "smoke", "--out", str(tmp_path), "--data", place]):  # fmt: skip
-            assert main(words) == 2
+        for words in commands(locked, tmp_path):
+            assert main(words) == 2, words
             text = capsys.readouterr().err
-            assert re.match(rf"sdps: {place}\S*: refused \(.*check the keys", text) and text.count("\n") == 1, text
+            assert re.match(rf"sdps: {locked}\S*: refused \(.*check the keys", text), (words, text)
+            assert text.count("\n") == 1, text
+    assert not any((tmp_path / name).exists() for name in ("tree", "tars", "trained"))
 
 
 @pytest.mark.parametrize(("scheme", "package"), [("gs", "gcsfs"), ("az", "adlfs"), ("s3", "s3fs")])
