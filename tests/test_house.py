@@ -4,6 +4,7 @@
 """
 
 import ast
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -92,6 +93,14 @@ def test_arrows(name):
         assert of_render <= {*LIGHT}
     for wanted in IMPORTS[name] & MODULES.keys():
         assert RANK[folder_of(wanted)] <= RANK[own], f"{own} may not import from {folder_of(wanted)} ({wanted})"
+
+
+def test_one_place_imports_mitsuba_and_drjit():
+    """Both start threads when they are imported, which must wait until the libLLVM is named: `render.backend.jit`."""
+    assert {name for name in MODULES if IMPORTS[name] & {"mitsuba", "drjit"}} == {"render.backend.variant"}
+    for path in ROOT.glob("tests/**/*.py"):
+        found = re.findall(r"^(?:import|from) (?:mitsuba|drjit)\b", path.read_text(encoding="utf-8"), re.M)
+        assert len(found) == (path.name == "test_mitsuba_scene.py"), path  # a script for a process of its own
 
 
 def test_no_circles():

@@ -120,10 +120,7 @@ def run(config: BenchConfig) -> dict[str, Any]:
     Raises:
         InputError: unknown shape or material, or no usable Mitsuba variant.
     """
-    from render.backend import variant
-
-    mi = variant.load()
-    import drjit as dr
+    from render.backend.jit import dr, mi
 
     found: dict[str, Any] = {}
     ways = _ways(config, found)
@@ -144,9 +141,8 @@ def run(config: BenchConfig) -> dict[str, Any]:
 
 def _ways(config: BenchConfig, found: dict[str, Any]) -> dict[str, Callable[[], None]]:
     """Return the ways of rendering that are timed in turn, but for `path`."""
-    import drjit as dr
-
     from render import shapes
+    from render.backend.jit import dr
     from render.kernel import many_lights, paths, scene
     from render.materials.kernels.packed import pack
 

@@ -37,12 +37,8 @@ def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
 
     Every second view is seen in perspective, half of these under near lights.
     """
-    from render.backend import variant
-
-    variant.load()
-    import drjit as dr
-
     from render import shapes
+    from render.backend.jit import dr
     from render.kernel import many_lights, scene
     from render.materials.kernels.packed import pack
 

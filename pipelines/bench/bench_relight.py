@@ -74,11 +74,10 @@ def _ways(scene: SceneSpec, folder: Path) -> dict[str, tuple[Callable[[], object
 def _environment_renders(scene: SceneSpec) -> Callable[[], object]:
     """Return what renders one image of the scene under an environment with Mitsuba's `path`, the scene loaded."""
     from render import shapes
-    from render.backend import variant
+    from render.backend.jit import mi
     from render.kernel import reference
     from render.materials.kernels import surface_bsdf
 
-    mi = variant.load()
     surface_bsdf.register()
     described = reference.scene_dict(shapes.load(scene.shape), scene.view, scene.material, _SIZE, _SPP, _BOUNCES)
     described["light"] = {"type": "envmap", "bitmap": mi.Bitmap(environments.load("studio"))}

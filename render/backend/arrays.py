@@ -3,12 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
-
-mi = variant.load()
+from render.backend.jit import dr, mi
 
 
 def opaque(value: Any) -> Any:

@@ -5,10 +5,8 @@ All functions take lanes and return lanes; seeds and counts are opaque, so that 
 
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import opaque
-
-mi = variant.load()
+from render.backend.jit import mi
 
 # Powers of 1 / g with g^4 = g + 1, the three-dimensional additive recurrence of least discrepancy (Roberts 2018), times
 # 2^32: integers wrap around exactly, so that a million samples are as well spread as the first.

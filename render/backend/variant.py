@@ -143,6 +143,11 @@ def load() -> ModuleType:
     choice = choose()
     if choice.llvm:
         os.environ["DRJIT_LIBLLVM_PATH"] = str(choice.llvm)
+    import drjit as dr
+
+    # Takes the lock that Dr.Jit's own start-up thread holds, and so waits for its end.
+    if choice.llvm and not dr.has_backend(dr.JitBackend.LLVM):
+        raise InputError(f"{choice.llvm}: Dr.Jit could not load this libLLVM; {REMEDY}")
     import mitsuba as mi
 
     mi.set_variant(choice.variant)

@@ -3,13 +3,9 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import drjit as dr
-
-from render.backend import variant
 from render.backend.arrays import opaque
+from render.backend.jit import dr, mi
 from render.records.manifest import View
-
-mi = variant.load()
 
 _START = 2.0  # radii of the object's unit sphere in front of its centre, where perspective rays start
 

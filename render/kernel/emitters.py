@@ -4,14 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import opaque, upload
+from render.backend.jit import dr, mi
 from render.kernel.camera import Camera
-
-mi = variant.load()
 
 
 @dataclass(frozen=True)

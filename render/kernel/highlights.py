@@ -16,14 +16,11 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import opaque, upload
+from render.backend.jit import dr, mi
 from render.backend.sampling import scrambled, stream, uniform
-
-mi = variant.load()
 
 _NORMALS_PER_SAMPLE, _FEWEST, _MOST = 8, 256, 2048
 # s = 1 - cos(theta) around h is drawn with density ~ (1 + s / _CORE)^(-3/2) up to _RIM, which falls with the cube of

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import opaque
+from render.backend.jit import dr, mi
 from render.backend.sampling import bounce_variates, pixel_position, random_variates, stream
 from render.kernel import highlights
 from render.kernel.camera import Camera
@@ -18,8 +17,6 @@ from render.materials.kernels.packed import PackedSurfaces
 from render.materials.kernels.textures.cover import Place
 from render.records.manifest import View
 from render.shapes.geometry.mesh import TriangleMesh
-
-mi = variant.load()
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from render.backend import variant
+from render.backend.jit import mi
 from render.kernel.scene import build_mesh
 from render.materials.kernels import surface_bsdf
 from render.records.manifest import View
 from render.shapes.geometry.mesh import TriangleMesh
-
-mi = variant.load()
 
 _DIRECTIONAL = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": np.pi}}
 _POINT = {"type": "point", "position": [0, 0, 9], "intensity": {"type": "rgb", "value": 1.0}}

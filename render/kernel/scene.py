@@ -2,14 +2,11 @@
 
 from typing import Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import integers, table
+from render.backend.jit import dr, mi
 from render.shapes.geometry.mesh import TriangleMesh
-
-mi = variant.load()
 
 
 class Triangles(NamedTuple):

@@ -8,19 +8,16 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import Columns, opaque
+from render.backend.jit import dr, mi
 from render.kernel import highlights
 from render.kernel.paths import Paths, Vertices
 from render.kernel.visibility import WORD
 from render.materials.kernels import bsdf
 from render.materials.kernels.bsdf import PackedMaterials
 from render.materials.kernels.packed import PackedSurfaces
-
-mi = variant.load()
 
 _BLOCK = 128  # pixels whose vertices stay in a core's cache while all lights pass over them
 

@@ -7,12 +7,8 @@ where they differ, or none of them faces the light, every sample asks for itself
 
 from typing import Any
 
-import drjit as dr
-
-from render.backend import variant
 from render.backend.arrays import opaque
-
-mi = variant.load()
+from render.backend.jit import dr, mi
 
 WORD = 32  # lights per entry of a bitmask
 _LEAST_PROBES = 8

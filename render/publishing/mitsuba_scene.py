@@ -159,10 +159,10 @@ def evaluator(material: Any) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 
 def _weights(pattern: surfaces.Pattern, mesh: TriangleMesh) -> pattern_mesh.Weights:
     """Return the weights of a pattern as a function of numpy arrays."""
+    from render.backend.jit import mi
     from render.materials.kernels import patterns
 
     evaluate = patterns.Evaluator(pattern, mesh).weights
-    mi = patterns.mi
 
     def weights(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         columns = (mi.Float(np.ascontiguousarray(column, np.float32)) for column in points.T)

@@ -31,8 +31,7 @@ def serve(connection: Connection, config: WorkerConfig) -> None:
     settle(config)
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         try:
-            import drjit as dr
-
+            from render.backend.jit import dr
             from render.running import rendered, worker
         except InputError as error:
             connection.send(Fatal(str(error)))

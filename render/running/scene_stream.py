@@ -98,8 +98,7 @@ def rendered_scenes(
     Raises:
         InputError: an unusable shape or material, an object outside the frame, or images that are not finite.
     """
-    import drjit as dr
-
+    from render.backend.jit import dr
     from render.running import worker
 
     order = stream_order(scenes, seed=seed, start=start)
@@ -130,11 +129,8 @@ def serve(connection: Connection, config: StreamWorkerConfig) -> None:
 def _render(config: StreamWorkerConfig, outbox: queue.Queue[_Message | None]) -> _Message:
     """Put the scenes into the outbox; return the last message."""
     try:
-        import drjit as dr
+        from render.backend.jit import dr
 
-        from render.backend import variant
-
-        variant.load()  # before Dr.Jit starts its threads: it names the libLLVM
         dr.set_thread_count(config.threads)
         rendered = rendered_scenes(config.scenes, seed=config.seed, start=config.start)
         for scene, arrays in islice(rendered, config.count):

@@ -11,8 +11,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-
+from render.backend.jit import dr
 from render.kernel.scene import Scene, build
 from render.materials.kernels.packed import pack
 from render.planning.chunks import view_groups

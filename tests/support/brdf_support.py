@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from render.backend import variant
-
-mi = variant.load()
+from render.backend.jit import mi
 
 
 def directions(count: int = 4000) -> tuple[np.ndarray, np.ndarray]:

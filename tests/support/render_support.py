@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import drjit as dr
 import numpy as np
 
 from render import shapes
+from render.backend.jit import dr
 from render.kernel import many_lights, scene
 from render.materials.kernels.packed import PackedSurfaces, pack
 from render.records.manifest import View

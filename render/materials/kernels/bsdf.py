@@ -6,11 +6,10 @@ Importing this module loads mitsuba. The numpy form, slow and plain, is `render.
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import interleaved, packet, packets
+from render.backend.jit import dr, mi
 from render.materials import model
 from render.materials.kernels import plugin
 from render.materials.kernels.lobes import HalfVectorLobes, cell, half_cell
@@ -18,8 +17,6 @@ from render.materials.kernels.plugin import FamilyBSDF
 from render.materials.library import load
 from render.materials.model import Material
 from render.shared.errors import InputError
-
-mi = variant.load()
 
 _ROWS, _COLUMNS, _SHADOW = model.HALF_KNOTS, model.DIFFERENCE_KNOTS, model.SHADOWING_KNOTS
 _ROW = 8  # floats of an entry of `PackedMaterials.rows`

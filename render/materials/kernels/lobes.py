@@ -7,15 +7,12 @@ material at the knots of the project's model (`model.half_knots`).
 from abc import ABC, abstractmethod
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import table
+from render.backend.jit import dr, mi
 from render.materials import highlight, model
 from render.materials.model import Material
-
-mi = variant.load()
 
 _KNOTS = model.HALF_KNOTS
 _ENTRIES = _KNOTS + 1  # lobe probability, then the cumulative distribution at the knots of theta_h

@@ -6,11 +6,10 @@ Importing this module loads mitsuba. The numpy form, slow and plain, is `render.
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import packet, packets
+from render.backend.jit import dr, mi
 from render.materials import merl, model
 from render.materials.kernels import plugin
 from render.materials.kernels.lobes import HalfVectorLobes
@@ -19,8 +18,6 @@ from render.materials.library import load
 from render.materials.merl import MerlTable
 from render.materials.model import Material
 from render.shared.errors import InputError
-
-mi = variant.load()
 
 _CELLS_H, _CELLS_D, _CELLS_P = merl.SHAPE
 _STEP_D = _CELLS_P  # entries from one knot of theta_d to the next

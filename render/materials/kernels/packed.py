@@ -7,11 +7,10 @@ Materials of one kind are packed into a family (`PackedMaterials` for fitted one
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import opaque
+from render.backend.jit import dr, mi
 from render.materials import surfaces as surface_names
 from render.materials.kernels.bsdf import PackedMaterials
 from render.materials.kernels.patterns import Evaluator
@@ -23,8 +22,6 @@ from render.materials.surfaces import Surface
 from render.materials.textures.textured import Textured
 from render.shapes.geometry.mesh import TriangleMesh
 from render.shared.errors import InputError
-
-mi = variant.load()
 
 GLOSSY = 0.1
 """Share of light in a narrow highlight from which on it gets samples of its own (`render.kernel.highlights`)."""

@@ -5,17 +5,14 @@ Coordinates are those of the object in its unit sphere. Parameters are drawn fro
 
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import integers, opaque, table
+from render.backend.jit import dr, mi
 from render.materials.surfaces import Pattern
 from render.shapes.geometry.mesh import TriangleMesh
 from render.shared.errors import InputError
 from render.shared.seeds import generator
-
-mi = variant.load()
 
 _WAVES = 6
 

@@ -8,11 +8,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
-import drjit as dr
-
-from render.backend import variant
-
-mi = variant.load()
+from render.backend.jit import dr, mi
 
 
 @cache

@@ -6,15 +6,12 @@ Importing this module loads mitsuba. The files are described at `render.material
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
+from render.backend.jit import dr, mi
 from render.materials import highlight, model
 from render.materials.rgl import RglMaterial
 from render.shared.errors import InputError
-
-mi = variant.load()
 
 _HALF_ANGLES = np.radians(np.concatenate([[0.0], np.geomspace(0.02, 4, 60), np.linspace(4.5, 80, 152)]))
 

@@ -4,11 +4,10 @@ The slow counterpart of `PackedSurfaces`, for `render.kernel.reference`; propert
 `to_object` (world to the object's unit sphere) and, for patterns that follow a mesh's pieces, `shape` (its name).
 """
 
-import drjit as dr
 import numpy as np
 
 from render import shapes
-from render.backend import variant
+from render.backend.jit import dr, mi
 from render.materials import surfaces
 from render.materials.kernels import plugin
 from render.materials.kernels.packed import PackedSurfaces, cover_of
@@ -16,8 +15,6 @@ from render.materials.kernels.patterns import Evaluator
 from render.materials.kernels.plugin import FamilyBSDF
 from render.materials.kernels.textures.cover import Place
 from render.materials.kernels.textures.gloss import Gloss
-
-mi = variant.load()
 
 
 def register() -> None:

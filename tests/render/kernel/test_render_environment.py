@@ -14,7 +14,7 @@ import render_support as support
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from render.backend import variant
+from render.backend.jit import mi
 from render.kernel import many_lights, reference, scene
 from render.materials.kernels import surface_bsdf
 from render.materials.kernels.packed import pack
@@ -24,7 +24,6 @@ from render.shared.imaging import environments
 from render.shared.imaging.mixing import LightMix, LightStage, mix
 from render.shared.seeds import generator
 
-mi = variant.load()
 _log = logging.getLogger(__name__)
 
 SIZE, SPP, BOUNCES, REPEATS = 12, 64, 2, 16

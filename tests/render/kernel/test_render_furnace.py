@@ -1,16 +1,13 @@
 """White furnaces: energy is neither lost nor made, in sampled directions, in direct light and between surfaces."""
 
-import drjit as dr
 import numpy as np
 import pytest
 import render_support as support
 
 from render import shapes
-from render.backend import variant
+from render.backend.jit import dr, mi
 from render.materials import library, model
 from render.records.manifest import View
-
-mi = variant.load()
 
 MATERIALS = (
     "chrome", "steel", "nickel", "gold-metallic-paint", "white-acrylic", "white-fabric", "pink-felt", "pearl-paint",

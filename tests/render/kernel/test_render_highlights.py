@@ -1,20 +1,18 @@
 """Highlights sampled from the lights' side: where the points lie, how many, and that nothing is counted twice."""
 
-import drjit as dr
 import numpy as np
 import pytest
 import render_support as support
 from scipy import stats
 
 from render import shapes
-from render.backend import variant
+from render.backend.jit import dr, mi
 from render.kernel import highlights, many_lights, scene
 from render.kernel.camera import Camera
 from render.kernel.emitters import DistantLights
 from render.materials import library, model
 from render.records.manifest import View
 
-mi = variant.load()
 SIZE, SPP = 24, 64
 LIGHTS = support.unit([0, 0, 1], [0.5, 0.2, 0.8], [-0.4, 0.7, 0.6], [0.9, -0.3, 0.2])
 VIEW = View(rotation=(0, 0, 1, 0, 1, 0, -1, 0, 0), scale=0.9, offset=(0.05, -0.02))

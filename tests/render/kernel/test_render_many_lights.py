@@ -1,12 +1,12 @@
 """Determinism, shared rays, passes, and the absence of compilation in steady state."""
 
-import drjit as dr
 import numpy as np
 import pytest
 import render_support as support
 from scipy import stats
 
 from render import shapes
+from render.backend.jit import dr
 from render.kernel import many_lights, scene
 from render.planning import light_sets
 from render.records.manifest import View

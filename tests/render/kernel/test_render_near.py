@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 
-import drjit as dr
 import numpy as np
 import pytest
 import render_support as support
 
 import render
 from render import shapes
+from render.backend.jit import dr
 from render.kernel import many_lights, scene
 from render.materials.kernels.packed import pack
 from render.records import view_geometry

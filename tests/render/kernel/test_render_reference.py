@@ -9,7 +9,6 @@ import logging
 from dataclasses import dataclass, replace
 from functools import cache
 
-import drjit as dr
 import merl_support
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from render import shapes
-from render.backend import variant
+from render.backend.jit import dr, mi
 from render.kernel import emitters, highlights, many_lights, reference, scene, shading
 from render.materials import merl
 from render.materials.kernels.packed import pack
@@ -28,7 +27,6 @@ from render.planning import light_sets
 from render.records.manifest import View
 from render.shared.seeds import generator
 
-mi = variant.load()
 _log = logging.getLogger(__name__)
 
 FAMILY_SIGNIFICANCE = 0.01

@@ -1,13 +1,11 @@
 """Sample points: stratified in every aligned run of 2^k, in [0, 1), of the right mean, and apart by pixel and seed."""
 
-import drjit as dr
 import numpy as np
 import pytest
 import render_support as support
 
-from render.backend import sampling, variant
-
-mi = variant.load()
+from render.backend import sampling
+from render.backend.jit import dr, mi
 
 
 def lanes(pixels: int, spp: int, first: int = 0) -> tuple:

@@ -1,18 +1,16 @@
 """Shadow bits: right for every light, and shared among a pixel's samples only where they agree."""
 
-import drjit as dr
 import numpy as np
 import pytest
 import render_support as support
 
 from render import shapes
-from render.backend import variant
+from render.backend.jit import dr, mi
 from render.kernel import many_lights, paths, scene
 from render.kernel.emitters import DistantLights
 from render.kernel.visibility import WORD, probe_count, probed_visibility, visibility
 from render.records.manifest import View
 
-mi = variant.load()
 SIZE, SPP = 16, 32
 
 

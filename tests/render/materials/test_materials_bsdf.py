@@ -1,16 +1,15 @@
 """The kernels' form of the materials against the numpy form, and the Mitsuba plugin against Mitsuba's own tests."""
 
-import drjit as dr
 import numpy as np
 import pytest
 from brdf_support import directions, vector
 
+from render.backend.jit import dr, mi
 from render.materials import library, model
 from render.materials.fit import spheres
 from render.materials.kernels import bsdf, lobes
 from render.shared.errors import InputError
 
-mi = bsdf.mi
 NAMES = ("chrome", "steel", "pink-fabric", "specular-orange-phenolic", "lambertian:0.8/0.3/0.1")
 
 

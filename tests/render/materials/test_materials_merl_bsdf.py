@@ -1,17 +1,16 @@
 """The kernels' form of MERL tables against the numpy form, and the plugin `merl` against Mitsuba's own tests."""
 
-import drjit as dr
 import numpy as np
 import pytest
 from brdf_support import directions, vector
 from merl_support import of_library, values
 
+from render.backend.jit import dr, mi
 from render.materials import library, merl, model
 from render.materials.fit import spheres
 from render.materials.kernels import bsdf, lobes, merl_bsdf
 from render.shared.errors import InputError
 
-mi = merl_bsdf.mi
 NAMES = ("chrome", "glossy", "lambertian:1")
 
 

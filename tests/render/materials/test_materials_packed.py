@@ -1,20 +1,19 @@
 """Surfaces packed for the kernels: families, evaluation, mixtures of patterns, and which are glossy."""
 
-import drjit as dr
 import merl_support
 import numpy as np
 import pytest
 import render_support as support
 
 from render import shapes
+from render.backend.jit import dr, mi
 from render.materials import merl
-from render.materials.kernels import merl_bsdf, packed, surface_bsdf
+from render.materials.kernels import merl_bsdf, surface_bsdf
 from render.materials.kernels.bsdf import PackedMaterials
 from render.materials.kernels.merl_bsdf import PackedMerl
 from render.materials.kernels.packed import Part, pack
 from render.shared.errors import InputError
 
-mi = packed.mi
 COUNT = 4000
 
 

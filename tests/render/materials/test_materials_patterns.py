@@ -1,11 +1,11 @@
 """Patterns of spatially-varying surfaces: partitions of unity, seeded, attached to the object, and named clearly."""
 
-import drjit as dr
 import numpy as np
 import pytest
 import render_support as support
 
 from render import shapes
+from render.backend.jit import dr, mi
 from render.materials import surfaces
 from render.materials.kernels import patterns
 from render.materials.kernels.patterns import Evaluator, part_labels
@@ -13,7 +13,6 @@ from render.materials.surfaces import PATTERNS, Pattern
 from render.records.manifest import View
 from render.shared.errors import InputError
 
-mi = patterns.mi
 BALLS = support.joined(support.ball(0.3, (-0.5, 0, 0)), support.ball(0.25, (0.5, 0, 0)), support.ball(0.2, (0, 0.7, 0)))
 
 

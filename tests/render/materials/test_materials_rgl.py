@@ -2,18 +2,16 @@
 
 from functools import partial
 
-import drjit as dr
 import numpy as np
 import pytest
 import render_support as support
-from mitsuba.python import tensor_io
 
+from render.backend.jit import dr, mi
 from render.materials import library, model, rgl
 from render.materials.fit import spheres
 from render.materials.kernels import rgl_bsdf
 from render.shared.errors import InputError
 
-mi = rgl_bsdf.mi
 NAMES = ("chrome", "red-plastic", "pink-fabric")
 SPREAD = {  # percent of relative RMS error on a sphere, see docs/reference/material-model.md
     "chrome": 0.3, "steel": 0.3, "black-obsidian": 0.5, "brass": 0.3, "grease-covered-steel": 0.5, "hematite": 0.3,
@@ -66,6 +64,8 @@ def test_loaded_material_is_named_after_its_file(files):
 
 
 def test_container_is_the_one_mitsuba_reads(files, capsys):
+    from mitsuba.python import tensor_io
+
     ours, theirs = rgl.read_fields(files[0].path), tensor_io.read(str(files[0].path))
     capsys.readouterr()
     assert ours.keys() == theirs.keys()

@@ -1,11 +1,11 @@
 """Procedural materials: seeded, bounded, with a relief whose normals are those of the height's exact slope."""
 
-import drjit as dr
 import numpy as np
 import pytest
 import render_support as support
 
 from render import shapes
+from render.backend.jit import dr, mi
 from render.materials import library, surfaces
 from render.materials.kernels.packed import pack
 from render.materials.kernels.textures import cover
@@ -15,7 +15,6 @@ from render.materials.textures.textured import KINDS
 from render.records.manifest import View
 from render.shared.errors import InputError
 
-mi = cover.mi
 COUNT = 3000
 VIEWER = np.array([0.0, 0.0, 1.0])
 

@@ -1,14 +1,12 @@
 """The reflectance that textures drive: no energy lost or made, reciprocal, drawn with the density it is weighed by."""
 
-import drjit as dr
 import numpy as np
 import pytest
 
-from render.materials.kernels.textures import gloss
+from render.backend.jit import dr, mi
 from render.materials.kernels.textures.gloss import Appearance, Gloss
 from render.materials.textures import microfacet
 
-mi = gloss.mi
 COUNT = 1 << 16
 LOOKS = {"dielectric": (0.3, 0.0), "smooth metal": (0.1, 1.0), "metal": (0.4, 1.0), "rough metal": (1.0, 1.0),
          "between": (0.6, 0.5), "smooth": (0.15, 0.0)}  # fmt: skip

@@ -1,19 +1,17 @@
 """Folders of maps: found by name, decoded in their colour space and depth, laid on from three sides."""
 
-import drjit as dr
 import numpy as np
 import pytest
 import textures_support as support
 
 from render import shapes
+from render.backend.jit import dr, mi
 from render.materials import library
 from render.materials.kernels.textures import cover, projections
 from render.materials.textures import map_folder
 from render.materials.textures.map_folder import find, read
 from render.shapes.geometry.mesh import load_mesh
 from render.shared.errors import InputError
-
-mi = cover.mi
 
 
 def linear(encoded: np.ndarray) -> np.ndarray:

@@ -1,6 +1,8 @@
 """Which variant and libLLVM are chosen, and what is said when there is none."""
 
+import os
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -80,6 +82,20 @@ def test_a_given_library_that_aborts_is_refused(clean, tmp_path, version):
     clean.setenv("DRJIT_LIBLLVM_PATH", str(path))
     with pytest.raises(InputError, match=f"libLLVM {version} aborts"):
         choose()
+
+
+def test_a_library_that_drjit_cannot_load_is_reported(tmp_path):
+    """In a process of its own, as Dr.Jit loads its library once. The message also shows that loading was waited for."""
+    path = tmp_path / "libLLVM.so.18.1"
+    path.touch()
+    code = (
+        "from render.shared.errors import InputError\n"
+        "try:\n    import render.backend.jit\n"
+        "except InputError as error:\n    print(error)"
+    )
+    environment = {**os.environ, "SDPS_VARIANT": "llvm_ad_rgb", "DRJIT_LIBLLVM_PATH": str(path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(f"{path}: Dr.Jit could not load this libLLVM; install libLLVM 19"), done.stderr
 
 
 def test_a_given_library_is_used_or_reported_missing(clean, tmp_path):

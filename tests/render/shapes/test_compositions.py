@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 import render_support as support
@@ -11,6 +9,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from render import shapes
+from render.backend.jit import dr, mi
 from render.kernel import many_lights, scene
 from render.materials.kernels.packed import pack
 from render.materials.kernels.patterns import part_labels

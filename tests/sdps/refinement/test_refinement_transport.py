@@ -55,8 +55,6 @@ def test_a_convex_object_neither_shades_nor_lights_itself() -> None:
 
 def test_bounced_light_is_that_of_the_renderer() -> None:
     """A Lambertian bowl under two lights: the same surface as a height field and as a mesh."""
-    variant = pytest.importorskip("render.backend.variant")
-    variant.load()
     from render.kernel import many_lights, scene
     from render.materials.kernels.packed import pack
     from render.records.manifest import View

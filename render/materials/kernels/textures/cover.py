@@ -2,10 +2,8 @@
 
 from typing import Any, NamedTuple
 
-import drjit as dr
-
-from render.backend import variant
 from render.backend.arrays import table
+from render.backend.jit import dr, mi
 from render.materials.kernels.textures import kinds, projections
 from render.materials.kernels.textures.gloss import Appearance, Gloss
 from render.materials.kernels.textures.jets import Jet, coordinates
@@ -14,8 +12,6 @@ from render.materials.textures.textured import UV, Textured
 from render.shapes.geometry.mesh import TriangleMesh
 from render.shared.errors import InputError
 from render.shared.seeds import generator
-
-mi = variant.load()
 
 _EDGE_ON = 0.05  # cosine to the viewer below which relief is turned towards it
 

@@ -3,14 +3,10 @@
 from functools import cache
 from typing import Any, NamedTuple
 
-import drjit as dr
-
-from render.backend import variant
 from render.backend.arrays import table
+from render.backend.jit import dr, mi
 from render.materials import model
 from render.materials.textures import microfacet
-
-mi = variant.load()
 
 _COLUMNS, _ROWS = microfacet.COSINES, microfacet.ROUGHNESSES
 

@@ -2,11 +2,7 @@
 
 from typing import Any
 
-import drjit as dr
-
-from render.backend import variant
-
-mi = variant.load()
+from render.backend.jit import dr, mi
 
 
 class Jet:

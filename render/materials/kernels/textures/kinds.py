@@ -7,12 +7,11 @@ unit sphere. `wood`, `marble`, `noise` and `rust` are solid; the others are laid
 
 from typing import Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from render.backend import variant
 from render.backend.arrays import opaque, table
+from render.backend.jit import dr, mi
 from render.materials.kernels.textures.jets import (
     Jet,
     absolute,
@@ -27,8 +26,6 @@ from render.materials.kernels.textures.jets import (
     step,
     uniform,
 )  # fmt: skip
-
-mi = variant.load()
 
 FLAT = ("tiles", "weave", "print", "scratches")  # patterns of two coordinates
 

@@ -3,15 +3,12 @@
 from collections.abc import Callable
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
-from render.backend import variant
 from render.backend.arrays import opaque, table
+from render.backend.jit import dr, mi
 from render.materials.textures.map_folder import MapFolder
 from render.shapes.geometry.mesh import TriangleMesh
-
-mi = variant.load()
 
 _SHARPNESS = 8  # power of the normal's components, by which the three sides are blended
 AXES = ((2, 1), (0, 2), (0, 1))  # coordinates seen along x, y and z: across, and up
