@@ -77,7 +77,7 @@ def team(device: str | torch.device | None = None) -> Iterator[Team]:
         device: Torch device; by default CUDA where there is one (each process its own), else CPU.
 
     Raises:
-        InputError: more processes than GPUs.
+        InputError: more processes than GPUs, or torchrun may start processes again in a way that fails.
     """
     world = int(os.environ.get("WORLD_SIZE", "1"))
     local = int(os.environ.get("LOCAL_RANK", "0"))
@@ -93,6 +93,9 @@ def team(device: str | torch.device | None = None) -> Iterator[Team]:
     if distributed.is_initialized():  # the caller has a team already, for several runs
         yield Team(distributed.get_rank(), world, own)
         return
+    if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True" and os.environ.get("TORCHELASTIC_MAX_RESTARTS") != "0":
+        # Processes that are started again would find the addresses of those before them (pytorch issue 135712).
+        raise InputError("torchrun --max-restarts: set TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1, or restarts may hang")
     distributed.init_process_group("nccl" if cuda else "gloo")
     try:
         yield Team(distributed.get_rank(), world, own)

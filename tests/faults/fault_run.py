@@ -173,9 +173,9 @@ def weights_differ(whole: Path, broken: Path) -> float:
 
 
 def names(folder: Path) -> set[str]:
-    """Return the names of all files but ledgers, of which every run writes its own."""
+    """Return the names of all files but ledgers and the cache, of which every run writes its own."""
     found = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-    return {str(path) for path in found if "log" not in path.parts}
+    return {str(path) for path in found if not {"log", "cache"} & {*path.parts}}
 
 
 def whole(name: str, out: Path) -> tuple[Path, float]:

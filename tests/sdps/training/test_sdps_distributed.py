@@ -10,7 +10,12 @@ import pytest
 from safetensors.torch import load_file
 from sdps_scenes import write_data
 
+from render.shared.errors import InputError
+from sdps.training.distributed import team
+
 SCRIPT = """
+import os
+import signal
 import sys
 from sdps.training.training_config import NormalTraining
 from sdps.training.stages import NormalStage
@@ -20,24 +25,42 @@ config = NormalTraining(
     steps=int(sys.argv[4]), batch_scenes=4, images=2, size=32, crop=16, lights="true", log_every=1, workers=0,
     validation_scenes=2, validate_every=2, schedule=sys.argv[5], clip_gradient=1.0, ema=0.5,
     accumulate=int(sys.argv[3]),
+    checkpoint_minutes=1e-9,  # after every step
     precision="float32",  # in bfloat16 the order of a sum, which differs, shows at 2e-4
 )
-result = train(NormalStage(config), sys.argv[1], sys.argv[2])
+
+
+class Dies:  # kills the second process once, at a step
+    def log(self, step, values):
+        if f"{step} {os.environ.get('RANK')} {os.environ.get('TORCHELASTIC_RESTART_COUNT')}" == f"{sys.argv[6]} 1 0":
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def close(self):
+        pass
+
+
+result = train(NormalStage(config), sys.argv[1], sys.argv[2], loggers=[Dies()])
 assert result.steps == int(sys.argv[4]), result
 """
 
 
 def run(
-    folder: Path, out: Path, processes: int, accumulate: int = 1, steps: int = 4, schedule: str = "cosine"
+    folder: Path,
+    out: Path,
+    processes: int,
+    accumulate: int = 1,
+    steps: int = 4,
+    schedule: str = "cosine",
+    dies: int = 0,
 ) -> list[dict]:
     """Train in a fresh process, or several under torchrun; return the metrics without what measures time."""
     script = out.with_suffix(".py")
     script.write_text(SCRIPT)
-    launch = (
-        ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)] if processes > 1 else []
-    )
-    command = [sys.executable, *launch, str(script), str(folder), str(out), str(accumulate), str(steps), schedule]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), "--max-restarts", "1"]
+    values = [accumulate, steps, schedule, dies]
+    command = [sys.executable, *(launch if processes > 1 else []), str(script), str(folder), str(out)]
+    command += [str(value) for value in values]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
@@ -75,13 +98,32 @@ def test_accumulation_and_another_number_of_processes_keep_the_batch(folder: Pat
         assert len(wanted) == 4 and found == pytest.approx(wanted, rel=tolerance)
 
 
+@pytest.mark.slow
+def test_a_killed_process_is_started_again_and_goes_on_from_the_checkpoint(folder: Path, tmp_path: Path) -> None:
+    alone, killed = run(folder, tmp_path / "one", 1, steps=6), run(folder, tmp_path / "two", 2, steps=6, dies=4)
+    found, wanted = ([(line["step"], line["loss"]) for line in lines if "loss" in line] for lines in (killed, alone))
+    assert [step for step, _ in found] == [step for step, _ in wanted] and found  # every step once
+    assert [value for _, value in found] == pytest.approx([value for _, value in wanted], rel=2e-4)
+
+
 def test_a_batch_that_cannot_be_shared_is_refused(folder: Path, tmp_path: Path) -> None:
     script = tmp_path / "odd.py"
     script.write_text(SCRIPT.replace("batch_scenes=4", "batch_scenes=3"))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
     done = subprocess.run(
-        [*command, str(folder), str(tmp_path / "out"), "1", "4", "cosine"], capture_output=True, text=True, check=False,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        [*command, str(folder), str(tmp_path / "out"), "1", "4", "cosine", "0"], capture_output=True, text=True,
+        check=False, env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode != 0
-    assert "batch_scenes 3 cannot be shared by 2 processes" in done.stderr
+    assert "batch_scenes 3 cannot be shared by 2 processes" in done.stderr[-2000:]
+
+
+def test_restarts_that_would_hang_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {
+        "WORLD_SIZE": "2",
+        "TORCHELASTIC_USE_AGENT_STORE": "True",
+        "TORCHELASTIC_MAX_RESTARTS": "3",
+    }.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(InputError, match="set TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1"), team("cpu"):
+        pass
