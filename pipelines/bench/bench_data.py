@@ -26,7 +26,7 @@ from render.shared.errors import InputError
 from render.shared.files import atomic_path
 from render.shared.templates import markdown_table
 
-_WARM_UP = 12  # views, after which every kernel a run needs has been met
+_WARM_UP = 36  # views, after which every kernel a run needs has been met
 _VIEWS = 40
 _SAMPLES = (16, 32, 64)
 _EVERY_MATERIAL = 7  # of the 100, in the measure of noise
@@ -35,7 +35,7 @@ _EVERY_MATERIAL = 7  # of the 100, in the measure of noise
 def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
     """Count the kernels compiled while shapes, views, materials, lights and cameras change.
 
-    Every second view is seen in perspective, half of these under near lights.
+    Every third view is seen in perspective, half of these under near lights; every third is one of a composition.
     """
     from render import shapes
     from render.backend.jit import dr
@@ -45,11 +45,15 @@ def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
     config = presets.load("small").data
     config = replace(config, families={"blobby": 8, "sculpture": 18}, views=2, spatially_varying=0.0, spp=16)
     near = replace(config, near_lights=0.5, camera="perspective")
-    plans = [plan(each)[: 2 * (_WARM_UP + _VIEWS)] for each in (config, near)]
-    planned = plans[0]
+    composed = replace(config, families={"composition": 26}, composition_materials=(3, 3))
+    plans = [plan(each) for each in (config, near, composed)]
 
-    def render(first: int) -> None:
-        pair = plans[first // 2 % 2][first : first + 2]
+    seen: set[str] = set()
+
+    def render(number: int) -> None:
+        turn, kind = divmod(number, len(plans))
+        pair = plans[kind][2 * turn : 2 * turn + 2]
+        seen.add(pair[0].shape)
         distances = np.asarray(pair[0].light_distances) if pair[0].light_distances else None
         built = scene.build(shapes.load(pair[0].shape))
         _, images = many_lights.render(
@@ -61,16 +65,17 @@ def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
             pass
 
     for number in range(_WARM_UP):
-        render(2 * number)
+        render(number)
+    seen.clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for number in range(_WARM_UP, _WARM_UP + _VIEWS):
-            render(2 * number)
+            render(number)
         history = dr.kernel_history([dr.KernelType.JIT])
     compiled = sum(not kernel["cache_hit"] or bool(kernel["cache_disk"]) for kernel in history)
     values = {"views": _VIEWS, "launches": len(history), "kernels_compiled": compiled}
     return values, (
-        f"Steady state: {_VIEWS} views of {len({s.shape for s in planned})} shapes with other poses, materials, "
+        f"Steady state: {_VIEWS} views of {len(seen)} shapes with other poses, materials, "
         f"lights and cameras, {len(history):,} kernel launches, {compiled} kernels compiled.\n"
     )
 

@@ -150,8 +150,16 @@ def render_planned(
 
 
 def write_preview(scenes: list[SceneSpec], folder: Path) -> None:
-    """Write a contact sheet of finished scenes to `preview.png`."""
+    """Write a contact sheet of finished scenes to `preview.png`.
+
+    Raises:
+        InputError: none is there any more.
+    """
     finished = mirror.finished(folder, scenes)
+    if not finished:
+        raise InputError(
+            f"{folder}: the shards that were rendered are gone; was the folder moved? run the command again"
+        )
     with atomic_path(folder / "preview.png") as temporary:
         pictures.scene_sheet(finished, folder).save(temporary)
 

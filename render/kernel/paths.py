@@ -1,50 +1,24 @@
 """Camera paths and their shadow rays: all of a view's rays, whatever its lights and materials reflect."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from render.backend.arrays import opaque
 from render.backend.jit import dr, mi
-from render.backend.sampling import bounce_variates, pixel_position, random_variates, stream
+from render.backend.sampling import pixel_position, stream
 from render.kernel import highlights
+from render.kernel.bounces import bounce
 from render.kernel.camera import Camera
 from render.kernel.emitters import DistantLights, NearLights, place
-from render.kernel.visibility import probe_count, probed_visibility, visibility
+from render.kernel.vertices import Vertices, take
+from render.kernel.visibility import WORD, grouped_visibility, probe_count, probed_visibility, visibility
 from render.materials.kernels.packed import PackedSurfaces
 from render.materials.kernels.textures.cover import Place
 from render.records.manifest import View
 from render.shapes.geometry.mesh import TriangleMesh
-
-
-@dataclass(frozen=True)
-class Vertices:
-    """Path vertices of one depth, sorted by pixel; all arrays are Dr.Jit, in the object frame.
-
-    `bitmask` is the visibility bitmask: bit b of entry `w * N + i` tells whether vertex i sees light 32 w + b.
-    """
-
-    count: int
-    position: Any  # Point3f (N)
-    normal: Any  # Vector3f (N), shading normal
-    wi: Any  # Vector3f (N, or 1 at an orthographic camera's hits), to the previous vertex
-    prim: Any  # UInt32 (N), triangle
-    sample: Any  # UInt32 (N), number of the camera sample
-    bitmask: Any  # UInt32 (ceil(L / 32) * N)
-    throughput: tuple  # K Color3f (N, or 1 at the camera hits): f cos / density along the path so far
-    weights: tuple  # K tuples of Float (N), weights of each surface's materials; None for a single material
-    turned: tuple  # K Vector3f (N), normals of surfaces with relief, None for others
-    centre: Any  # Point3f (N), centroid of the triangle, or None where no highlight needs it
-    spread: Any  # Float (N), d(solid angle of normals) / d(image area), or None where no highlight needs it
-    pixels: Any  # UInt32 (Q), pixels with at least one vertex
-    start: Any  # UInt32 (Q), first vertex of the pixel
-    length: Any  # UInt32 (Q), number of vertices of the pixel
-
-    def normal_of(self, number: int) -> Any:
-        """Return the shading normals (N) of a surface."""
-        return self.normal if self.turned[number] is None else self.turned[number]
 
 
 @dataclass(frozen=True)
@@ -99,6 +73,7 @@ def trace(
     parallel = camera.parallel and isinstance(emitters, DistantLights)
     halves = highlights.half_vectors(camera, emitters, parallel) if any(surfaces.glossy) else None
     depths: list[Vertices] = []
+    composed = scene.mesh.objects is not None  # much of its light has bounced
     throughput = (mi.Color3f(1),) * len(surfaces)
     for depth in range(bounces + 1):
         found, uv = scene.ray_intersect(ray, depth == 0)
@@ -120,30 +95,49 @@ def trace(
         sample, uv, prim = take(mi.UInt32, sample, kept), take(mi.Point2f, uv, kept), take(mi.UInt32, prim, kept)
         dr.eval(position, normal, facet, wi, sample, prim, uv, throughput)
         segments = _segments(sample, spp, size * size)
-        rays = (scene, position, normal, facet, emitters, len(lights))
-        if depth == 0 and probe:
-            probes = sample % opaque(mi.UInt32(spp)) < opaque(mi.UInt32(probe_count(spp)))
-            seen = probed_visibility(*rays, probes, segments[1:])
+        rays = {"scene": scene, "position": position, "normal": normal, "facet": facet, "emitters": emitters}
+        if depth == 0:
+            seen = _seen(rays, len(lights), sample, spp, segments, probe)
         else:
-            seen = visibility(*rays, coherent=depth == 0)
+            seen = None if composed else visibility(**rays, lights=len(lights), coherent=False)
         centre, spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and halves else (None, None)
         covers = surfaces.at(Place(mi.Vector3f(position), normal, prim, uv), wi)  # weights, turned normals
-        lit = position, normal, wi, prim, sample, seen, throughput
+        lit = position, normal, facet, wi, prim, sample, seen, throughput
         depths.append(Vertices(len(kept), *lit, *covers, centre, spread, *segments))
         if depth < bounces:
-            ray, factors = _bounce(depths[-1], facet, surfaces, seed, depth + 1, first, spp)
-            throughput = tuple(value * factor for value, factor in zip(throughput, factors, strict=True))
-    glints = None
-    if halves and depths:
-        glints = highlights.find(scene, camera, emitters, halves, len(lights), surfaces, spp, seed, first)
+            ray, throughput = bounce(depths[-1], surfaces, seed, depth + 1, first, spp, composed)
+    if composed and len(depths) > 1:
+        depths[1:] = _seen_together(scene, depths[1:], emitters, len(lights))
+    mirrors = (scene, camera, emitters, halves, len(lights), surfaces, spp, seed, first)
+    glints = highlights.find(*mirrors) if halves and depths else None
     shared = emitters, parallel, halves, len(lights), size, spp
     return Paths(tuple(depths), glints, *shared, *_sums(depths, camera, surfaces, scene.mesh, spp))
 
 
-def take(kind: type, source: Any, index: Any) -> Any:
-    """Gather the lanes `index` of an array; one that is uniform (width 1) stays so."""
-    source = kind(source)
-    return dr.gather(kind, source, index) if dr.width(source) > 1 else source
+def _seen_together(scene: Any, depths: list[Vertices], emitters: Any, lights: int) -> list[Vertices]:
+    """Find the lights that the vertices of several depths see, which they share with others close to them."""
+    positions, normals, facets = (
+        np.concatenate([[np.array(row) for row in column] for column in columns], axis=1)  # row by row: see `place`
+        for columns in zip(*((vertices.position, vertices.normal, vertices.facet) for vertices in depths), strict=True)
+    )
+    bits = grouped_visibility(scene, positions, normals, facets, emitters, lights)
+    total, first, found = opaque(mi.UInt32(positions.shape[1])), 0, []
+    for vertices in depths:
+        width, lane = opaque(mi.UInt32(vertices.count)), dr.arange(mi.UInt32, vertices.count * -(-lights // WORD))
+        word = lane // width
+        entry = dr.fma(word, total, lane - word * width + opaque(mi.UInt32(first)))
+        found.append(replace(vertices, bitmask=dr.gather(mi.UInt32, bits, entry)))
+        dr.eval(found[-1].bitmask)
+        first += vertices.count
+    return found
+
+
+def _seen(rays: dict[str, Any], lights: int, sample: Any, spp: int, segments: tuple, probe: bool) -> Any:
+    """Return what the camera's hits see, whose samples share it where they may."""
+    if not probe:
+        return visibility(**rays, lights=lights, coherent=True)
+    probes = sample % opaque(mi.UInt32(spp)) < opaque(mi.UInt32(probe_count(spp)))
+    return probed_visibility(**rays, lights=lights, probes=probes, segments=segments[1:])
 
 
 def _camera_rays(camera: Camera, spp: int, seed: int, first: int) -> tuple["mi.Ray3f", "mi.UInt32"]:
@@ -157,76 +151,6 @@ def _camera_rays(camera: Camera, spp: int, seed: int, first: int) -> tuple["mi.R
     x = (mi.Float(pixel - row * side) + place.x) * half - 1
     y = 1 - (mi.Float(row) + place.y) * half
     return camera.ray(x, y), index
-
-
-def _bounce(
-    vertices: Vertices, facet: Any, surfaces: PackedSurfaces, seed: int, depth: int, first: int, spp: int
-) -> tuple["mi.Ray3f", list]:
-    """Draw the next direction from the mixture of all materials' lobes.
-
-    Returns:
-        The rays, and per surface the weight f cos / density.
-    """
-    if depth == 1:
-        per_pixel = opaque(mi.UInt32(spp))
-        pixel = vertices.sample // per_pixel
-        number = vertices.sample - pixel * per_pixel + opaque(mi.UInt32(first))
-        chosen, u, v = bounce_variates(pixel, number, stream(seed, depth))
-    else:
-        chosen, u, v = random_variates(vertices.sample, stream(seed, (first << 8) + depth))
-    lobe, _, _ = random_variates(vertices.sample, stream(seed, (first << 8) + 128 + depth))
-    if any(normal is not None for normal in vertices.turned):
-        towards, density, factors = _mixed_frames(vertices, surfaces, chosen, lobe, mi.Point2f(u, v))
-    else:
-        frame = mi.Frame3f(vertices.normal)
-        wi = frame.to_local(vertices.wi)
-        dr.eval(wi, chosen, u, v, lobe)
-        wo, density = surfaces.sample(vertices.weights, wi, chosen, lobe, mi.Point2f(u, v))
-        scale = dr.select(density > 0, dr.rcp(density), 0)
-        dr.eval(wi, wo, scale)
-        factors = [surfaces.eval(number, wi, wo, vertices.weights[number]) * scale for number in range(len(surfaces))]
-        towards = frame.to_world(wo)
-    start = dr.zeros(mi.SurfaceInteraction3f, vertices.count)
-    start.p, start.n = vertices.position, facet
-    ray = start.spawn_ray(towards)
-    ray.maxt = dr.select(density > 0, ray.maxt, 0)
-    dr.eval(ray, factors)
-    return ray, factors
-
-
-def _mixed_frames(vertices: Vertices, surfaces: PackedSurfaces, chosen: Any, lobe: Any, point: Any) -> tuple:
-    """Do the same where some surfaces have a relief: each of these is drawn for alone, the others together.
-
-    Returns:
-        Directions (N), their density (N) in the mixture of all surfaces, and the factors.
-    """
-    plain = [number for number, normal in enumerate(vertices.turned) if normal is None]
-    groups = [[number] for number in range(len(surfaces)) if number not in plain]
-    groups += [plain] if plain else []
-    frames = [mi.Frame3f(vertices.normal_of(group[0])) for group in groups]
-    local = [frame.to_local(vertices.wi) + dr.zeros(mi.Vector3f, vertices.count) for frame in frames]
-    dr.eval(local, chosen, lobe, point)
-    towards, edge = mi.Vector3f(0, 0, 1), 0.0
-    for group, frame, wi in zip(groups, frames, local, strict=True):
-        share = len(group) / len(surfaces)
-        within = (chosen - opaque(mi.Float(edge))) * opaque(mi.Float(1 / share))
-        wo = surfaces.draw(vertices.weights, wi, dr.clip(within, 0, 1 - 2**-24), lobe, point, group)
-        towards = dr.select(within >= 0, frame.to_world(wo), towards)
-        edge += share
-    dr.eval(towards)
-    above = dr.dot(vertices.normal, towards) > 0  # below, the surface hides what its relief would reflect
-    density, ends = mi.Float(0), []
-    for group, frame, wi in zip(groups, frames, local, strict=True):
-        wo = frame.to_local(towards)
-        dr.eval(wo)
-        density += surfaces.density(vertices.weights, wi, wo, group) * opaque(mi.Float(len(group) / len(surfaces)))
-        ends += [(number, wi, wo) for number in group]
-    density = dr.select(above, density, 0)
-    scale = dr.select(density > 0, dr.rcp(density), 0)
-    towards = dr.select(density > 0, towards, vertices.normal)  # no ray is cast along what could not be drawn
-    dr.eval(density, scale, towards)
-    found = {number: surfaces.eval(number, wi, wo, vertices.weights[number]) * scale for number, wi, wo in ends}
-    return towards, density, [found[number] for number in range(len(surfaces))]
 
 
 def _segments(sample: Any, spp: int, pixel_count: int) -> tuple:

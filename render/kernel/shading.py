@@ -13,7 +13,8 @@ import numpy as np
 from render.backend.arrays import Columns, opaque
 from render.backend.jit import dr, mi
 from render.kernel import highlights
-from render.kernel.paths import Paths, Vertices
+from render.kernel.paths import Paths
+from render.kernel.vertices import Vertices
 from render.kernel.visibility import WORD
 from render.materials.kernels import bsdf
 from render.materials.kernels.bsdf import PackedMaterials

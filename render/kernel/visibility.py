@@ -2,17 +2,22 @@
 
 At the camera's hits neighbouring samples of a pixel mostly see the same lights. So the first samples of a pixel, spread
 evenly over it, probe every light. Where all of them agree that a light is seen, or that it is not, the others follow;
-where they differ, or none of them faces the light, every sample asks for itself.
+where they differ, or none of them faces the light, every sample asks for itself. In compositions half of the paths go
+on, and vertices behind the camera's hits share in the same way what others near them see.
 """
 
 from typing import Any
 
-from render.backend.arrays import opaque
+import numpy as np
+
+from render.backend.arrays import opaque, upload
 from render.backend.jit import dr, mi
 
 WORD = 32  # lights per entry of a bitmask
 _LEAST_PROBES = 8
 _PROBED = 4  # one sample in so many probes, where there are more than the least
+_CELL = 0.08  # side of the cells whose vertices share, in radii of the object's bounding sphere
+_SHUFFLE = np.uint64(2654435761)  # odd, so that multiples of the first 2^24 numbers differ below 2^24
 
 
 def probe_count(spp: int) -> int:
@@ -70,6 +75,52 @@ def probed_visibility(
     dr.eval(bitmask, known)
     agreed = _agreement(bitmask, known, segments, total, groups)
     return _complete(scene, (position, normal, facet), emitters, bitmask, probes, agreed, segments, lights)
+
+
+def grouped_visibility(
+    scene: Any, positions: np.ndarray, normals: np.ndarray, facets: np.ndarray, emitters: Any, lights: int
+) -> Any:
+    """Do the same at vertices in any order, of which those share that lie in one cell and face one way.
+
+    Args:
+        scene, emitters, lights: As in `visibility`.
+        positions: (3, N) float32, in the unit sphere.
+        normals: (3, N) float32, shading normals.
+        facets: (3, N) float32, geometric normals.
+    """
+    count, groups = positions.shape[1], -(-lights // WORD)
+    order, (start, length) = cells(positions, facets)
+    rank = (np.arange(count) - np.repeat(start, length)).astype(np.uint32)
+    place = np.empty(count, np.uint32)
+    place[order] = np.arange(count, dtype=np.uint32)
+    position, normal, facet = (
+        mi.Vector3f(*(upload(mi.Float, row[order]) for row in rows)) for rows in (positions, normals, facets)
+    )
+    probes = upload(mi.UInt32, rank) < _LEAST_PROBES
+    segments = upload(mi.UInt32, start.astype(np.uint32)), upload(mi.UInt32, length.astype(np.uint32))
+    bits = probed_visibility(scene, mi.Point3f(position), normal, facet, emitters, lights, probes, segments)
+    width, lane = opaque(mi.UInt32(count)), dr.arange(mi.UInt32, count * groups)
+    word = lane // width * width
+    bitmask = dr.gather(mi.UInt32, bits, word + dr.gather(mi.UInt32, upload(mi.UInt32, place), lane - word))
+    dr.eval(bitmask)
+    return bitmask
+
+
+def cells(positions: np.ndarray, facets: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Sort vertices (3, N) by the cell they lie in and the axis they face, in random order within.
+
+    Returns:
+        The order (N,) uint32, and (start, length) of each run.
+    """
+    count = positions.shape[1]
+    column, row, layer = np.floor((np.clip(positions, -1.5, 1.5) + 1.5) / _CELL).astype(np.uint64)
+    axis = np.abs(facets).argmax(0)
+    side = 2 * axis.astype(np.uint64) + (np.take_along_axis(facets, axis[None], 0)[0] > 0)
+    cell = ((column << np.uint64(20) | row << np.uint64(10) | layer) << np.uint64(3)) | side
+    order = np.lexsort((np.arange(count, dtype=np.uint64) * _SHUFFLE % np.uint64(1 << 24), cell))
+    cell = cell[order]
+    start = np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]]))
+    return order.astype(np.uint32), (start, np.diff(start, append=count))
 
 
 def _cast(scene: Any, position: Any, normal: Any, facet: Any, emitters: Any, lights: int, coherent: bool) -> tuple:

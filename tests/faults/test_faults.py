@@ -11,6 +11,7 @@ from data_folders import good_folder, scene_of, sphere_shard
 from fault_run import FAULTS, digests, disturbed, finished, left_over
 
 from pipelines.cli import main
+from pipelines.rendering.render_data import write_preview
 from render.records.shards import read_shard, write_shard
 from render.shared import files
 from render.shared.errors import InputError
@@ -113,6 +114,11 @@ def test_a_folder_that_may_not_be_written_is_one_line(tmp_path: Path, monkeypatc
     said = capsys.readouterr().err
     assert "Read-only file system" in said and "Traceback" not in said
     assert not (tmp_path / "tree").exists()
+
+
+def test_a_folder_that_vanished_while_it_was_rendered_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the shards that were rendered are gone"):
+        write_preview([scene_of(sphere_shard(count=3))], tmp_path / "data")
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ level over all scenes; with any one part of the light transport taken away it mu
 
 import logging
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import merl_support
 import numpy as np
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from render import shapes
 from render.backend.jit import dr, mi
-from render.kernel import emitters, highlights, many_lights, reference, scene, shading
+from render.kernel import bounces, emitters, highlights, many_lights, reference, scene, shading, visibility
 from render.materials import merl
 from render.materials.kernels.packed import pack
 from render.materials.kernels.textures import cover, gloss
@@ -345,8 +345,29 @@ def test_notices_a_missing_map(part, material, monkeypatch):
 COMPOSED = next(case for case in CASES if case.shape.startswith("composition"))
 
 
-@pytest.mark.parametrize("mutation", ["an object moved", "materials exchanged", "two bounces dropped"])
-def test_notices_what_is_wrong_with_a_composition(mutation):
+def without_weight(reach, throughput, sample, seed, *, real):
+    """Russian roulette whose survivors carry what they did."""
+    return real(reach, throughput, sample, seed)[0], throughput
+
+
+def shuffled(positions, facets):
+    """Groups of vertices that have nothing in common."""
+    start = np.arange(0, positions.shape[1], 50)
+    order = np.random.default_rng(0).permutation(positions.shape[1]).astype(np.uint32)
+    return order, (start, np.diff(start, append=len(order)))
+
+
+@pytest.mark.parametrize(
+    "mutation",
+    [
+        "an object moved",
+        "materials exchanged",
+        "two bounces dropped",
+        "paths end unweighted",
+        "strangers share shadows",
+    ],
+)
+def test_notices_what_is_wrong_with_a_composition(mutation, monkeypatch):
     mesh, view, directions = parts(COMPOSED)
     settings = {"bounces": 1} if mutation == "two bounces dropped" else {}
     assert mesh.objects is not None
@@ -358,6 +379,15 @@ def test_notices_what_is_wrong_with_a_composition(mutation):
     if mutation == "materials exchanged":
         first, second = name.removeprefix("parts:0:").split("+")
         name = f"parts:0:{second}+{first}"
+    if mutation == "paths end unweighted":
+        monkeypatch.setattr(bounces, "_FULL", 0.5)  # or few would end: nine tenths of the light go on here
+        unweighted = partial(without_weight, real=bounces.roulette)
+        weighted = ours(COMPOSED, name, scene_parts=(mesh, view, directions))
+        assert p_value(weighted, expected(COMPOSED, COMPOSED.material)) > 0.01
+        monkeypatch.setattr(bounces, "roulette", unweighted)
+    if mutation == "strangers share shadows":
+        monkeypatch.setattr(visibility, "cells", shuffled)
+        monkeypatch.setattr(visibility, "_LEAST_PROBES", 1)
     changed = ours(COMPOSED, name, scene_parts=(mesh, view, directions), **settings)
     assert p_value(changed, expected(COMPOSED, COMPOSED.material)) < 1e-4
 

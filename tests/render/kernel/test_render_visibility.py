@@ -8,7 +8,7 @@ from render import shapes
 from render.backend.jit import dr, mi
 from render.kernel import many_lights, paths, scene
 from render.kernel.emitters import DistantLights
-from render.kernel.visibility import WORD, probe_count, probed_visibility, visibility
+from render.kernel.visibility import WORD, cells, grouped_visibility, probe_count, probed_visibility, visibility
 from render.records.manifest import View
 
 SIZE, SPP = 16, 32
@@ -167,3 +167,76 @@ def test_other_lights_shapes_and_counts_compile_nothing():
     go(bowl, 20, 32)
     go(sculpture, 40, 32)
     assert support.compiled(lambda: (go(bowl, 70, 64), go(sculpture, 33, 16), go(shapes.load("blobby:2"), 64, 32))) == 0
+
+
+@pytest.fixture(scope="module")
+def heap() -> tuple:
+    """Return a composition, and the vertices behind the camera's hits: position, normal and facet."""
+    mesh = shapes.load("composition:15")
+    built, surfaces = scene.build(mesh), support.packed("lambertian:0.9")
+    found = paths.trace(built, View(), surfaces, support.spread(8, 0.02), size=64, spp=32, bounces=1, seed=3)
+    return built, found.depths[1]
+
+
+def test_cells_hold_vertices_that_are_close_and_face_one_way(heap):
+    _, later = heap
+    positions, facets = np.array(later.position), np.array(later.facet)
+    order, (start, length) = cells(positions, facets)
+    assert sorted(order) == [*range(later.count)] and length.sum() == later.count
+    assert later.count / len(start) > 10  # enough of them to share
+    for first, number in zip(start, length, strict=True):
+        members = order[first : first + number]
+        assert np.ptp(positions[:, members], axis=1).max() <= 0.0801
+        assert (np.argmax(np.abs(facets[:, members]), axis=0) == np.abs(facets[:, members[0]]).argmax()).all()
+
+
+@pytest.mark.parametrize("lights", [31, 64])
+def test_groups_share_what_they_would_see(heap, lights):
+    built, later = heap
+    emitters = DistantLights(mi.Vector3f(*support.spread(lights, 0.02).T.astype(np.float32)))
+    at = later.position, later.normal, later.facet, emitters, lights
+    asked = bits(visibility(built, *at, coherent=False), later.count, lights)
+    columns = [np.array(column) for column in at[:3]]
+    shared = bits(grouped_visibility(built, *columns, emitters, lights), later.count, lights)
+    faced = support.spread(lights, 0.02) @ np.array(later.normal) > 0
+    wrong = (asked != shared) & faced
+    assert 0.2 < asked[faced].mean() < 0.8  # much is in shadow
+    assert 0 < wrong.sum() / faced.sum() < 0.02
+    assert shared[faced].mean() == pytest.approx(asked[faced].mean(), abs=2e-3)  # light is missed as often as added
+    free = bits(grouped_visibility(NoShadows(built.mesh), *columns, emitters, lights), later.count, lights)
+    np.testing.assert_array_equal(free & faced, faced)
+
+
+def test_sharing_in_groups_is_far_below_the_noise(monkeypatch):
+    mesh, lights = shapes.load("composition:15"), support.spread(32, 0.02)
+    built, surfaces = scene.build(mesh), support.packed("blue-acrylic")
+
+    def rendered(seed: int) -> np.ndarray:
+        options = {"size": 64, "spp": 32, "bounces": 3, "seed": seed}
+        return dict(many_lights.render(built, View(), surfaces, lights, **options)[1])[0]
+
+    shared, other = rendered(0), rendered(1)
+    monkeypatch.setattr(paths, "grouped_visibility", asked_one_by_one)
+    asked = rendered(0)
+    assert 0 < abs(shared.mean(dtype=np.float64) / asked.mean(dtype=np.float64) - 1) < 2e-4
+    np.testing.assert_allclose(shared.mean((1, 2, 3)), asked.mean((1, 2, 3)), rtol=1e-3)
+    noise = np.sqrt(((other - shared) ** 2).mean() / 2)
+    assert np.sqrt(((shared - asked) ** 2).mean()) < noise / 10
+
+
+def asked_one_by_one(built, positions, normals, facets, emitters, lights):
+    """Give what `grouped_visibility` gives, by a ray for every vertex and light."""
+    at = (mi.Vector3f(*rows) for rows in (positions, normals, facets))
+    return visibility(built, *at, emitters, lights, coherent=False)
+
+
+def test_compositions_compile_nothing():
+    def go(seed: int, lights: int, spp: int) -> None:
+        mesh = shapes.load(f"composition:{seed}")
+        surfaces = support.packed("lambertian:0.9")
+        directions = support.spread(lights, 0.02)
+        paths.trace(scene.build(mesh), View(), surfaces, directions, size=SIZE, spp=spp, bounces=3, seed=seed)
+
+    go(0, 20, 32)
+    go(1, 40, 32)
+    assert support.compiled(lambda: (go(2, 70, 64), go(3, 33, 16))) == 0
