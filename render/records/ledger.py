@@ -9,7 +9,7 @@ import math
 import os
 import socket
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -54,7 +54,8 @@ class Ledger:
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._handle is not None:
-            self._handle.close()
+            with suppress(OSError):  # of a line that `add` could not write, and told
+                self._handle.close()
 
     def add(self, line: dict[str, Any]) -> None:
         """Append the line of a finished shard: id, spec, bytes, seconds, stages, time, worker."""

@@ -44,7 +44,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
-        with _writing(path):
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
             _flush(temporary)
@@ -64,7 +64,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     temporary, old = (path.with_name(f".{path.name}.{os.getpid()}.{kind}") for kind in ("tmp", "old"))
     try:
-        with _writing(path):
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             for stale in path.parent.glob(f".{path.name}.*.tmp"):  # of a run that was killed
                 shutil.rmtree(stale, ignore_errors=True)
@@ -88,8 +88,12 @@ def _flush(path: Path) -> None:
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turn what the disk refuses into one line."""
+def writing(path: Path) -> Iterator[None]:
+    """Turn what the disk refuses into one line.
+
+    Raises:
+        InputError: the disk is full or the file cannot be written.
+    """
     try:
         yield
     except OSError as error:

@@ -3,14 +3,14 @@
 import json
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from render.shared.errors import InputError
-from render.shared.files import read_whole_lines, write_jsonl
+from render.shared.files import read_whole_lines, write_jsonl, writing
 
 
 class Logger(Protocol):
@@ -37,16 +37,24 @@ class JsonlLogger:
         if path.is_file():
             # A killed run may have left half a line at the end.
             write_jsonl(path, [row for row in read_whole_lines(path) if row["step"] <= last_step])
-        self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by close)
+        self._path = path
+        with writing(path):
+            self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by close)
 
     def log(self, step: int, values: dict[str, float]) -> None:
-        """Write one line and flush it."""
-        self._file.write(json.dumps({"step": step, **values}) + "\n")
-        self._file.flush()
+        """Write one line and flush it.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        with writing(self._path):
+            self._file.write(json.dumps({"step": step, **values}) + "\n")
+            self._file.flush()
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        with suppress(OSError):  # of a line that `log` could not write, and told
+            self._file.close()
 
 
 class TensorBoardLogger:

@@ -3,12 +3,14 @@
 import builtins
 import errno
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from data_folders import good_folder, scene_of, sphere_shard
-from fault_run import FAULTS, digests, disturbed, finished, left_over
+from fault_run import FAULTS, ROOT, digests, disturbed, finished, left_over
 
 from pipelines.cli import main
 from pipelines.rendering.render_data import write_preview
@@ -114,6 +116,24 @@ def test_a_folder_that_may_not_be_written_is_one_line(tmp_path: Path, monkeypatc
     said = capsys.readouterr().err
     assert "Read-only file system" in said and "Traceback" not in said
     assert not (tmp_path / "tree").exists()
+
+
+def test_a_line_that_the_disk_refuses_is_told_once(tmp_path: Path) -> None:
+    """In a process of its own, whose files may not grow beyond 60 bytes, as on a full disk."""
+    code = (
+        "import resource, sys\nfrom pathlib import Path\nfrom sdps.training.loggers import JsonlLogger\n"
+        "from render.records.ledger import Ledger\nfrom render.shared.errors import InputError\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (60, 60))\n"
+        "logger, folder = JsonlLogger(Path(sys.argv[1]) / 'metrics.jsonl', 0), Path(sys.argv[1])\n"
+        "try:\n    [logger.log(step, {'loss': 0.5}) for step in range(9)]\n"
+        "except InputError as error:\n    print(error)\n"
+        "logger.close()\n"
+        "try:\n    with Ledger(folder) as ledger:\n        [ledger.add({'id': str(k)}) for k in range(9)]\n"
+        "except InputError as error:\n    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True, cwd=ROOT)
+    told = done.stdout.splitlines()
+    assert len(told) == 2 and all("cannot be written (File too large)" in line for line in told), done.stderr
 
 
 def test_a_folder_that_vanished_while_it_was_rendered_is_one_line(tmp_path: Path) -> None:
