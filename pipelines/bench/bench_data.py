@@ -26,7 +26,7 @@ from render.shared.errors import InputError
 from render.shared.files import atomic_path
 from render.shared.templates import markdown_table
 
-_WARM_UP = 36  # views, after which every kernel a run needs has been met
+_WARM_UP = 48  # views, after which every kernel a run needs has been met
 _VIEWS = 40
 _SAMPLES = (16, 32, 64)
 _EVERY_MATERIAL = 7  # of the 100, in the measure of noise

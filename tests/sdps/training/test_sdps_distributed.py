@@ -115,7 +115,7 @@ def test_a_batch_that_cannot_be_shared_is_refused(folder: Path, tmp_path: Path) 
         check=False, env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode != 0
-    assert "batch_scenes 3 cannot be shared by 2 processes" in done.stderr[-2000:]
+    assert "batch_scenes 3 cannot be shared by 2 processes" in done.stderr  # torchrun's own lines follow at any length
 
 
 def test_restarts_that_would_hang_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
