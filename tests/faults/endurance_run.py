@@ -23,6 +23,8 @@ for place in (ROOT, ROOT / "tests" / "support"):
     if str(place) not in sys.path:
         sys.path.insert(0, str(place))
 
+from render.shared.progress import progress_bar  # noqa: E402
+
 
 class Held(NamedTuple):
     """What a process holds.
@@ -93,7 +95,7 @@ def watch(task: str, count: int, folder: Path) -> list[Held]:
     """Do a task `count` times; return what was held before, and after every round."""
     once = TASKS[task](folder)
     rows = [held()]
-    for number in range(count):
+    for number in progress_bar(range(count), desc=task):
         began = time.perf_counter()
         once(number)
         rows.append(held(time.perf_counter() - began))
