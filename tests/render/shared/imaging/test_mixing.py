@@ -58,6 +58,20 @@ def test_smooth_light_is_exact_to_a_per_cent():
     assert abs(mirrored / exact - 1) > 0.2  # a mirrored map is noticed
 
 
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_black_pixels_are_left_out_and_change_no_other(dtype: type) -> None:
+    """Some pixels black under all lights, some under a few, or in one channel, or all of them; against a plain sum."""
+    rng = generator(0, "test")
+    images = rng.uniform(0.1, 2.0, (5, 40, 3)).astype(dtype)
+    images[:, 10:30] = 0
+    images[2:, 5] = images[:, 6, 1] = 0
+    weights = rng.uniform(0.0, 1.0, (2, 5, 3)).astype(np.float32)
+    expected = np.einsum("lpc,qlc->qpc", images.astype(np.float64), weights)
+    np.testing.assert_allclose(mix(images, weights), expected, rtol=1e-6)
+    np.testing.assert_array_equal(mix(images[:, ::2], weights), mix(images, weights)[:, ::2])
+    assert not mix(np.zeros_like(images), weights).any()
+
+
 def test_discs_lie_around_their_centre_and_sum_to_one():
     for degrees in (0.0, 3.0, 15.0, 40.0):
         weights = STAGE.disc(np.array(tilted(30, 50)), degrees)
