@@ -1,8 +1,8 @@
 """Do the same work many times in one process and watch what it holds: `python tests/faults/endurance_run.py`.
 
 Tasks: `infer` (a folder of photographs, with networks and the files of `sdps infer`), `render` (small scenes, each of
-another shape and light). After every round memory, open files, threads and child processes are noted; printed as a
-Markdown table and, with --plot, drawn.
+another shape). After every round, of many after every so many, memory, open files, threads and child processes are
+noted; printed as a Markdown table and, with --plot, drawn.
 """
 
 import argparse
@@ -30,13 +30,15 @@ class Held(NamedTuple):
     """What a process holds.
 
     Attributes:
+        round: After so many rounds.
         memory: MiB resident.
         files: Open file descriptors.
         threads: Threads.
         children: Child processes.
-        seconds: Of the round.
+        seconds: Of a round, the mean since the last look.
     """
 
+    round: int
     memory: float
     files: int
     threads: int
@@ -44,7 +46,7 @@ class Held(NamedTuple):
     seconds: float
 
 
-def held(seconds: float = 0.0) -> Held:
+def held(number: int = 0, seconds: float = 0.0) -> Held:
     """Look at this process, after what lies unused has gone back to the system."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
@@ -52,9 +54,8 @@ def held(seconds: float = 0.0) -> Held:
     tasks = list((process / "task").iterdir())
     children = sum(len((task / "children").read_text().split()) for task in tasks)
     pages = int((process / "statm").read_text().split()[1])
-    return Held(
-        pages * os.sysconf("SC_PAGE_SIZE") / 2**20, len(os.listdir(process / "fd")), len(tasks), children, seconds
-    )
+    memory = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+    return Held(number, memory, len(os.listdir(process / "fd")), len(tasks), children, seconds)
 
 
 def infer(folder: Path) -> Callable[[int], Any]:
@@ -75,15 +76,24 @@ def infer(folder: Path) -> Callable[[int], Any]:
 
 
 def render(folder: Path) -> Callable[[int], Any]:
-    """Return what renders one small scene."""
+    """Return what renders one small scene: every fourth a new blob, the others a mesh file that was never read."""
+    import trimesh
+
     from render import api
 
+    ball = trimesh.creation.icosphere(3)
     materials = ("chrome", "pink-plastic", "lambertian:0.8")
     lights = np.array([[0.3, 0.2, 0.9], [-0.5, 0.1, 0.8]])
 
     def once(number: int) -> None:
-        view = api.render_view(f"blobby:{number}", materials[number % 3], lights, size=16, spp=1, seed=number)
+        shape = f"blobby:{number}"
+        if number % 4:
+            shape = str(folder / f"{number}.ply")
+            stretch = np.random.default_rng(number).uniform(0.5, 1.0, 3)
+            trimesh.Trimesh(ball.vertices * stretch, ball.faces).export(shape)
+        view = api.render_view(shape, materials[number % 3], lights, size=16, spp=1, seed=number)
         assert np.isfinite(view.images).all()
+        Path(shape).unlink(missing_ok=True)
 
     return once
 
@@ -92,13 +102,14 @@ TASKS = {"infer": infer, "render": render}
 
 
 def watch(task: str, count: int, folder: Path) -> list[Held]:
-    """Do a task `count` times; return what was held before, and after every round."""
+    """Do a task `count` times; return what was held before, and after every round, of many after every so many."""
     once = TASKS[task](folder)
-    rows = [held()]
-    for number in progress_bar(range(count), desc=task):
-        began = time.perf_counter()
-        once(number)
-        rows.append(held(time.perf_counter() - began))
+    rows, step, began = [held()], max(1, count // 500), time.perf_counter()
+    for number in progress_bar(range(1, count + 1), desc=task):
+        once(number - 1)
+        if number % step == 0 or number == count:
+            rows.append(held(number, (time.perf_counter() - began) / (number - rows[-1].round)))
+            began = time.perf_counter()
     return rows
 
 
@@ -112,7 +123,7 @@ def table(task: str, rows: list[Held]) -> str:
     for number in chosen:
         row = rows[number]
         cells = (
-            number or "before",
+            row.round or "before",
             f"{row.memory:.0f} MiB",
             row.files,
             row.threads,
@@ -129,7 +140,7 @@ def plot(path: Path, rows: list[Held]) -> None:
 
     figure = Figure(figsize=(8, 3), layout="constrained")
     for axes, field, unit in zip(figure.subplots(1, 3), ("memory", "files", "children"), ("MiB", "", ""), strict=True):
-        axes.plot([getattr(row, field) for row in rows])
+        axes.plot([row.round for row in rows], [getattr(row, field) for row in rows])
         axes.set(title=f"{field} {unit}", xlabel="round", ylim=(0, None))
     figure.savefig(path, dpi=100)
 

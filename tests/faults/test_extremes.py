@@ -25,7 +25,7 @@ def test_many_rounds_hold_no_more_than_few(task: str, count: int, tmp_path: Path
 
 
 def test_what_grows_is_seen() -> None:
-    still = [Held(100.0, 5, 2, 0, 0.1)] * 20
+    still = [Held(number, 100.0, 5, 2, 0, 0.1) for number in range(20)]
     assert not grown(still)
     assert grown([row._replace(memory=100.0 + 2 * number) for number, row in enumerate(still)])
     assert grown([row._replace(files=5 + number) for number, row in enumerate(still)])
