@@ -49,7 +49,7 @@ class DataConfig:
         camera_distance: Range of the distance of a perspective camera from the plane of the object's centre, in half
             image widths, drawn as that of lights. The field of view is 2 atan(1 / distance): 28 to 11 degrees.
         size: Image side in pixels, a multiple of 4.
-        spp: Camera samples per pixel.
+        spp: Camera samples per pixel; more did not make trained networks better (docs/studies/renderer.md).
         bounces: Interreflection bounces.
         composition_bounces: The same for compositions, whose objects light each other.
         composition_materials: Fewest and most materials of a composition, each on objects of its own; from 1 to 8.
@@ -82,7 +82,7 @@ class DataConfig:
     camera: str = "orthographic"
     camera_distance: tuple[float, float] = (4.0, 10.0)
     size: int = 128
-    spp: int = 128
+    spp: int = 16
     bounces: int = 2
     composition_bounces: int = 3
     composition_materials: tuple[int, int] = (2, 5)
