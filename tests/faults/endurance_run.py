@@ -1,8 +1,8 @@
 """Do the same work many times in one process and watch what it holds: `python tests/faults/endurance_run.py`.
 
 Tasks: `infer` (a folder of photographs, with networks and the files of `sdps infer`), `render` (small scenes, each of
-another shape). After every round, of many after every so many, memory, open files, threads and child processes are
-noted; printed as a Markdown table and, with --plot, drawn.
+another shape), `train` (steps of one training). After every round, of many after every so many, memory, open files,
+threads and child processes are noted; printed as a Markdown table and, with --plot, drawn.
 """
 
 import argparse
@@ -99,10 +99,43 @@ def render(folder: Path) -> Callable[[int], Any]:
 
 
 TASKS = {"infer": infer, "render": render}
+TRAIN = "train"
+
+
+def watch_training(count: int, folder: Path) -> list[Held]:
+    """Train a normal network on crops of 16x16, with validations and checkpoints; look at it now and then."""
+    from sdps_scenes import write_data
+
+    from sdps.training.stages import NormalStage
+    from sdps.training.trainer import train
+    from sdps.training.training_config import NormalTraining
+
+    write_data(folder / "data", ("train",) * 6 + ("val", "val"), lights=4, size=32)
+    rows, began = [held()], time.perf_counter()
+
+    class Looks:
+        def log(self, step: int, values: dict[str, Any]) -> None:
+            nonlocal began
+            if step > rows[-1].round:  # validations are told for the same step
+                rows.append(held(step, (time.perf_counter() - began) / (step - rows[-1].round)))
+                began = time.perf_counter()
+
+        def close(self) -> None:
+            pass
+
+    config = NormalTraining(
+        steps=count, batch_scenes=2, images=2, size=32, crop=16, lights="true", schedule="constant", clip_gradient=1.0,
+        log_every=max(1, count // 500), validate_every=max(1, count // 50), validation_scenes=2, workers=0,
+        checkpoint_minutes=0.1,
+    )  # fmt: skip
+    train(NormalStage(config), folder / "data", folder / "out", loggers=[Looks()])
+    return rows
 
 
 def watch(task: str, count: int, folder: Path) -> list[Held]:
     """Do a task `count` times; return what was held before, and after every round, of many after every so many."""
+    if task == TRAIN:
+        return watch_training(count, folder)
     once = TASKS[task](folder)
     rows, step, began = [held()], max(1, count // 500), time.perf_counter()
     for number in progress_bar(range(1, count + 1), desc=task):
@@ -128,18 +161,19 @@ def table(task: str, rows: list[Held]) -> str:
             row.files,
             row.threads,
             row.children,
-            f"{row.seconds:.2f}",
+            f"{row.seconds:.3f}",
         )
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines) + "\n"
 
 
 def plot(path: Path, rows: list[Held]) -> None:
-    """Draw memory, files and children over the rounds."""
+    """Draw memory, files and the time of a round over the rounds."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 3), layout="constrained")
-    for axes, field, unit in zip(figure.subplots(1, 3), ("memory", "files", "children"), ("MiB", "", ""), strict=True):
+    fields = {"memory": "MiB", "files": "", "seconds": "a round"}
+    for axes, (field, unit) in zip(figure.subplots(1, 3), fields.items(), strict=True):
         axes.plot([row.round for row in rows], [getattr(row, field) for row in rows])
         axes.set(title=f"{field} {unit}", xlabel="round", ylim=(0, None))
     figure.savefig(path, dpi=100)
@@ -148,7 +182,7 @@ def plot(path: Path, rows: list[Held]) -> None:
 def main() -> int:
     """Run a task; 1 where it holds more at the end than after a fifth of the rounds."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--task", choices=TASKS, default="infer")
+    parser.add_argument("--task", choices=(*TASKS, TRAIN), default="infer")
     parser.add_argument("--count", type=int, default=50)
     parser.add_argument("--plot", type=Path, help="picture of memory, files and children")
     args = parser.parse_args()
