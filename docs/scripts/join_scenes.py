@@ -19,8 +19,13 @@ from render.shared.errors import InputError
 from render.shared.files import atomic_path
 
 
-def join(folders: Sequence[Path], out: Path) -> int:
+def join(folders: Sequence[Path], out: Path, *, first: bool = False) -> int:
     """Write `out`, a data folder, and return its number of scenes.
+
+    Args:
+        folders: Data folders.
+        out: Folder to write.
+        first: Of scenes of one name keep the first folder's, instead of refusing.
 
     Raises:
         InputError: a folder without a manifest, two scenes of one name, no scene at all, or another plan in `out`.
@@ -31,9 +36,12 @@ def join(folders: Sequence[Path], out: Path) -> int:
         for scene in read_manifest(folder):
             if not (folder / scene.file).is_file():
                 continue
+            if scene.id in origins and first:
+                continue
             if scene.id in origins:
                 raise InputError(
-                    f"{folder}: scene {scene.id} is in {origins[scene.id]} too; render different parts with --shard"
+                    f"{folder}: scene {scene.id} is in {origins[scene.id]} too; render different parts with --shard, "
+                    "or add --first"
                 )
             origins[scene.id] = folder
             scenes.append(scene)
@@ -61,9 +69,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="+", type=Path, help="data folders")
     parser.add_argument("--out", type=Path, required=True, help="data folder to write")
+    parser.add_argument("--first", action="store_true", help="of scenes of one name keep the first folder's")
     args = parser.parse_args(arguments)
     try:
-        count = join(args.folders, args.out)
+        count = join(args.folders, args.out, first=args.first)
     except InputError as error:
         sys.stderr.write(f"join_scenes: {error}\n")
         return 2

@@ -45,6 +45,41 @@ def masked_normal_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
     return (sums / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)).mean()
 
 
+_CHORD_FLOOR = 0.02
+
+
+def chord_normal_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean over scenes of the mean distance |n - truth| over the object's pixels, smooth near zero.
+
+    It grows with the angle as the mean angular error does, not with its square as 1 - cos: pixels that nothing can tell
+    do not outweigh all others.
+
+    Args:
+        normals: (B, 3, H, W) unit estimates.
+        truth: (B, 3, H, W) unit normals.
+        mask: (B, 1, H, W), 0 or 1; a scene without object pixels adds zero.
+    """
+    squares = (normals - truth).square().sum(dim=1, keepdim=True)  # (B, 1, H, W)
+    distances = (squares + _CHORD_FLOOR**2).sqrt() - _CHORD_FLOOR
+    return ((distances * mask).sum(dim=(1, 2, 3)) / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)).mean()
+
+
+def expected_error_loss(expected: Tensor, normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
+    """Return how badly expected errors describe those made: the negative log-likelihood of exponential distributions.
+
+    It is least where the expected distance is the mean of those that occur. The normals learn nothing by it.
+
+    Args:
+        expected: (B, 1, H, W) expected distances |n - truth|, positive.
+        normals: (B, 3, H, W) unit estimates.
+        truth: (B, 3, H, W) unit normals.
+        mask: (B, 1, H, W), 0 or 1; a scene without object pixels adds zero.
+    """
+    distances = (normals.detach() - truth).norm(dim=1, keepdim=True)
+    each = (distances / expected + expected.log()) * mask
+    return (each.sum(dim=(1, 2, 3)) / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)).mean()
+
+
 def normal_gradient_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
     """Return the mean over scenes of the mean error of the step from a pixel to its neighbour, |x| + |y| + |z|.
 

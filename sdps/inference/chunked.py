@@ -17,7 +17,6 @@ from torch.nn import functional
 
 from render.shared.progress import stage
 from sdps.inference.turned_views import AnyView
-from sdps.models.attention import AttentionNet
 from sdps.models.base import LightingNetwork, Lights, NormalNetwork, divide
 from sdps.models.observation_maps import predict_normals
 
@@ -65,19 +64,19 @@ def normal_map(network: NormalNetwork, view: AnyView, lights: Lights | None, aut
     """
     brightness = None if network.division == "none" else _brightness(network, view, lights)
     mask = view.mask
-    feature: Tensor | None = None
-    kept: list[Tensor] = []
+    feature: Any = None
+    kept: list[Any] = []
     for part, images in view:
         some = None if lights is None else Lights(lights.directions[:, part], lights.intensities[:, part])
         seen = network.observe(images, mask, some, brightness)
         with autocast():
-            if isinstance(network, AttentionNet):
+            if network.keeps:
                 kept.append(network.kept(seen))
             else:
                 feature = _maximum(feature, network.encode(seen))
         stage("normals", part.stop, len(view))
     with autocast():
-        if isinstance(network, AttentionNet):
+        if network.keeps:
             feature = network.fused(kept)
         assert feature is not None  # a view has an image
         return network.regress(feature).float()

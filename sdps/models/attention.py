@@ -68,6 +68,8 @@ class AttentionNet(MaxFusionNet):
         InputError: an unknown division, or a negative number of blocks.
     """
 
+    keeps = True
+
     def __init__(self, *, blocks: int = 3, division: Division = "max", shading: bool = True) -> None:
         if division not in DIVISIONS:
             raise unknown("division", str(division), DIVISIONS)

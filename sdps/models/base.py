@@ -109,12 +109,15 @@ class NormalNetwork(nn.Module, ABC):
         division: Images are divided by each pixel's `norm` over all lights and channels (PS-FCN (Norm.), Chen et al.,
             TPAMI 2020), or by its `max`imum (ESSENCE-Net), which takes albedo away and leaves shading.
         size_multiple: Sides of images must be multiples of it.
+        keeps: Its lights meet pixel by pixel, so that a maximum over images does not do: `kept` takes of some images
+            what is needed of them, and `fused` makes the feature of all of it.
     """
 
     needs_lights: bool = True
     needs_mask: bool = False
     division: Division = "none"
     size_multiple: int = 4
+    keeps: bool = False
 
     def observe(
         self,
@@ -154,12 +157,20 @@ class NormalNetwork(nn.Module, ABC):
         return images.float().square().mean(dim=(1, 2), keepdim=True).clamp(min=1e-14)
 
     @abstractmethod
-    def encode(self, seen: Observations) -> Tensor:
-        """Return the maximum over the features of the given images."""
+    def encode(self, seen: Observations) -> Any:
+        """Return the feature of the given images, a maximum over theirs unless the network `keeps`."""
 
     @abstractmethod
-    def regress(self, feature: Tensor) -> Tensor:
+    def regress(self, feature: Any) -> Tensor:
         """Return unit normals (B, 3, H, W), float32, of the aggregated feature."""
+
+    def kept(self, seen: Observations) -> Any:
+        """Return what `fused` needs of some of a scene's images; of networks that keep."""
+        raise NotImplementedError
+
+    def fused(self, parts: list[Any]) -> Any:
+        """Return the feature of all of a scene's images, without gradients; of networks that keep."""
+        raise NotImplementedError
 
     def forward(self, seen: Observations) -> Tensor:
         """Return unit normals (B, 3, H, W)."""

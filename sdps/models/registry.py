@@ -16,6 +16,7 @@ from render.shared.config import read_yaml
 from render.shared.errors import InputError, unknown
 from sdps.models.attention import AttentionNet
 from sdps.models.cnnps import CNNPS
+from sdps.models.frames import FrameNet
 from sdps.models.lcnet import LCNet
 from sdps.models.lighting_variants import LCNetReg, LCNetSecond, LCNetSoft
 from sdps.models.nenet import NENet
@@ -97,7 +98,7 @@ def _entries() -> tuple[dict[str, ModelEntry], dict[str, Combination]]:
 
 NETWORKS: dict[str, type[nn.Module]] = {
     kind.__name__: kind
-    for kind in (LCNet, LCNetReg, LCNetSoft, LCNetSecond, NENet, AttentionNet, UPSFCN, UPSFCNLight, CNNPS)
+    for kind in (LCNet, LCNetReg, LCNetSoft, LCNetSecond, NENet, AttentionNet, FrameNet, UPSFCN, UPSFCNLight, CNNPS)
 }
 MODELS, COMBINATIONS = _entries()
 

@@ -14,13 +14,21 @@ from torch.nn import functional
 
 from render.shared.seeds import derived_seed, generator
 from sdps.core.lighting import ReadOut
-from sdps.core.losses import faithful_normal_loss, masked_normal_loss, normal_gradient_loss, shading_loss
+from sdps.core.losses import (
+    chord_normal_loss,
+    expected_error_loss,
+    faithful_normal_loss,
+    masked_normal_loss,
+    normal_gradient_loss,
+    shading_loss,
+)
 from sdps.core.metrics import angle_degrees, direction_mae, intensity_error
 from sdps.data.dataset import Batch, SampleOptions
 from sdps.models import registry
 from sdps.models.attention import AttentionNet
 from sdps.models.base import LightingNetwork, Lights, NormalNetwork, Observations
 from sdps.models.checkpoint import TrainedModel
+from sdps.models.frames import FrameNet
 from sdps.models.lcnet import resize_input
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.models.upsfcn import UPSFCNLight
@@ -186,6 +194,8 @@ class NormalStage(Stage):
     def training_lights(self, batch: Batch) -> Lights | None:
         """Return the lights the network is given in training, some of the way towards the true ones (`light_blend`)."""
         lights, limit = self.lights(batch), self.config.light_blend
+        if lights is not None and self.config.light_error:
+            lights = disturbed(lights, batch.seed.tolist(), self.config.light_error)
         if self.lighting is None or lights is None or not limit:
             return lights
         drawn = [generator(seed, "light_blend").uniform(0.0, limit) for seed in batch.seed.tolist()]
@@ -235,6 +245,12 @@ def normal_loss(
         mask: (B, 1, H, W), 0 or 1.
         directions: (B, Q, 3), the true ones.
     """
+    if isinstance(network, FrameNet):
+        staged = network.staged(seen)
+        loss, terms = plain_normal_loss(config, staged.normals, truth, mask)
+        terms["pixel_loss"], _ = plain_normal_loss(config, staged.alone, truth, mask)
+        terms["expected_loss"] = expected_error_loss(staged.expected, staged.normals, truth, mask)
+        return loss + terms["pixel_loss"] + config.expected_weight * terms["expected_loss"], terms
     if not (isinstance(network, AttentionNet) and network.shades and config.shading_weight):
         return plain_normal_loss(config, network(seen), truth, mask)
     normals, maps = network.with_shading(seen)
@@ -248,11 +264,41 @@ def plain_normal_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the loss of estimated normals alone, and named parts; see `normal_loss`."""
     masked = masked_normal_loss(normals, truth, mask)
-    loss, terms = masked if config.loss == "masked" else faithful_normal_loss(normals, truth), {"masked_loss": masked}
+    loss, terms = masked, {"masked_loss": masked}
+    if config.loss == "chord":
+        loss = chord_normal_loss(normals, truth, mask)
+    elif config.loss == "faithful":
+        loss = faithful_normal_loss(normals, truth)
     if config.gradient_weight:
         terms["gradient_loss"] = normal_gradient_loss(normals, truth, mask)
         loss = loss + config.gradient_weight * terms["gradient_loss"]
     return loss, terms
+
+
+_BENT, _SCATTERED, _UNEVEN = 0.10, 0.06, 0.08
+"""How far `disturbed` moves lights: all alike, each by itself, and in intensity."""
+
+
+def disturbed(lights: Lights, seeds: list[int], limit: float) -> Lights:
+    """Return lights with errors like those of estimated ones, drawn for each scene.
+
+    A linear map bends the directions of a scene alike, as a relief that is taken too flat or too deep does; each light
+    strays by itself; intensities err with the direction, and by themselves. A scene's share of all that is drawn
+    evenly from 0 to `limit`.
+    """
+    directions, intensities = [], []
+    for scene, seed in enumerate(seeds):
+        rng = generator(seed, "light_error")
+        share, count = rng.uniform(0.0, limit), lights.directions.shape[1]
+        bend = np.eye(3) + share * _BENT * rng.standard_normal((3, 3))
+        own = share * _SCATTERED * rng.standard_normal((count, 3))
+        slope, noise = share * _UNEVEN * rng.standard_normal(3), share * _UNEVEN * rng.standard_normal(count)
+        given = lights.directions[scene].cpu().numpy()
+        directions.append(given @ bend.T + own)
+        intensities.append(np.exp(given @ slope + noise))
+    moved = torch.from_numpy(np.stack(directions)).to(lights.directions)
+    factors = torch.from_numpy(np.stack(intensities)).to(lights.intensities)
+    return Lights(functional.normalize(moved, dim=-1), lights.intensities * factors)
 
 
 def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:

@@ -179,33 +179,39 @@ class NormalTraining(TrainingConfig):
     """Models that give normals, on the lights of a frozen lighting model, on true lights, or on none.
 
     Attributes:
-        loss: `masked` averages over the object, `faithful` over all pixels as the authors' code does.
+        loss: 1 - cos, averaged over the object (`masked`) or over all pixels as the authors' code does (`faithful`); or
+            the distance of the unit vectors, averaged over the object (`chord`).
         lights: The run of a lighting model, `shipped:<name>`, a `.safetensors` file, or `true`; empty: what the
             model's registry entry names.
         read_out: How light classes become lights: `centre` (argmax, the paper's), `expectation` (soft-argmax) or
             `peak` (parabolic).
         light_blend: Largest share of the way to the true lights that estimated ones are moved, drawn evenly for each
             training sample. Many images and test-time augmentation give better lights than a sample's few images.
+        light_error: Size of the errors drawn onto the lights in training, 1 for those of lights estimated from few
+            images. So a network learns what estimated lights are worth, and no lighting model has to run.
         crop: Side of the random crop the network sees (0: the whole image); the lighting model always sees the whole.
         min_object: Least share of object pixels a crop should have; the best of a few draws is taken.
         lighting_weight: Weight of the lighting loss beside the normal loss, for models that learn both.
         gradient_weight: Weight of the error of the normals' steps from pixel to pixel.
         shading_weight: Weight of the errors of the shading maps, for models that learn them.
+        expected_weight: Weight of the errors of the expected error, for models that learn it.
         options: Options of the network over those of its registry entry, for variants of a model.
     """
 
     epochs: float = 10.0
     batch_scenes: int = 16
     halve_after: tuple[float, ...] = (2.0, 4.0, 6.0, 8.0)
-    loss: Literal["masked", "faithful"] = "masked"
+    loss: Literal["masked", "faithful", "chord"] = "masked"
     lights: str = ""
     read_out: ReadOut = "centre"
     light_blend: float = 0.0
+    light_error: float = 0.0
     crop: int = 0
     min_object: float = 0.3
     lighting_weight: float = 0.1
     gradient_weight: float = 0.0
     shading_weight: float = 0.0
+    expected_weight: float = 0.02
     options: dict[str, bool | int | float | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -216,7 +222,15 @@ class NormalTraining(TrainingConfig):
             raise InputError(f"light_blend must be in [0, 1], got {self.light_blend}")
         if not 0.0 <= self.min_object < 1.0:
             raise InputError(f"min_object must be in [0, 1), got {self.min_object}")
-        check_fields(self, "not negative", "lighting_weight", "gradient_weight", "shading_weight")
+        check_fields(
+            self,
+            "not negative",
+            "light_error",
+            "lighting_weight",
+            "gradient_weight",
+            "shading_weight",
+            "expected_weight",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

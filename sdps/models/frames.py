@@ -1,0 +1,212 @@
+"""A normal network that sees every pixel in the frame of a first normal, and context only after the lights are fused.
+
+What a pixel of an isotropic material shows depends on the angles between its normal, the lights and the view, and on
+nothing else. So each pixel's lights are turned into the frame of a first normal, found by robust least squares: z along
+it, the view in the plane of x and z. There all normals are near z, whatever way the surface faces, and one pixel
+teaches what others of another orientation need. Images of a pixel meet by their mean and maximum (as in Deep Sets,
+Zaheer et al., NeurIPS 2017), a few times over, without convolutions; convolutions see the fused map, once for a scene
+and not once for an image.
+
+Legend: B scenes, Q images of a scene, H and W the sides, N pixels of all objects, C channels.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from render.shared.errors import InputError, unknown
+from sdps.core.first_normals import first_normals, frames
+from sdps.models.base import NormalNetwork, Observations
+from sdps.models.blocks import SLOPE, conv, deconv
+
+FRAMES = ("normal", "camera")
+_SEEN, _KNOWN = 10, 7
+"""Values of a pixel under one light, and those it has under all."""
+_DARK = 1e-3
+"""Radiance below which nothing is seen; full scale is 1."""
+_MAP = 32
+"""Channels of the fused map besides the normals."""
+_LOG_USUAL = -2.0
+"""Logarithm of the error that an untrained network expects: 8 degrees."""
+_STRIP = 2**16
+"""Pixels times lights that are worked on at once in inference."""
+
+
+class Exchange(nn.Module):
+    """A layer for each light of a pixel that also sees the mean and the maximum over its lights."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.own = nn.Linear(width, 2 * width)
+        self.shared = nn.Linear(2 * width, 2 * width, bias=False)
+        self.out = nn.Linear(2 * width, width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return tokens (N, Q, C) that know of each other; their order does not matter."""
+        seen = self.norm(tokens)
+        shared = self.shared(pooled(seen))[:, None]
+        return tokens + self.out(functional.leaky_relu(self.own(seen) + shared, SLOPE))
+
+
+class Pixels(NamedTuple):
+    """Object pixels under their lights."""
+
+    values: Tensor  # (N, Q, 3) float32, exposed images over the light intensities
+    directions: Tensor  # (N, Q, 3) float32, unit
+
+
+class FusedMap(NamedTuple):
+    """What is known of every pixel once all lights were seen."""
+
+    normals: Tensor  # (B, 3, H, W) float32, unit on the object
+    feature: Tensor  # (B, 32, H, W)
+    mask: Tensor  # (B, 1, H, W)
+
+
+class StagedNormals(NamedTuple):
+    """What `FrameNet` predicts while it is trained."""
+
+    alone: Tensor  # (B, 3, H, W) unit, by pixels alone
+    normals: Tensor  # (B, 3, H, W) unit, corrected by their surroundings
+    expected: Tensor  # (B, 1, H, W), distance to the true normals
+
+
+class FrameNet(NormalNetwork):
+    """Normals pixel by pixel in frames of their own, then corrected by their surroundings.
+
+    Args:
+        width: C, channels of a light of a pixel.
+        blocks: Layers in which the lights of a pixel exchange what they know.
+        frame: `normal` for the frame of the first normal; `camera` leaves directions as they are, to compare.
+    """
+
+    needs_mask = True
+    keeps = True
+
+    def __init__(self, *, width: int = 64, blocks: int = 4, frame: str = "normal") -> None:
+        super().__init__()
+        if blocks < 1 or width < 1:
+            raise InputError(f"width and blocks must be at least 1, got {width} and {blocks}")
+        if frame not in FRAMES:
+            raise unknown("frame", str(frame), FRAMES)
+        self.frame = frame
+        self.seen, self.known = nn.Linear(_SEEN, width), nn.Linear(_KNOWN, width)
+        self.exchange = nn.Sequential(*(Exchange(width) for _ in range(blocks)))
+        self.fuse = nn.Sequential(
+            nn.Linear(2 * width + _KNOWN, 128), nn.LeakyReLU(SLOPE), nn.Linear(128, 128), nn.LeakyReLU(SLOPE)
+        )
+        self.offset, self.feature = nn.Linear(128, 3), nn.Linear(128, _MAP)
+        self.enter = nn.Sequential(conv(_MAP + 4, 64), conv(64, 64))
+        self.smaller = nn.Sequential(conv(64, 96, stride=2), conv(96, 96))
+        self.quarter = nn.Sequential(conv(96, 128, stride=2), conv(128, 128), conv(128, 128), deconv(128, 96))
+        self.back = nn.Sequential(conv(192, 96), deconv(96, 64))
+        self.leave = nn.Sequential(conv(128, 64), nn.Conv2d(64, 4, 3, padding=1))
+        # Training begins at the first normals.
+        for parameter in (*self.offset.parameters(), *self.leave[-1].parameters()):
+            nn.init.zeros_(parameter)
+
+    def forward(self, seen: Observations) -> Tensor:
+        return self.regress(self.encode(seen))
+
+    def staged(self, seen: Observations) -> StagedNormals:
+        """Return what is learned: the normals of pixels alone, the corrected ones, and the error to expect of these."""
+        fused = self.encode(seen)
+        return StagedNormals(fused.normals, *self.corrected(fused))
+
+    def encode(self, seen: Observations) -> FusedMap:
+        """Return the fused map of all of a scene's images."""
+        inside, pixels = object_pixels(seen)
+        return self._mapped(self._per_pixel(pixels), inside)
+
+    def regress(self, feature: FusedMap) -> Tensor:
+        return self.corrected(feature)[0]
+
+    def corrected(self, feature: FusedMap) -> tuple[Tensor, Tensor]:
+        """Return unit normals (B, 3, H, W), float32, and the expected distance (B, 1, H, W) to the true ones."""
+        normals, fused, mask = feature
+        entered = self.enter(torch.cat([normals.to(fused.dtype), fused, mask.to(fused.dtype)], dim=1))
+        half = self.smaller(entered)
+        back = self.back(torch.cat([self.quarter(half), half], dim=1))
+        change = self.leave(torch.cat([back, entered], dim=1)).float()
+        return functional.normalize(normals + change[:, :3], dim=1), (change[:, 3:] + _LOG_USUAL).exp()
+
+    def kept(self, seen: Observations) -> Observations:
+        """Return some of a scene's images, in 16 bits, for `fused`."""
+        return seen._replace(images=seen.images.half())
+
+    def fused(self, parts: list[Observations]) -> FusedMap:
+        """Return the fused map of all of a scene's images, a few pixels at a time, without gradients."""
+        images = torch.cat([part.images for part in parts], dim=1)
+        directions = torch.cat([part.directions for part in parts if part.directions is not None], dim=1)
+        seen = Observations(images, directions, parts[0].mask)
+        inside, pixels = object_pixels(seen)
+        count = max(1, _STRIP // images.shape[1])
+        found = [
+            self._per_pixel(Pixels(*(part.float() for part in some)))
+            for some in zip(*(each.split(count) for each in pixels), strict=True)
+        ]
+        return self._mapped(torch.cat(found) if found else pixels.values.new_zeros(0, 3 + _MAP), inside)
+
+    def _per_pixel(self, pixels: Pixels) -> Tensor:
+        """Return normals and features of pixels, (N, 3 + 32)."""
+        with torch.no_grad(), torch.autocast(pixels.values.device.type, enabled=False):
+            first, scale, residual = first_normals(*pixels)
+            camera = torch.eye(3, device=first.device).expand(len(first), 3, 3)
+            axes = frames(first) if self.frame == "normal" else camera  # (N, 3, 3)
+            start = (axes @ first[..., None])[..., 0]  # the first normal in the frame
+            seen, known = described(pixels, axes, start, scale, residual)
+        tokens = self.exchange(self.seen(seen) + self.known(known)[:, None])  # (N, Q, C)
+        fused = self.fuse(torch.cat([pooled(tokens), known.to(tokens.dtype)], dim=-1))  # (N, 128)
+        # Never under autocast: a normal rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
+        with torch.autocast(fused.device.type, enabled=False):
+            local = functional.normalize(start + self.offset(fused.float()), dim=-1)
+            normals = (local[:, None] @ axes)[:, 0]
+            return torch.cat([normals, self.feature(fused.float())], dim=1)
+
+    def _mapped(self, found: Tensor, inside: Tensor) -> FusedMap:
+        """Return what was found of the object's pixels, (N, 3 + 32), in its place; `inside` (B, H, W) bool."""
+        places = found.new_zeros(*inside.shape, found.shape[1])
+        places[inside] = found
+        places = places.permute(0, 3, 1, 2)
+        return FusedMap(places[:, :3], places[:, 3:], inside[:, None].float())
+
+
+def pooled(tokens: Tensor) -> Tensor:
+    """Return mean and maximum (N, 2 C) over the lights of tokens (N, Q, C)."""
+    return torch.cat([tokens.mean(dim=1), tokens.max(dim=1).values], dim=-1)
+
+
+def object_pixels(seen: Observations) -> tuple[Tensor, Pixels]:
+    """Return where the object is, (B, H, W) bool, and its pixels in reading order."""
+    assert seen.mask is not None and seen.directions is not None  # the network asks for both
+    inside = seen.mask[:, 0] > 0.5
+    values = seen.images.permute(0, 3, 4, 1, 2)[inside]  # (N, Q, 3)
+    which = torch.arange(len(inside), device=inside.device).repeat_interleave(inside.flatten(1).sum(1))
+    return inside, Pixels(values, seen.directions[which].to(values.dtype))
+
+
+def described(pixels: Pixels, axes: Tensor, start: Tensor, scale: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what the network is told of each light of a pixel, (N, Q, 10), and of the pixel, (N, 7).
+
+    Args:
+        pixels: What they showed.
+        axes: (N, 3, 3), rows are x, y and z of each pixel's frame.
+        start: (N, 3), the first normal in the frame.
+        scale: (N, 3), radiance of a Lambertian surface of the pixel's colour that faces the light.
+        residual: (N,), mean absolute error of that surface, relative to `scale`.
+    """
+    values, directions = pixels
+    relative = values / (scale + 0.1 * scale.mean(dim=1, keepdim=True) + _DARK)[:, None]  # all equal on matte surfaces
+    local = directions @ axes.transpose(1, 2)  # (N, Q, 3)
+    view = axes[:, :, 2]  # (N, 3), z of the camera
+    half = functional.normalize(local + view[:, None], dim=-1)
+    # Brightness as it was exposed tells what is noise and what is clipped. The inverse hyperbolic sine keeps highlights
+    # in range, and zero at zero.
+    brightness = torch.asinh(4.0 * values.mean(dim=-1, keepdim=True))
+    seen = torch.cat([torch.asinh(2.0 * relative), local, half, brightness], dim=-1)
+    facing = (view * start).sum(dim=1, keepdim=True)
+    known = torch.cat([start[:, :2], facing, torch.log(scale + _DARK), residual[:, None]], dim=-1)
+    return seen, known

@@ -1,0 +1,174 @@
+"""The network that sees pixels in frames of their own, its first normals, and light errors in training."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from render.shared.errors import InputError
+from sdps.core.first_normals import first_normals, frames
+from sdps.models.base import Lights, Observations
+from sdps.models.blocks import parameter_count
+from sdps.models.frames import FrameNet, Pixels, described, object_pixels
+from sdps.models.observation_maps import rotate_about_view
+from sdps.models.registry import MODELS
+from sdps.training import recipes
+from sdps.training.stage_factory import create_stage
+from sdps.training.stages import disturbed
+
+
+def unit(*shape: int) -> Tensor:
+    """Return random unit vectors that look at the camera."""
+    vectors = torch.randn(*shape, 3)
+    vectors[..., 2] = vectors[..., 2].abs() + 0.5
+    return functional.normalize(vectors, dim=-1)
+
+
+def observations(images: int, side: int = 8) -> Observations:
+    mask = torch.zeros(1, 1, side, side)
+    mask[..., 1:-1, 2:] = 1.0
+    return Observations(torch.rand(1, images, 3, side, side), unit(1, images), mask)
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    torch.manual_seed(7)
+
+
+@pytest.fixture
+def trained() -> FrameNet:
+    """Return a network whose last layers are no longer zero."""
+    network = FrameNet(width=16, blocks=2).eval()
+    for last in (network.offset, network.leave[-1]):
+        torch.nn.init.normal_(last.weight, std=0.1)
+    return network
+
+
+def test_a_lambertian_pixel_is_fitted_exactly_but_for_the_ridge():
+    normals, lights = unit(50), unit(50, 20)
+    colour = torch.rand(50, 3) + 0.1
+    shading = torch.einsum("nqi,ni->nq", lights, normals).clamp(min=0.0)
+    found, scale, error = first_normals(shading[..., None] * colour[:, None], lights)
+    angles = torch.rad2deg((found * normals).sum(-1).clamp(-1.0, 1.0).acos())
+    assert angles.mean() < 0.5
+    torch.testing.assert_close(scale, colour, rtol=0.03, atol=0.01)
+    assert error.max() < 0.03
+
+
+def test_a_highlight_moves_the_first_normal_less_than_least_squares():
+    normals, lights = unit(40), unit(40, 32)
+    half = functional.normalize(lights + torch.tensor([0.0, 0.0, 1.0]), dim=-1)
+    shading = torch.einsum("nqi,ni->nq", lights, normals).clamp(min=0.0)
+    gloss = 3.0 * torch.einsum("nqi,ni->nq", half, normals).clamp(min=0.0) ** 60 * (shading > 0)
+    grey = 0.5 * shading + gloss
+    plain = functional.normalize(torch.linalg.lstsq(lights, grey[..., None]).solution[..., 0], dim=-1)
+    found, *_ = first_normals(grey[..., None].expand(-1, -1, 3), lights)
+    errors = [(normals * each).sum(-1).clamp(-1.0, 1.0).acos().mean() for each in (found, plain)]
+    assert errors[0] < 0.5 * errors[1]
+
+
+@pytest.mark.parametrize("values", [0.0, -0.01])
+def test_a_black_pixel_has_a_normal(values):
+    found, scale, error = first_normals(torch.full((3, 5, 3), values), unit(3, 5))
+    assert torch.isfinite(found).all() and (found[:, 2] > 0).all()
+    assert (scale == 0).all() and torch.isfinite(error).all()
+
+
+def test_a_frame_has_the_normal_along_z_and_the_view_in_its_xz_plane():
+    normals = torch.cat([unit(30), torch.tensor([[0.0, 0.0, 1.0], [1e-5, 0.0, 1.0]])])
+    axes = frames(functional.normalize(normals, dim=-1))
+    torch.testing.assert_close(axes @ axes.transpose(1, 2), torch.eye(3).expand(len(axes), 3, 3), atol=1e-4, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(axes), torch.ones(len(axes)), atol=1e-4, rtol=0)
+    view = axes[:30, :, 2]
+    assert view[:, 1].abs().max() < 1e-5 and (view[:, 0] >= 0).all()
+
+
+def test_what_a_pixel_is_told_does_not_change_when_it_turns_about_the_view():
+    values, lights = torch.rand(20, 9, 3), unit(20, 9)
+    turned = rotate_about_view(lights, 1.1)
+    told = []
+    for directions in (lights, turned):
+        first, scale, error = first_normals(values, directions)
+        axes = frames(first)
+        start = (axes @ first[..., None])[..., 0]
+        told.append(described(Pixels(values, directions), axes, start, scale, error))
+    for one, other in zip(*told, strict=True):
+        torch.testing.assert_close(one, other, atol=2e-3, rtol=1e-3)
+
+
+def test_pixels_alone_turn_with_their_lights(trained):
+    seen = observations(9)
+    turned = seen._replace(directions=rotate_about_view(seen.directions, 0.7))
+    with torch.no_grad():
+        one, other = (trained.encode(each).normals.permute(0, 2, 3, 1)[seen.mask[:, 0] > 0] for each in (seen, turned))
+    torch.testing.assert_close(rotate_about_view(one, 0.7), other, atol=5e-3, rtol=0)
+
+
+def test_neither_order_nor_chunks_of_images_matter(trained, monkeypatch):
+    monkeypatch.setattr("sdps.models.frames._STRIP", 64)
+    seen, order = observations(9), torch.randperm(9)
+    shuffled = seen._replace(images=seen.images[:, order], directions=seen.directions[:, order])
+    parts = [seen._replace(images=seen.images[:, part], directions=seen.directions[:, part])
+             for part in (slice(0, 4), slice(4, 9))]  # fmt: skip
+    with torch.no_grad():
+        whole = trained(seen)
+        torch.testing.assert_close(trained(shuffled), whole, atol=1e-4, rtol=0)
+        chunked = trained.regress(trained.fused([trained.kept(part) for part in parts]))
+    torch.testing.assert_close(chunked, whole, atol=0.02, rtol=0)  # images are kept in 16 bits
+
+
+def test_an_untrained_network_gives_the_first_normals():
+    network, seen = FrameNet().eval(), observations(12)
+    inside, pixels = object_pixels(seen)
+    with torch.no_grad():
+        found = network(seen).permute(0, 2, 3, 1)[inside]
+    torch.testing.assert_close(found, first_normals(*pixels)[0], atol=1e-4, rtol=0)
+
+
+def test_a_mask_without_pixels_gives_a_map(trained):
+    seen = observations(5)
+    with torch.no_grad():
+        assert torch.isfinite(trained(seen._replace(mask=torch.zeros_like(seen.mask)))).all()
+
+
+def test_size_and_options():
+    assert parameter_count(FrameNet()) == MODELS["frames"].parameters <= 3_000_000
+    for options in ({"width": 0}, {"blocks": 0}):
+        with pytest.raises(InputError, match="must be at least 1"):
+            FrameNet(**options)
+    with pytest.raises(InputError, match="camera"):
+        FrameNet(frame="camra")
+
+
+def test_light_errors_are_those_of_the_seed_and_grow_with_the_limit():
+    lights = Lights(unit(2, 40), torch.rand(2, 40) + 0.5)
+    one, again, none = (disturbed(lights, [3, 4], limit) for limit in (1.0, 1.0, 0.0))
+    torch.testing.assert_close(one.directions, again.directions)
+    torch.testing.assert_close(none.directions, lights.directions)
+    torch.testing.assert_close(none.intensities, lights.intensities)
+    many = [disturbed(lights, [seed, seed + 1], 1.0) for seed in range(0, 200, 2)]
+    angles = torch.stack([(each.directions * lights.directions).sum(-1).clamp(-1, 1).acos() for each in many])
+    assert 4.0 < math.degrees(angles.mean()) < 9.0
+    assert all((each.intensities > 0).all() for each in many)
+
+
+def test_training_lights_err_and_validation_lights_do_not():
+    run = recipes.run("frames", {}, {})
+    assert run.config.light_error == 1.0
+    stage = create_stage("frames", "frames", run.config, {})
+    batch = _batch()
+    assert not torch.equal(stage.training_lights(batch).directions, batch.directions)
+    assert torch.equal(stage.lights(batch).directions, batch.directions)
+    loss, terms = stage.loss(batch)
+    assert np.isfinite(float(loss)) and {"masked_loss", "pixel_loss"} <= terms.keys()
+
+
+def _batch():
+    from sdps.data.dataset import Batch
+
+    seen = observations(6, 16)
+    return Batch(seen.images, seen.mask, unit(1, 16, 16).permute(0, 3, 1, 2) * seen.mask, seen.directions,
+                 torch.ones(1, 6), torch.zeros(1, 2, dtype=torch.int64), torch.tensor([5]))  # fmt: skip
