@@ -138,6 +138,10 @@ def _section(result: "Inference") -> SectionWriter:
     writer.strip("Under lights of our choice (matt, with cast shadows)", relit)
     if "refined" in result.estimate.diagnostics:
         writer.strip("Refinement", _refinement_pictures(result, box))
+    elif result.expected_error is not None:
+        expected = np.where(result.photos.mask, result.expected_error, np.nan)
+        tile = Tile("error to expect (yellow: 20 degrees)", pictures.error_map(expected, 20.0)[box])
+        writer.strip("How sure the network is", [tile])
     return writer
 
 
@@ -200,6 +204,8 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
     if result.residuals is not None:
         rows.append(("photographs against Lambert's law, relative RMS", f"{result.residuals.overall:.3f}"))
     rows += _refinement_rows(facts)
+    if "expected_normal_error_degrees" in facts and "refined" not in facts:
+        rows.append(("error of the normals to expect", f"{facts['expected_normal_error_degrees']}°"))
     note = f"Terms of the weights: {facts['terms']}." if facts["terms"] else ""
     tables = [checks, Table(title="Figures", header=("what", "value"), rows=tuple(rows), note=note)]
     if len(result.light_directions):

@@ -53,8 +53,10 @@ def lighting_prediction(
     return type(predictions[0])(*(torch.cat(parts, dim=1) for parts in zip(*predictions, strict=True)))
 
 
-def normal_map(network: NormalNetwork, view: AnyView, lights: Lights | None, autocast: Autocast) -> Tensor:
-    """Return a normal network's unit normals (1, 3, h, w), float32.
+def normal_map(
+    network: NormalNetwork, view: AnyView, lights: Lights | None, autocast: Autocast
+) -> tuple[Tensor, Tensor | None]:
+    """Return a normal network's unit normals (1, 3, h, w), float32, and the errors it expects of them.
 
     Args:
         network: In evaluation mode.
@@ -79,7 +81,8 @@ def normal_map(network: NormalNetwork, view: AnyView, lights: Lights | None, aut
         if network.keeps:
             feature = network.fused(kept)
         assert feature is not None  # a view has an image
-        return network.regress(feature).float()
+        normals, expected = network.regress_with_error(feature)
+        return normals.float(), expected
 
 
 def _brightness(network: NormalNetwork, view: AnyView, lights: Lights | None) -> Tensor:

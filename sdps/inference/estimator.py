@@ -122,7 +122,8 @@ class Estimator(InferenceConfig):
             The estimate. Directions or intensities that nobody gave, estimated or assumed are empty, (0, 3) and (0,),
             so that scoring them is refused. Diagnostics hold `seconds`, `precision` (what was computed in), `exposure`
             (factor applied for each network), `stray_light` (L, 3) (taken off before that) and, where classes of light
-            were estimated, `confidence` (L,), the product of the probabilities of the two likeliest direction classes.
+            were estimated, `confidence` (L,), the product of the probabilities of the two likeliest direction classes;
+            of normal models that tell it, `expected_error` (H, W), the error to expect in degrees, 0 off the object.
 
         Raises:
             InputError: sizes that do not fit, non-finite values, an empty mask, lights wanted without a lighting
@@ -188,8 +189,13 @@ class Estimator(InferenceConfig):
         model = self._normal_model()
         multiple = 1 if model.role == "pixels" else cast(NormalNetwork, model.network).size_multiple
         view = self._view(scene, "normals", known.balance, pad_to(multiple), scene.mask.size, diagnostics)
-        box = self._normals(view, lit)[0].permute(1, 2, 0).cpu().numpy()  # padded
-        box = box[: scene.mask.shape[0], : scene.mask.shape[1]]
+        normals, expected = self._normals(view, lit)  # padded
+        rows, columns = scene.mask.shape
+        if expected is not None:
+            whole = np.zeros(scene.shape, np.float32)
+            whole[scene.rows, scene.columns] = expected[0, 0, :rows, :columns].cpu().numpy() * scene.mask
+            diagnostics["expected_error"] = whole
+        box = normals[0].permute(1, 2, 0).cpu().numpy()[:rows, :columns]
         return np.where(scene.mask[..., None], box, np.float32(0.0))
 
     def _estimate_lights(self, scene: ObjectImages, known: _Known, diagnostics: dict[str, Any]) -> Lights:
@@ -199,7 +205,7 @@ class Estimator(InferenceConfig):
         if self.second is not None:
             first = self._merged(known, lights)
             small = self._view(scene, "normals", known.balance, resize_input, INPUT_SIZE**2, diagnostics)
-            normals, mask = self._normals(small, first), small.mask
+            normals, mask = self._normals(small, first)[0], small.mask
 
             def context(part: slice) -> Tensor:
                 return LCNetSecond.context(normals, mask, first.directions[:, part])
@@ -233,20 +239,23 @@ class Estimator(InferenceConfig):
             found.append((symmetry, network.lights(prediction, read_out)))
         return mean_lights(found)
 
-    def _normals(self, view: View, lights: Lights | None) -> Tensor:
-        """Return normals (1, 3, h, w) of a view, with test-time augmentation."""
+    def _normals(self, view: View, lights: Lights | None) -> tuple[Tensor, Tensor | None]:
+        """Return normals (1, 3, h, w) of a view, with test-time augmentation, and errors to expect, (1, 1, h, w)."""
         model = self._normal_model()
         if model.role == "pixels":
             assert lights is not None  # these models need lights
-            return pixel_normal_map(model.network, view, lights, self.arithmetic.autocast, rotations=self.rotations)
-        network, found = cast(NormalNetwork, model.network), []
+            autocast = self.arithmetic.autocast
+            return pixel_normal_map(model.network, view, lights, autocast, rotations=self.rotations), None
+        network, found, errors = cast(NormalNetwork, model.network), [], []
         views = self.normal_views or 1
         for number, symmetry in enumerate(SYMMETRIES[:views]):
             lit = turned_lights(symmetry, lights)
             with repeat(number, views):
-                turned = normal_map(network, TurnedView(view, symmetry), lit, self.arithmetic.autocast)
+                turned, expected = normal_map(network, TurnedView(view, symmetry), lit, self.arithmetic.autocast)
             found.append(symmetry.back.vectors(symmetry.back.images(turned), dim=1))
-        return functional.normalize(torch.stack(found).mean(0), dim=1) if len(found) > 1 else found[0]
+            errors += [] if expected is None else [symmetry.back.images(expected)]
+        mean = functional.normalize(torch.stack(found).mean(0), dim=1) if len(found) > 1 else found[0]
+        return mean, torch.stack(errors).mean(0) if errors else None
 
     def _view(
         self,

@@ -35,6 +35,8 @@ NORMAL_ROWS = (  # lighting, normals, second, row of the paper
     ("lcnet-soft", "nenet-plus", "lcnet-second", ""),
     ("lcnet-soft", "attention", NONE, ""),
     (TRUE_LIGHTS, "attention", NONE, ""),
+    ("lcnet-soft", "frames", NONE, ""),
+    (TRUE_LIGHTS, "frames", NONE, ""),
     ("lcnet", "least-squares", NONE, ""),
     (TRUE_LIGHTS, "least-squares", NONE, ""),
 )

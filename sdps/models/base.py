@@ -164,6 +164,10 @@ class NormalNetwork(nn.Module, ABC):
     def regress(self, feature: Any) -> Tensor:
         """Return unit normals (B, 3, H, W), float32, of the aggregated feature."""
 
+    def regress_with_error(self, feature: Any) -> tuple[Tensor, Tensor | None]:
+        """Return the normals, and the angles to the true ones to expect, (B, 1, H, W) degrees, if it tells them."""
+        return self.regress(feature), None
+
     def kept(self, seen: Observations) -> Any:
         """Return what `fused` needs of some of a scene's images; of networks that keep."""
         raise NotImplementedError

@@ -124,6 +124,10 @@ class FrameNet(NormalNetwork):
     def regress(self, feature: FusedMap) -> Tensor:
         return self.corrected(feature)[0]
 
+    def regress_with_error(self, feature: FusedMap) -> tuple[Tensor, Tensor | None]:
+        normals, distance = self.corrected(feature)
+        return normals, torch.rad2deg(2.0 * (0.5 * distance).clamp(max=1.0).asin())
+
     def corrected(self, feature: FusedMap) -> tuple[Tensor, Tensor]:
         """Return unit normals (B, 3, H, W), float32, and the expected distance (B, 1, H, W) to the true ones."""
         normals, fused, mask = feature

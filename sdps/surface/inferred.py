@@ -85,6 +85,15 @@ class Inference:
         return residuals(self.photos, self.photos.mask, self.normals, self.light_directions, self.gains, self.albedo)
 
     @property
+    def expected_error(self) -> np.ndarray | None:
+        """Angle to the true normals to expect, (H, W) float32 in degrees; None where neither network nor refinement
+        tells it. Where refinement was not kept it is the network's, if that one tells.
+        """
+        diagnostics = self.estimate.diagnostics
+        own, trust = diagnostics.get("expected_error"), diagnostics.get("trust")
+        return own if trust is None or (trust.doubt and own is not None) else trust.normals
+
+    @property
     def gains(self) -> np.ndarray:
         """Intensities (L,) or (L, 3), equal ones where none were found."""
         return self.intensities if len(self.intensities) else np.ones(len(self.photos), np.float32)
@@ -131,6 +140,8 @@ class Inference:
             facts["light_confidence"] = dict(
                 zip(photos.files, np.round(np.asarray(confidence, float), 4).tolist(), strict=True)
             )
+        if self.expected_error is not None:
+            facts["expected_normal_error_degrees"] = round(float(self.expected_error[photos.mask].mean()), 2)
         refined = self.estimate.diagnostics.get("refined")
         if refined is not None:
             facts["refined"] = _about_refined(self.estimate.diagnostics, photos)
@@ -176,7 +187,8 @@ class Inference:
             _save_array(folder / "albedo.npy", refined.albedo)
             _save_array(folder / "highlights.npy", refined.strength)
             _save_array(folder / "residual.npy", refined.pixel_residual)
-            _save_array(folder / "expected-error.npy", self.estimate.diagnostics["trust"].normals)
+        if self.expected_error is not None:
+            _save_array(folder / "expected-error.npy", self.expected_error)
         _save_array(folder / "depth.npy", self.depth.z)
         colour = None if self.albedo is None else _display(self.albedo, mask)
         surface = mesh(self.depth, colour=colour, normals=normals)

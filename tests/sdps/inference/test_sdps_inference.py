@@ -281,6 +281,16 @@ def test_networks_told_no_lights_work_without(estimator: Estimator, lighting: st
     np.testing.assert_array_equal(told.normals, estimate.normals)
 
 
+@pytest.mark.parametrize("views", [1, 2])
+def test_a_network_that_tells_the_error_to_expect_tells_it_in_degrees(estimator: Estimator, views: int) -> None:
+    images, mask, lights = scene(size=50)
+    model = replace(estimator, normals=trained("frames"), normal_views=views)
+    expected = model.estimate(images, mask, lights, np.ones(6)).diagnostics["expected_error"]
+    assert expected.shape == mask.shape and not expected[~mask].any()
+    np.testing.assert_allclose(expected[mask], 2.0 * np.degrees(np.arcsin(0.5 * np.exp(-2.0))), rtol=1e-4)
+    assert "expected_error" not in estimator.estimate(images, mask, lights, np.ones(6)).diagnostics
+
+
 @pytest.mark.parametrize("names", [("lcnet", "nenet"), ("lcnet-soft", "nenet-plus", "lcnet-second")])
 def test_lights_found_before_change_nothing(names: tuple[str, ...]) -> None:
     images, mask, lights = scene(size=72)

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from render.shared.errors import InputError
 from sdps.core.first_normals import first_normals, frames
+from sdps.core.losses import chord_normal_loss, expected_error_loss
 from sdps.models.base import Lights, Observations
 from sdps.models.blocks import parameter_count
 from sdps.models.frames import FrameNet, Pixels, described, object_pixels
@@ -164,6 +165,27 @@ def test_training_lights_err_and_validation_lights_do_not():
     assert torch.equal(stage.lights(batch).directions, batch.directions)
     loss, terms = stage.loss(batch)
     assert np.isfinite(float(loss)) and {"masked_loss", "pixel_loss"} <= terms.keys()
+
+
+def test_the_chord_loss_grows_with_the_angle_and_knows_the_mask():
+    truth, mask = torch.zeros(1, 3, 1, 3), torch.tensor([1.0, 1.0, 0.0]).view(1, 1, 1, 3)
+    truth[:, 2] = 1.0
+    turned = truth.clone()
+    turned[0, :, 0, 0] = torch.tensor([math.sin(0.4), 0.0, math.cos(0.4)])
+    turned[..., 2] = -1.0
+    wanted = (math.hypot(2.0 * math.sin(0.2), 0.02) - 0.02) / 2.0
+    assert float(chord_normal_loss(turned, truth, mask)) == pytest.approx(wanted, rel=1e-5)
+    assert float(chord_normal_loss(turned, truth, 0.0 * mask)) == 0.0
+
+
+def test_the_expected_error_is_best_at_the_mean_of_the_errors():
+    truth = unit(1, 8, 8).permute(0, 3, 1, 2)
+    normals = unit(1, 8, 8).permute(0, 3, 1, 2).requires_grad_()
+    mask = torch.ones(1, 1, 8, 8)
+    mean = (normals.detach() - truth).norm(dim=1).mean()
+    losses = [float(expected_error_loss(scale * mean * mask, normals, truth, mask)) for scale in (0.8, 1.0, 1.25)]
+    assert losses[1] < min(losses[0], losses[2])
+    assert not expected_error_loss(mean * mask, normals, truth, mask).requires_grad
 
 
 def _batch():

@@ -188,6 +188,7 @@ def test_names_break_no_table(tmp_path: Path) -> None:
         ("nenet-norm", "pixel's norm"),
         ("attention", "pixel's maximum"),
         ("attention", "3 blocks of self-attention"),
+        ("frames", "exchange what they know 4 times"),
     ],
 )
 def test_models_differ(tmp_path: Path, model: str, fact: str) -> None:
