@@ -111,6 +111,7 @@ class NormalNetwork(nn.Module, ABC):
         size_multiple: Sides of images must be multiples of it.
         keeps: Its lights meet pixel by pixel, so that a maximum over images does not do: `kept` takes of some images
             what is needed of them, and `fused` makes the feature of all of it.
+        corrects: It also tells better lights than it was given (`corrected_lights`), for lights that were estimated.
     """
 
     needs_lights: bool = True
@@ -118,6 +119,7 @@ class NormalNetwork(nn.Module, ABC):
     division: Division = "none"
     size_multiple: int = 4
     keeps: bool = False
+    corrects: bool = False
 
     def observe(
         self,
@@ -170,6 +172,10 @@ class NormalNetwork(nn.Module, ABC):
 
     def kept(self, seen: Observations) -> Any:
         """Return what `fused` needs of some of a scene's images; of networks that keep."""
+        raise NotImplementedError
+
+    def corrected_lights(self, parts: list[Any]) -> tuple[Tensor, Tensor]:
+        """Return directions (1, L, 3) and factors (1, L) of the intensities, of all parts; of networks that correct."""
         raise NotImplementedError
 
     def fused(self, parts: list[Any]) -> Any:

@@ -18,6 +18,7 @@ from sdps.core.losses import (
     chord_normal_loss,
     expected_error_loss,
     faithful_normal_loss,
+    light_loss,
     masked_normal_loss,
     normal_gradient_loss,
     shading_loss,
@@ -28,7 +29,7 @@ from sdps.models import registry
 from sdps.models.attention import AttentionNet
 from sdps.models.base import LightingNetwork, Lights, NormalNetwork, Observations
 from sdps.models.checkpoint import TrainedModel
-from sdps.models.frames import FrameNet
+from sdps.models.frames import FrameNet, StagedNormals
 from sdps.models.lcnet import resize_input
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.models.upsfcn import UPSFCNLight
@@ -210,6 +211,9 @@ class NormalStage(Stage):
         side = self.config.crop or self.config.size
         images, mask, truth = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
         seen = self.network.observe(images, mask, lights)
+        if isinstance(self.network, FrameNet):
+            assert lights is not None  # it is always told them
+            return self._frame_loss(self.network.staged(seen), truth, mask, lights, batch)
         if not isinstance(self.network, UPSFCNLight):
             return normal_loss(self.config, self.network, seen, truth, mask, batch.directions)
         normals, logits = self.network.with_lights(seen)
@@ -217,14 +221,36 @@ class NormalStage(Stage):
         terms["lighting_loss"] = self.network.lighting_loss(logits, batch.directions, batch.intensities)
         return loss + self.config.lighting_weight * terms["lighting_loss"], terms
 
+    def _frame_loss(
+        self, staged: StagedNormals, truth: Tensor, mask: Tensor, lights: Lights, batch: Batch
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of all that `FrameNet` tells of crops under the lights given."""
+        config = self.config
+        loss, terms = plain_normal_loss(config, staged.normals, truth, mask)
+        terms["pixel_loss"], _ = plain_normal_loss(config, staged.alone, truth, mask)
+        terms["expected_loss"] = expected_error_loss(staged.expected, staged.normals, truth, mask)
+        wanted = batch.intensities / lights.intensities
+        terms["light_loss"] = light_loss(staged.directions, staged.factors, batch.directions, wanted)
+        weighed = config.expected_weight * terms["expected_loss"] + config.lighting_weight * terms["light_loss"]
+        return loss + terms["pixel_loss"] + weighed, terms
+
     def metrics(self, batch: Batch) -> dict[str, float]:
-        """Return the normal MAE on whole images, and the errors of lights that a model found."""
+        """Return the normal MAE on whole images, and the errors of lights that a model found or that were drawn."""
         lights = self.lights(batch)
         normals = self.network(self.network.observe(batch.images, batch.mask, lights))
         values = {
             "loss": float(masked_normal_loss(normals, batch.normals, batch.mask)),
             "normal_mae": normal_error(normals, batch),
         }
+        if isinstance(self.network, FrameNet) and lights is not None and self.config.light_error:
+            drawn = disturbed(lights, batch.seed.tolist(), self.config.light_error)
+            seen = self.network.observe(batch.images, batch.mask, drawn)
+            directions, factors = self.network.corrected_lights([seen])
+            better = Lights(directions, drawn.intensities * factors)
+            values |= light_errors(drawn, batch, "_drawn") | light_errors(better, batch, "_moved")
+            for name, told in (("drawn", drawn), ("moved", better)):
+                found = self.network(self.network.observe(batch.images, batch.mask, told))
+                values[f"normal_mae_{name}"] = normal_error(found, batch)
         return values | self.light_scores(lights, batch)
 
     def light_scores(self, lights: Lights | None, batch: Batch) -> dict[str, float]:
@@ -245,12 +271,6 @@ def normal_loss(
         mask: (B, 1, H, W), 0 or 1.
         directions: (B, Q, 3), the true ones.
     """
-    if isinstance(network, FrameNet):
-        staged = network.staged(seen)
-        loss, terms = plain_normal_loss(config, staged.normals, truth, mask)
-        terms["pixel_loss"], _ = plain_normal_loss(config, staged.alone, truth, mask)
-        terms["expected_loss"] = expected_error_loss(staged.expected, staged.normals, truth, mask)
-        return loss + terms["pixel_loss"] + config.expected_weight * terms["expected_loss"], terms
     if not (isinstance(network, AttentionNet) and network.shades and config.shading_weight):
         return plain_normal_loss(config, network(seen), truth, mask)
     normals, maps = network.with_shading(seen)
