@@ -7,7 +7,7 @@ to the lights of a pixel, 16 bytes per pixel.
 Legend: L images, P pixels of the object, (h, w) the sides of what the network sees.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from render.shared.progress import stage
+from sdps.core.symmetry import Symmetry
 from sdps.inference.turned_views import AnyView
 from sdps.models.base import LightingNetwork, Lights, NormalNetwork, divide
 from sdps.models.observation_maps import predict_normals
@@ -54,8 +55,12 @@ def lighting_prediction(
 
 
 def normal_map(
-    network: NormalNetwork, view: AnyView, lights: Lights | None, autocast: Autocast
-) -> tuple[Tensor, Tensor | None]:
+    network: NormalNetwork,
+    view: AnyView,
+    lights: Lights | None,
+    autocast: Autocast,
+    symmetries: Sequence[Symmetry] = (),
+) -> list[tuple[Tensor, Tensor | None]]:
     """Return a normal network's unit normals (1, 3, h, w), float32, and the errors it expects of them.
 
     Args:
@@ -63,6 +68,7 @@ def normal_map(
         view: Images whose sides are multiples of `network.size_multiple`.
         lights: Of all images, (1, L, ...); None for networks that are not told the lights.
         autocast: Makes the context in which the network runs.
+        symmetries: Of networks that turn their features: an answer for each, of the feature turned so. Others give one.
     """
     brightness = None if network.division == "none" else _brightness(network, view, lights)
     mask = view.mask
@@ -81,8 +87,8 @@ def normal_map(
         if network.keeps:
             feature = network.fused(kept)
         assert feature is not None  # a view has an image
-        normals, expected = network.regress_with_error(feature)
-        return normals.float(), expected
+        turned = [network.turned(feature, symmetry) for symmetry in symmetries] or [feature]
+        return [network.regress_with_error(each) for each in turned]
 
 
 def second_lights(network: NormalNetwork, view: AnyView, lights: Lights, autocast: Autocast) -> Lights:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from render.shared.errors import InputError
 from render.shared.progress import repeat
@@ -20,7 +19,14 @@ from sdps.data.augment import measure_exposure
 from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map, second_lights
 from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
 from sdps.inference.inference_config import InferenceConfig
-from sdps.inference.turned_views import KeptView, TurnedView, mean_lights, turned_context, turned_lights
+from sdps.inference.turned_views import (
+    KeptView,
+    TurnedView,
+    mean_lights,
+    mean_normals,
+    turned_context,
+    turned_lights,
+)
 from sdps.models.base import Lights, NormalNetwork
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
@@ -252,16 +258,17 @@ class Estimator(InferenceConfig):
             assert lights is not None  # these models need lights
             autocast = self.arithmetic.autocast
             return pixel_normal_map(model.network, view, lights, autocast, rotations=self.rotations), None
-        network, found, errors = cast(NormalNetwork, model.network), [], []
-        views = self.normal_views or 1
-        for number, symmetry in enumerate(SYMMETRIES[:views]):
-            lit = turned_lights(symmetry, lights)
-            with repeat(number, views):
-                turned, expected = normal_map(network, TurnedView(view, symmetry), lit, self.arithmetic.autocast)
-            found.append(symmetry.back.vectors(symmetry.back.images(turned), dim=1))
-            errors += [] if expected is None else [symmetry.back.images(expected)]
-        mean = functional.normalize(torch.stack(found).mean(0), dim=1) if len(found) > 1 else found[0]
-        return mean, torch.stack(errors).mean(0) if errors else None
+        network = cast(NormalNetwork, model.network)
+        symmetries = SYMMETRIES[: self.normal_views or 1]
+        answers: list[tuple[Tensor, Tensor | None]] = []
+        if network.turns:
+            answers = normal_map(network, view, lights, self.arithmetic.autocast, symmetries)
+        else:
+            for number, symmetry in enumerate(symmetries):
+                lit = turned_lights(symmetry, lights)
+                with repeat(number, len(symmetries)):
+                    answers += normal_map(network, TurnedView(view, symmetry), lit, self.arithmetic.autocast)
+        return mean_normals(symmetries, answers)
 
     def _view(
         self,

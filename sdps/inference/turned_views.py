@@ -6,7 +6,7 @@ answers, each turned back, is nearer to the truth than one of them.
 Legend: L images, h and w the sides of an image.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -81,3 +81,14 @@ def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
     sure = [lights.confidence.float() for _, lights in found if lights.confidence is not None]
     confidence = torch.stack(sure).mean(0) if sure else None
     return Lights(functional.normalize(directions, dim=-1), intensities, confidence)
+
+
+def mean_normals(
+    symmetries: Sequence[Symmetry], answers: Sequence[tuple[Tensor, Tensor | None]]
+) -> tuple[Tensor, Tensor | None]:
+    """Return the mean of normals (1, 3, h, w) found in turned views, each turned back, and of the errors to expect."""
+    pairs = list(zip(symmetries, answers, strict=True))
+    normals = [symmetry.back.vectors(symmetry.back.images(found.float()), dim=1) for symmetry, (found, _) in pairs]
+    errors = [symmetry.back.images(expected) for symmetry, (_, expected) in pairs if expected is not None]
+    mean = functional.normalize(torch.stack(normals).mean(0), dim=1) if len(normals) > 1 else normals[0]
+    return mean, torch.stack(errors).mean(0) if errors else None

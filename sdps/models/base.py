@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from sdps.core.lighting import LightClasses, ReadOut
+from sdps.core.symmetry import Symmetry
 from sdps.models.blocks import max_over_images
 
 Division = Literal["none", "norm", "max"]
@@ -111,6 +112,7 @@ class NormalNetwork(nn.Module, ABC):
         size_multiple: Sides of images must be multiples of it.
         keeps: Its lights meet pixel by pixel, so that a maximum over images does not do: `kept` takes of some images
             what is needed of them, and `fused` makes the feature of all of it.
+        turns: Its feature turns with the scene, so that turned views need none of their own (`turned`).
         corrects: It also tells better lights than it was given (`corrected_lights`), for lights that were estimated.
     """
 
@@ -120,6 +122,7 @@ class NormalNetwork(nn.Module, ABC):
     size_multiple: int = 4
     keeps: bool = False
     corrects: bool = False
+    turns: bool = False
 
     def observe(
         self,
@@ -176,6 +179,10 @@ class NormalNetwork(nn.Module, ABC):
 
     def corrected_lights(self, parts: list[Any]) -> tuple[Tensor, Tensor]:
         """Return directions (1, L, 3) and factors (1, L) of the intensities, of all parts; of networks that correct."""
+        raise NotImplementedError
+
+    def turned(self, feature: Any, symmetry: Symmetry) -> Any:
+        """Return the feature that the scene would have had if it were turned; of networks that turn."""
         raise NotImplementedError
 
     def fused(self, parts: list[Any]) -> Any:

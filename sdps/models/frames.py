@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from render.shared.errors import InputError, unknown
 from sdps.core.first_normals import first_normals, frames
+from sdps.core.symmetry import Symmetry
 from sdps.models.base import NormalNetwork, Observations
 from sdps.models.blocks import SLOPE, conv, deconv
 
@@ -92,6 +93,7 @@ class FrameNet(NormalNetwork):
     needs_mask = True
     keeps = True
     corrects = True
+    turns = True
 
     def __init__(self, *, width: int = 64, blocks: int = 4, frame: str = "normal") -> None:
         super().__init__()
@@ -148,6 +150,11 @@ class FrameNet(NormalNetwork):
         back = self.back(torch.cat([self.quarter(half), half], dim=1))
         change = self.leave(torch.cat([back, entered], dim=1)).float()
         return functional.normalize(normals + change[:, :3], dim=1), (change[:, 3:] + _LOG_USUAL).exp()
+
+    def turned(self, feature: FusedMap, symmetry: Symmetry) -> FusedMap:
+        """Return the fused map of the turned scene: its pixels see their lights in frames that turn with them."""
+        normals, fused, mask = (symmetry.images(each) for each in feature)
+        return FusedMap(symmetry.vectors(normals, dim=1), fused, mask)
 
     def kept(self, seen: Observations) -> Observations:
         """Return some of a scene's images, in 16 bits, for `fused`."""

@@ -11,6 +11,7 @@ from torch.nn import functional
 from render.shared.errors import InputError
 from sdps.core.first_normals import first_normals, frames
 from sdps.core.losses import chord_normal_loss, expected_error_loss, light_loss
+from sdps.core.symmetry import Symmetry
 from sdps.models.base import Lights, Observations
 from sdps.models.blocks import parameter_count
 from sdps.models.frames import FrameNet, Pixels, described, object_pixels
@@ -106,6 +107,15 @@ def test_pixels_alone_turn_with_their_lights(trained):
     with torch.no_grad():
         one, other = (trained.encode(each).normals.permute(0, 2, 3, 1)[seen.mask[:, 0] > 0] for each in (seen, turned))
     torch.testing.assert_close(rotate_about_view(one, 0.7), other, atol=5e-3, rtol=0)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_the_map_turns_with_the_scene(trained, turns):
+    seen, symmetry = observations(9), Symmetry(turns, False)
+    turned = Observations(symmetry.images(seen.images), symmetry.vectors(seen.directions), symmetry.images(seen.mask))
+    with torch.no_grad():
+        for one, other in zip(trained.turned(trained.encode(seen), symmetry), trained.encode(turned), strict=True):
+            torch.testing.assert_close(one, other, atol=5e-3, rtol=0)
 
 
 def test_neither_order_nor_chunks_of_images_matter(trained, monkeypatch):
