@@ -31,6 +31,8 @@ _MAP = 32
 """Channels of the fused map besides the normals."""
 _LOG_USUAL = -2.0
 """Logarithm of the error that an untrained network expects: 8 degrees."""
+_VOTE = 0.05
+"""Scale of votes: a few degrees."""
 LIGHT_ROUNDS = 2
 """Votes on estimated lights in inference."""
 _VOTERS = 4096
@@ -108,14 +110,14 @@ class FrameNet(NormalNetwork):
             nn.Linear(2 * width + _KNOWN, 128), nn.LeakyReLU(SLOPE), nn.Linear(128, 128), nn.LeakyReLU(SLOPE)
         )
         self.offset, self.feature = nn.Linear(128, 3), nn.Linear(128, _MAP)
-        self.vote = nn.Linear(width, 5)
+        self.vote = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 5))
         self.enter = nn.Sequential(conv(_MAP + 4, 64), conv(64, 64))
         self.smaller = nn.Sequential(conv(64, 96, stride=2), conv(96, 96))
         self.quarter = nn.Sequential(conv(96, 128, stride=2), conv(128, 128), conv(128, 128), deconv(128, 96))
         self.back = nn.Sequential(conv(192, 96), deconv(96, 64))
         self.leave = nn.Sequential(conv(128, 64), nn.Conv2d(64, 4, 3, padding=1))
         # Training begins at the first normals.
-        for parameter in (*self.offset.parameters(), *self.vote.parameters(), *self.leave[-1].parameters()):
+        for parameter in (*self.offset.parameters(), *self.vote[-1].parameters(), *self.leave[-1].parameters()):
             nn.init.zeros_(parameter)
 
     def forward(self, seen: Observations) -> Tensor:
@@ -214,8 +216,8 @@ class FrameNet(NormalNetwork):
         with torch.autocast(fused.device.type, enabled=False):
             local = functional.normalize(start + self.offset(fused.float()), dim=-1)
             normals = (local[:, None] @ axes)[:, 0]
-            votes = self.vote(tokens.float())
-            votes = torch.cat([votes[..., :3] @ axes, votes[..., 3:4], votes[..., 4:].sigmoid()], dim=-1)
+            votes = _VOTE * self.vote(tokens.float())
+            votes = torch.cat([votes[..., :3] @ axes, votes[..., 3:4], (votes[..., 4:] / _VOTE).sigmoid()], dim=-1)
             return torch.cat([normals, self.feature(fused.float())], dim=1), votes
 
     def _mapped(self, found: Tensor, inside: Tensor) -> FusedMap:

@@ -294,7 +294,7 @@ def test_a_network_that_tells_the_error_to_expect_tells_it_in_degrees(estimator:
 def test_a_normal_network_may_correct_lights_that_were_estimated_and_no_others(estimator: Estimator) -> None:
     images, mask, lights = scene(size=50)
     network = trained("frames")
-    torch.nn.init.normal_(network.network.get_parameter("vote.weight"), std=0.1)
+    torch.nn.init.normal_(network.network.get_parameter("vote.1.weight"), std=0.5)
     model, gains = replace(estimator, normals=network), np.linspace(0.5, 2.0, 6)
     first = model.estimate_lights(images, mask)
     corrected = model.estimate(images, mask)

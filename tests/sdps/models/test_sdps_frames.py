@@ -158,7 +158,7 @@ def test_an_untrained_network_leaves_the_lights():
 
 
 def test_votes_move_lights_the_same_way_however_the_scene_is_turned_cut_and_ordered(trained, monkeypatch):
-    torch.nn.init.normal_(trained.vote.weight, std=0.1)
+    torch.nn.init.normal_(trained.vote[-1].weight, std=0.5)
     seen, order = observations(9), torch.randperm(9)
     turned = seen._replace(directions=rotate_about_view(seen.directions, 0.7))
     shuffled = [seen._replace(images=seen.images[:, part], directions=seen.directions[:, part])
@@ -177,7 +177,7 @@ def test_votes_move_lights_the_same_way_however_the_scene_is_turned_cut_and_orde
 
 
 def test_training_and_inference_count_the_same_votes(trained):
-    torch.nn.init.normal_(trained.vote.weight, std=0.1)
+    torch.nn.init.normal_(trained.vote[-1].weight, std=0.5)
     seen = observations(6)
     with torch.no_grad():
         staged = trained.staged(seen)
