@@ -80,20 +80,6 @@ def expected_error_loss(expected: Tensor, normals: Tensor, truth: Tensor, mask: 
     return (each.sum(dim=(1, 2, 3)) / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)).mean()
 
 
-def light_loss(directions: Tensor, factors: Tensor, truth: Tensor, wanted: Tensor) -> Tensor:
-    """Return the mean distance of light directions plus the mean error of the intensities' logarithms.
-
-    Args:
-        directions: (B, Q, 3) unit estimates.
-        factors: (B, Q) positive, by which the given intensities are to be multiplied.
-        truth: (B, Q, 3) unit directions.
-        wanted: (B, Q) true intensities over the given ones; of any scale in each scene.
-    """
-    distances = ((directions - truth).square().sum(dim=-1) + 1e-6).sqrt()
-    errors = factors.log() - wanted.log()
-    return distances.mean() + (errors - errors.mean(dim=1, keepdim=True)).abs().mean()
-
-
 def normal_gradient_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
     """Return the mean over scenes of the mean error of the step from a pixel to its neighbour, |x| + |y| + |z|.
 

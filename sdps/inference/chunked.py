@@ -91,18 +91,6 @@ def normal_map(
         return [network.regress_with_error(each) for each in turned]
 
 
-def second_lights(network: NormalNetwork, view: AnyView, lights: Lights, autocast: Autocast) -> Lights:
-    """Return the lights (1, L, ...) as a normal network corrects them, one that does; arguments as of `normal_map`."""
-    mask, kept = view.mask, []
-    for part, images in view:
-        some = Lights(lights.directions[:, part], lights.intensities[:, part])
-        kept.append(network.kept(network.observe(images, mask, some)))
-        stage("lights", part.stop, len(view))
-    with autocast():
-        directions, factors = network.corrected_lights(kept)
-    return lights._replace(directions=directions, intensities=lights.intensities * factors)
-
-
 def _brightness(network: NormalNetwork, view: AnyView, lights: Lights | None) -> Tensor:
     """Return `network.brightness` of all images, (1, 1, 1, h, w)."""
     total: Tensor | None = None

@@ -16,7 +16,7 @@ from sdps.core.lighting import ReadOut
 from sdps.core.precision import Arithmetic, arithmetic
 from sdps.core.symmetry import SYMMETRIES
 from sdps.data.augment import measure_exposure
-from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map, second_lights
+from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map
 from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
 from sdps.inference.inference_config import InferenceConfig
 from sdps.inference.turned_views import (
@@ -141,7 +141,7 @@ class Estimator(InferenceConfig):
         scene, known, diagnostics = self._prepare(images, mask, lights, intensities)
         lit = self._lit(scene, known, found, diagnostics)
         normals = np.zeros((*mask.shape, 3), np.float32)
-        normals[scene.rows, scene.columns], lit = self._box_normals(scene, known, lit, diagnostics)
+        normals[scene.rows, scene.columns] = self._box_normals(scene, known, lit, diagnostics)
         return _concluded(normals, known if lit is None else lit, began, diagnostics)
 
     @torch.inference_mode()
@@ -190,17 +190,11 @@ class Estimator(InferenceConfig):
 
     def _box_normals(
         self, scene: ObjectImages, known: _Known, lit: Lights | None, diagnostics: dict[str, Any]
-    ) -> tuple[np.ndarray, Lights | None]:
-        """Return the normals of the object's box, (h, w, 3) float32, zero outside the mask, and the lights they are of.
-
-        These are others than those the normal model is told where it corrects lights that were estimated.
-        """
+    ) -> np.ndarray:
+        """Return the normals of the object's box, (h, w, 3) float32, zero outside the mask."""
         model = self._normal_model()
         multiple = 1 if model.role == "pixels" else cast(NormalNetwork, model.network).size_multiple
         view = self._view(scene, "normals", known.balance, pad_to(multiple), scene.mask.size, diagnostics)
-        if lit is not None and known.directions is None and getattr(model.network, "corrects", False):
-            network = cast(NormalNetwork, model.network)
-            lit = self._merged(known, second_lights(network, view, lit, self.arithmetic.autocast))
         normals, expected = self._normals(view, lit)  # padded
         rows, columns = scene.mask.shape
         if expected is not None:
@@ -208,7 +202,7 @@ class Estimator(InferenceConfig):
             whole[scene.rows, scene.columns] = expected[0, 0, :rows, :columns].cpu().numpy() * scene.mask
             diagnostics["expected_error"] = whole
         box = normals[0].permute(1, 2, 0).cpu().numpy()[:rows, :columns]
-        return np.where(scene.mask[..., None], box, np.float32(0.0)), lit
+        return np.where(scene.mask[..., None], box, np.float32(0.0))
 
     def _estimate_lights(self, scene: ObjectImages, known: _Known, diagnostics: dict[str, Any]) -> Lights:
         """Return the lights (1, L, ...) after one or two passes; what is known stays."""

@@ -31,8 +31,8 @@ class InferenceConfig:
         stray_light: Take off what the images show where the object is in shadow (`sdps.inference.stray_light`).
         rotations: Rotations about the view axis that pixel networks average over.
         light_views: Test-time augmentation: lights are the mean over so many turned and mirrored views of the object,
-            1, 2, 4 or 8; null for what the method says, which is 1 but for `sdps-plus`.
-        normal_views: The same for normals; every view costs as much again.
+            1, 2, 4 or 8; null for what the method says, which is 1 but for `sdps-frames` and `sdps-plus`.
+        normal_views: The same for normals; every view costs as much again, but for `frames`.
 
     Raises:
         InputError: an option out of range.

@@ -113,7 +113,6 @@ class NormalNetwork(nn.Module, ABC):
         keeps: Its lights meet pixel by pixel, so that a maximum over images does not do: `kept` takes of some images
             what is needed of them, and `fused` makes the feature of all of it.
         turns: Its feature turns with the scene, so that turned views need none of their own (`turned`).
-        corrects: It also tells better lights than it was given (`corrected_lights`), for lights that were estimated.
     """
 
     needs_lights: bool = True
@@ -121,7 +120,6 @@ class NormalNetwork(nn.Module, ABC):
     division: Division = "none"
     size_multiple: int = 4
     keeps: bool = False
-    corrects: bool = False
     turns: bool = False
 
     def observe(
@@ -175,10 +173,6 @@ class NormalNetwork(nn.Module, ABC):
 
     def kept(self, seen: Observations) -> Any:
         """Return what `fused` needs of some of a scene's images; of networks that keep."""
-        raise NotImplementedError
-
-    def corrected_lights(self, parts: list[Any]) -> tuple[Tensor, Tensor]:
-        """Return directions (1, L, 3) and factors (1, L) of the intensities, of all parts; of networks that correct."""
         raise NotImplementedError
 
     def turned(self, feature: Any, symmetry: Symmetry) -> Any:

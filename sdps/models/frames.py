@@ -31,13 +31,7 @@ _MAP = 32
 """Channels of the fused map besides the normals."""
 _LOG_USUAL = -2.0
 """Logarithm of the error that an untrained network expects: 8 degrees."""
-_VOTE = 0.05
-"""Scale of votes: a few degrees."""
-LIGHT_ROUNDS = 2
-"""Votes on estimated lights in inference."""
-_VOTERS = 4096
-"""Pixels that vote on the lights in inference."""
-_STRIP = 2**16
+_STRIP = 2**13
 """Pixels times lights that are worked on at once in inference."""
 
 
@@ -76,8 +70,6 @@ class FusedMap(NamedTuple):
 class StagedNormals(NamedTuple):
     """What `FrameNet` predicts while it is trained."""
 
-    directions: Tensor  # (B, Q, 3) unit, of the lights as the shading has them
-    factors: Tensor  # (B, Q) positive, of the light intensities
     alone: Tensor  # (B, 3, H, W) unit, by pixels alone
     normals: Tensor  # (B, 3, H, W) unit, corrected by their surroundings
     expected: Tensor  # (B, 1, H, W), distance to the true normals
@@ -94,7 +86,6 @@ class FrameNet(NormalNetwork):
 
     needs_mask = True
     keeps = True
-    corrects = True
     turns = True
 
     def __init__(self, *, width: int = 64, blocks: int = 4, frame: str = "normal") -> None:
@@ -110,14 +101,13 @@ class FrameNet(NormalNetwork):
             nn.Linear(2 * width + _KNOWN, 128), nn.LeakyReLU(SLOPE), nn.Linear(128, 128), nn.LeakyReLU(SLOPE)
         )
         self.offset, self.feature = nn.Linear(128, 3), nn.Linear(128, _MAP)
-        self.vote = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 5))
         self.enter = nn.Sequential(conv(_MAP + 4, 64), conv(64, 64))
         self.smaller = nn.Sequential(conv(64, 96, stride=2), conv(96, 96))
         self.quarter = nn.Sequential(conv(96, 128, stride=2), conv(128, 128), conv(128, 128), deconv(128, 96))
         self.back = nn.Sequential(conv(192, 96), deconv(96, 64))
         self.leave = nn.Sequential(conv(128, 64), nn.Conv2d(64, 4, 3, padding=1))
         # Training begins at the first normals.
-        for parameter in (*self.offset.parameters(), *self.vote[-1].parameters(), *self.leave[-1].parameters()):
+        for parameter in (*self.offset.parameters(), *self.leave[-1].parameters()):
             nn.init.zeros_(parameter)
 
     def forward(self, seen: Observations) -> Tensor:
@@ -125,17 +115,13 @@ class FrameNet(NormalNetwork):
 
     def staged(self, seen: Observations) -> StagedNormals:
         """Return what is learned: the normals of pixels alone, the corrected ones, and the error to expect of these."""
-        inside, pixels = object_pixels(seen)
-        found, votes = self._per_pixel(pixels)
-        fused = self._mapped(found, inside)
-        assert seen.directions is not None  # `object_pixels` has seen them
-        lights = moved(seen.directions.float(), tallied(votes, inside))
-        return StagedNormals(*lights, fused.normals, *self.corrected(fused))
+        fused = self.encode(seen)
+        return StagedNormals(fused.normals, *self.corrected(fused))
 
     def encode(self, seen: Observations) -> FusedMap:
         """Return the fused map of all of a scene's images."""
         inside, pixels = object_pixels(seen)
-        return self._mapped(self._per_pixel(pixels)[0], inside)
+        return self._mapped(self._per_pixel(pixels), inside)
 
     def regress(self, feature: FusedMap) -> Tensor:
         return self.corrected(feature)[0]
@@ -168,42 +154,13 @@ class FrameNet(NormalNetwork):
         inside, pixels = object_pixels(seen)
         count = max(1, _STRIP // seen.images.shape[1])
         found = [
-            self._per_pixel(Pixels(*(part.float() for part in some)))[0]
+            self._per_pixel(Pixels(*(part.float() for part in some)))
             for some in zip(*(each.split(count) for each in pixels), strict=True)
         ]
         return self._mapped(torch.cat(found) if found else pixels.values.new_zeros(0, 3 + _MAP), inside)
 
-    def corrected_lights(self, parts: list[Observations], *, rounds: int = LIGHT_ROUNDS) -> tuple[Tensor, Tensor]:
-        """Return directions (1, L, 3) of all of a scene's lights, and factors (1, L) of their intensities.
-
-        The scene's pixels vote on them; some thousand do, evenly spread.
-
-        Args:
-            parts: What `kept` gave.
-            rounds: Votes; each is on the lights of the one before.
-        """
-        seen = _joined(parts)
-        pixels = object_pixels(seen)[1]
-        values, directions = (each[:: max(1, len(each) // _VOTERS)].float() for each in pixels)
-        assert seen.directions is not None  # `object_pixels` has seen them
-        lights, factors = seen.directions.float(), values.new_ones(1, values.shape[1])
-        for _ in range(rounds if len(values) else 0):
-            change = self._tallied_votes(Pixels(values / factors[0, :, None], lights.expand_as(directions)))
-            lights, more = moved(lights, change)
-            factors = factors * more
-        return lights, factors
-
-    def _tallied_votes(self, pixels: Pixels) -> Tensor:
-        """Return the mean vote (1, Q, 4) of a scene's pixels, a few at a time."""
-        strips = zip(*(each.split(max(1, _STRIP // pixels.values.shape[1])) for each in pixels), strict=True)
-        votes = torch.cat([self._per_pixel(Pixels(*strip))[1] for strip in strips])
-        return tallied(votes, votes.new_ones(1, len(votes), 1, dtype=torch.bool))
-
-    def _per_pixel(self, pixels: Pixels) -> tuple[Tensor, Tensor]:
-        """Return normals and features of pixels, (N, 3 + 32), and what they say of their lights, (N, Q, 5).
-
-        A vote is where a light should move, how its intensity's logarithm should, and how much the vote counts.
-        """
+    def _per_pixel(self, pixels: Pixels) -> Tensor:
+        """Return normals and features of pixels, (N, 3 + 32)."""
         with torch.no_grad(), torch.autocast(pixels.values.device.type, enabled=False):
             first, scale, residual = first_normals(*pixels)
             camera = torch.eye(3, device=first.device).expand(len(first), 3, 3)
@@ -216,9 +173,7 @@ class FrameNet(NormalNetwork):
         with torch.autocast(fused.device.type, enabled=False):
             local = functional.normalize(start + self.offset(fused.float()), dim=-1)
             normals = (local[:, None] @ axes)[:, 0]
-            votes = _VOTE * self.vote(tokens.float())
-            votes = torch.cat([votes[..., :3] @ axes, votes[..., 3:4], (votes[..., 4:] / _VOTE).sigmoid()], dim=-1)
-            return torch.cat([normals, self.feature(fused.float())], dim=1), votes
+            return torch.cat([normals, self.feature(fused.float())], dim=1)
 
     def _mapped(self, found: Tensor, inside: Tensor) -> FusedMap:
         """Return what was found of the object's pixels, (N, 3 + 32), in its place; `inside` (B, H, W) bool."""
@@ -233,25 +188,6 @@ def _joined(parts: list[Observations]) -> Observations:
     images = torch.cat([part.images for part in parts], dim=1)
     directions = torch.cat([part.directions for part in parts if part.directions is not None], dim=1)
     return Observations(images, directions, parts[0].mask)
-
-
-def tallied(votes: Tensor, inside: Tensor) -> Tensor:
-    """Return the weighted means (B, Q, 4) of the votes (N, Q, 5) of each scene's pixels; `inside` (B, H, W) bool."""
-    counts = inside.flatten(1).sum(dim=1).tolist()
-    means = []
-    for each in votes.split(counts):
-        weights = each[..., 4:]  # (n, Q, 1)
-        means.append((each[..., :4] * weights).sum(dim=0) / (weights.sum(dim=0) + 1e-6))
-    return torch.stack(means)
-
-
-def moved(directions: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
-    """Return lights (B, Q, 3) moved by a change (B, Q, 4), unit, and factors (B, Q) of their intensities, 1 on average.
-
-    The average is that of the logarithms: pixels cannot tell a common factor from their albedo.
-    """
-    steps = change[..., 3] - change[..., 3].mean(dim=1, keepdim=True)
-    return functional.normalize(directions + change[..., :3], dim=-1), steps.exp()
 
 
 def pooled(tokens: Tensor) -> Tensor:

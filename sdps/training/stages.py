@@ -18,7 +18,6 @@ from sdps.core.losses import (
     chord_normal_loss,
     expected_error_loss,
     faithful_normal_loss,
-    light_loss,
     masked_normal_loss,
     normal_gradient_loss,
     shading_loss,
@@ -212,8 +211,7 @@ class NormalStage(Stage):
         images, mask, truth = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
         seen = self.network.observe(images, mask, lights)
         if isinstance(self.network, FrameNet):
-            assert lights is not None  # it is always told them
-            return self._frame_loss(self.network.staged(seen), truth, mask, lights, batch)
+            return self._frame_loss(self.network.staged(seen), truth, mask)
         if not isinstance(self.network, UPSFCNLight):
             return normal_loss(self.config, self.network, seen, truth, mask, batch.directions)
         normals, logits = self.network.with_lights(seen)
@@ -221,18 +219,13 @@ class NormalStage(Stage):
         terms["lighting_loss"] = self.network.lighting_loss(logits, batch.directions, batch.intensities)
         return loss + self.config.lighting_weight * terms["lighting_loss"], terms
 
-    def _frame_loss(
-        self, staged: StagedNormals, truth: Tensor, mask: Tensor, lights: Lights, batch: Batch
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def _frame_loss(self, staged: StagedNormals, truth: Tensor, mask: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of all that `FrameNet` tells of crops under the lights given."""
         config = self.config
         loss, terms = plain_normal_loss(config, staged.normals, truth, mask)
         terms["pixel_loss"], _ = plain_normal_loss(config, staged.alone, truth, mask)
         terms["expected_loss"] = expected_error_loss(staged.expected, staged.normals, truth, mask)
-        wanted = batch.intensities / lights.intensities
-        terms["light_loss"] = light_loss(staged.directions, staged.factors, batch.directions, wanted)
-        weighed = config.expected_weight * terms["expected_loss"] + config.lighting_weight * terms["light_loss"]
-        return loss + terms["pixel_loss"] + weighed, terms
+        return loss + terms["pixel_loss"] + config.expected_weight * terms["expected_loss"], terms
 
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return the normal MAE on whole images, and the errors of lights that a model found or that were drawn."""
@@ -245,12 +238,8 @@ class NormalStage(Stage):
         if isinstance(self.network, FrameNet) and lights is not None and self.config.light_error:
             drawn = disturbed(lights, batch.seed.tolist(), self.config.light_error)
             seen = self.network.observe(batch.images, batch.mask, drawn)
-            directions, factors = self.network.corrected_lights([seen])
-            better = Lights(directions, drawn.intensities * factors)
-            values |= light_errors(drawn, batch, "_drawn") | light_errors(better, batch, "_moved")
-            for name, told in (("drawn", drawn), ("moved", better)):
-                found = self.network(self.network.observe(batch.images, batch.mask, told))
-                values[f"normal_mae_{name}"] = normal_error(found, batch)
+            values |= light_errors(drawn, batch, "_drawn")
+            values["normal_mae_drawn"] = normal_error(self.network(seen), batch)
         return values | self.light_scores(lights, batch)
 
     def light_scores(self, lights: Lights | None, batch: Batch) -> dict[str, float]:

@@ -291,22 +291,6 @@ def test_a_network_that_tells_the_error_to_expect_tells_it_in_degrees(estimator:
     assert "expected_error" not in estimator.estimate(images, mask, lights, np.ones(6)).diagnostics
 
 
-def test_a_normal_network_may_correct_lights_that_were_estimated_and_no_others(estimator: Estimator) -> None:
-    images, mask, lights = scene(size=50)
-    network = trained("frames")
-    torch.nn.init.normal_(network.network.get_parameter("vote.1.weight"), std=0.5)
-    model, gains = replace(estimator, normals=network), np.linspace(0.5, 2.0, 6)
-    first = model.estimate_lights(images, mask)
-    corrected = model.estimate(images, mask)
-    assert np.abs(corrected.light_directions - first.light_directions).max() > 1e-3
-    np.testing.assert_allclose(np.linalg.norm(corrected.light_directions, axis=1), 1.0, rtol=1e-5)
-    np.testing.assert_array_equal(model.estimate(images, mask, lights, gains).light_directions, lights)
-    told = model.estimate(images, mask, intensities=gains)
-    np.testing.assert_allclose(told.intensities / told.intensities.mean(), gains / gains.mean(), rtol=1e-5)
-    again = model.estimate(images, mask, found=first)
-    np.testing.assert_array_equal(again.normals, corrected.normals)
-
-
 @pytest.mark.parametrize("names", [("lcnet", "nenet"), ("lcnet-soft", "nenet-plus", "lcnet-second")])
 def test_lights_found_before_change_nothing(names: tuple[str, ...]) -> None:
     images, mask, lights = scene(size=72)

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from render.shared.errors import InputError
 from sdps.core.first_normals import first_normals, frames
-from sdps.core.losses import chord_normal_loss, expected_error_loss, light_loss
+from sdps.core.losses import chord_normal_loss, expected_error_loss
 from sdps.core.symmetry import Symmetry
 from sdps.models.base import Lights, Observations
 from sdps.models.blocks import parameter_count
@@ -139,51 +139,11 @@ def test_an_untrained_network_gives_the_first_normals():
     torch.testing.assert_close(found, first_normals(*pixels)[0], atol=1e-4, rtol=0)
 
 
-def test_a_mask_without_pixels_gives_a_map_and_leaves_the_lights(trained):
+def test_a_mask_without_pixels_gives_a_map(trained):
     seen = observations(5)
     empty = seen._replace(mask=torch.zeros_like(seen.mask))
     with torch.no_grad():
         assert torch.isfinite(trained(empty)).all()
-        directions, factors = trained.corrected_lights([empty])
-    torch.testing.assert_close(directions, seen.directions)
-    assert (factors == 1).all()
-
-
-def test_an_untrained_network_leaves_the_lights():
-    seen = observations(7)
-    with torch.no_grad():
-        directions, factors = FrameNet().corrected_lights([seen])
-    torch.testing.assert_close(directions, seen.directions)
-    torch.testing.assert_close(factors, torch.ones(1, 7))
-
-
-def test_votes_move_lights_the_same_way_however_the_scene_is_turned_cut_and_ordered(trained, monkeypatch):
-    torch.nn.init.normal_(trained.vote[-1].weight, std=0.5)
-    seen, order = observations(9), torch.randperm(9)
-    turned = seen._replace(directions=rotate_about_view(seen.directions, 0.7))
-    shuffled = [seen._replace(images=seen.images[:, part], directions=seen.directions[:, part])
-                for part in order.split(4)]  # fmt: skip
-    with torch.no_grad():
-        directions, factors = trained.corrected_lights([seen])
-        of_turned, same = trained.corrected_lights([turned])
-        monkeypatch.setattr("sdps.models.frames._STRIP", 64)
-        of_shuffled, of_order = trained.corrected_lights(shuffled)
-    assert not torch.allclose(directions, seen.directions, atol=1e-3)
-    torch.testing.assert_close(rotate_about_view(directions, 0.7), of_turned, atol=5e-3, rtol=0)
-    torch.testing.assert_close(factors, same, atol=5e-3, rtol=0)
-    torch.testing.assert_close(of_shuffled, directions[:, order], atol=1e-4, rtol=0)
-    torch.testing.assert_close(of_order, factors[:, order], atol=1e-4, rtol=0)
-    assert float(factors.log().mean()) == pytest.approx(0.0, abs=1e-5)
-
-
-def test_training_and_inference_count_the_same_votes(trained):
-    torch.nn.init.normal_(trained.vote[-1].weight, std=0.5)
-    seen = observations(6)
-    with torch.no_grad():
-        staged = trained.staged(seen)
-        directions, factors = trained.corrected_lights([seen], rounds=1)
-    torch.testing.assert_close(staged.directions, directions, atol=1e-5, rtol=0)
-    torch.testing.assert_close(staged.factors, factors, atol=1e-5, rtol=0)
 
 
 def test_size_and_options():
@@ -215,12 +175,10 @@ def test_training_lights_err_and_validation_lights_do_not():
     assert not torch.equal(stage.training_lights(batch).directions, batch.directions)
     assert torch.equal(stage.lights(batch).directions, batch.directions)
     loss, terms = stage.loss(batch)
-    assert np.isfinite(float(loss)) and {"masked_loss", "pixel_loss", "light_loss", "expected_loss"} <= terms.keys()
+    assert np.isfinite(float(loss)) and {"masked_loss", "pixel_loss", "expected_loss"} <= terms.keys()
     with torch.no_grad():
         scores = stage.metrics(batch)
-    # A network that was not trained leaves the lights that were drawn.
-    assert scores["direction_mae_drawn"] == pytest.approx(scores["direction_mae_moved"], abs=0.02) != 0.0
-    assert scores["normal_mae_drawn"] == pytest.approx(scores["normal_mae_moved"], abs=0.1)
+    assert scores["direction_mae_drawn"] > 0.1 and scores["normal_mae_drawn"] != scores["normal_mae"]
 
 
 def test_the_chord_loss_grows_with_the_angle_and_knows_the_mask():
@@ -232,13 +190,6 @@ def test_the_chord_loss_grows_with_the_angle_and_knows_the_mask():
     wanted = (math.hypot(2.0 * math.sin(0.2), 0.02) - 0.02) / 2.0
     assert float(chord_normal_loss(turned, truth, mask)) == pytest.approx(wanted, rel=1e-5)
     assert float(chord_normal_loss(turned, truth, 0.0 * mask)) == 0.0
-
-
-def test_the_light_loss_does_not_know_a_common_factor():
-    lights, factors = unit(2, 9), torch.rand(2, 9) + 0.5
-    assert float(light_loss(lights, factors, lights, 3.0 * factors)) == pytest.approx(1e-3, rel=0.01)
-    one = float(light_loss(lights, factors, lights, factors * torch.tensor([1.1, 1.0, 1.0] * 3)))
-    assert 0.02 < one < 0.1
 
 
 def test_the_expected_error_is_best_at_the_mean_of_the_errors():
