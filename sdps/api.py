@@ -41,9 +41,9 @@ from sdps.training.trainer import TrainingResult
 __all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "load", "train"]
 
 AUTO = "auto"
-_LEARNED = ("sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
+_LEARNED = ("sdps-frames", "sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
 """Tried in this order; the parts may be trained or shipped one by one."""
-_CALIBRATED = ("psfcn", "robust-least-squares")
+_CALIBRATED = ("frames", "psfcn", "robust-least-squares")
 _FALLBACK = "pf14"
 
 _log = logging.getLogger(__name__)

@@ -116,7 +116,12 @@ def test_flags_that_a_classical_method_would_not_look_at(runs: Path) -> None:
     for flags in (("lcnet", None, None), (None, None, "true")):
         with pytest.raises(InputError, match="leave out --lights, --second and --intensities"):
             combine(flags[0], "pf14", flags[1], flags[2], find)
-    for name, counts in (("sdps-plus", (8, 4)), ("shipped:sdps-plus", (8, 4)), ("sdps", (None, None))):
+    for name, counts in (
+        ("sdps-frames", (8, 8)),
+        ("sdps-plus", (8, 4)),
+        ("shipped:sdps-plus", (8, 4)),
+        ("sdps", (None, None)),
+    ):
         method = combine(None, name, None, None, lambda name: Path(name))
         assert (method.light_views, method.normal_views) == counts
     assert combine("lcnet-soft", "nenet-plus", None, None, lambda name: Path(name)).light_views is None
@@ -126,8 +131,9 @@ def test_flags_that_a_classical_method_would_not_look_at(runs: Path) -> None:
 
 def test_a_combination_has_one_label_however_it_is_asked_for() -> None:
     asked = combine(None, "shipped:sdps-plus", None, None, lambda name: Path(name))
-    (row,) = [rows.as_shipped(row) for row in rows._every_row() if row.light_views]
-    assert row == asked and asked.name == "sdps-plus (lcnet-soft + nenet-plus) (shipped)"
+    of_views = [rows.as_shipped(row) for row in rows._every_row() if row.light_views]
+    assert asked in of_views and asked.name == "sdps-plus (lcnet-soft + nenet-plus) (shipped)"
+    assert len(of_views) == len({row.name for row in of_views}) == 2  # sdps-frames, too
 
 
 def test_a_lazy_source_gives_a_classical_method_what_an_array_does() -> None:
