@@ -179,3 +179,21 @@ def test_methods_that_can_be_used_are_listed():
     about = sdps.available_methods()
     assert {"sdps", "lcnet", "pf14", "least-squares"} <= about.keys() and all(about.values())
     assert not {"lcnet-second", "true", "lcnet-reg"} & about.keys()  # no method by itself, and without weights
+
+
+@pytest.mark.parametrize(
+    ("lit", "refine", "images", "expected"),
+    [
+        (False, False, 96, "sdps-frames (lcnet-soft + frames)"),
+        (False, None, 7, "sdps-frames (lcnet-soft + frames)"),  # too few to refine
+        (False, None, 96, "sdps-plus (lcnet-soft + nenet-plus), refined"),
+        (False, True, 96, "sdps-plus (lcnet-soft + nenet-plus), refined"),
+        (True, False, 96, "frames, true lights"),
+    ],
+)
+def test_the_automatic_method_depends_on_what_follows(
+    lit: bool, refine: bool | None, images: int, expected: str
+) -> None:
+    from sdps import api
+
+    assert api._runner("auto", lit, None, None, refine, images).method.name.replace(" (shipped)", "") == expected
