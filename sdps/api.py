@@ -42,10 +42,9 @@ __all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "
 
 AUTO = "auto"
 _LEARNED = ("sdps-frames", "sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
-"""Tried in this order; the parts may be trained or shipped one by one."""
-_REFINED = _LEARNED[1:]
-"""The same where refinement follows: it ends no nearer to the truth from `sdps-frames` (docs/studies/refinement.md)."""
 _CALIBRATED = ("frames", "psfcn", "robust-least-squares")
+"""Tried in this order; the parts may be trained or shipped one by one. Refinement leaves out the first: from there it
+ends no nearer to the truth (docs/studies/refinement.md)."""
 _FALLBACK = "pf14"
 
 _log = logging.getLogger(__name__)
@@ -245,7 +244,7 @@ def _told(text: str, lit: bool, find: Callable[[str], Path]) -> Method:
 
 def _automatic(lit: bool, refines: bool, find: Callable[[str], Path]) -> str:
     """Return the best method whose weights are there, as it is or as the start of refinement."""
-    for name in _CALIBRATED if lit else _REFINED if refines else _LEARNED:
+    for name in (_CALIBRATED if lit else _LEARNED)[refines:]:
         try:
             _told(name, lit, find)
         except InputError:

@@ -189,6 +189,7 @@ def test_methods_that_can_be_used_are_listed():
         (False, None, 96, "sdps-plus (lcnet-soft + nenet-plus), refined"),
         (False, True, 96, "sdps-plus (lcnet-soft + nenet-plus), refined"),
         (True, False, 96, "frames, true lights"),
+        (True, None, 96, "psfcn, true lights, refined"),
     ],
 )
 def test_the_automatic_method_depends_on_what_follows(
