@@ -36,9 +36,9 @@ def join(folders: Sequence[Path], out: Path, *, first: bool = False) -> int:
         for scene in read_manifest(folder):
             if not (folder / scene.file).is_file():
                 continue
-            if scene.id in origins and first:
-                continue
             if scene.id in origins:
+                if first:
+                    continue
                 raise InputError(
                     f"{folder}: scene {scene.id} is in {origins[scene.id]} too; render different parts with --shard, "
                     "or add --first"

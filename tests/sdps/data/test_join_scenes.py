@@ -52,3 +52,10 @@ def test_folders_without_a_finished_scene_are_refused(tmp_path, capsys):
     folder = plan(tmp_path / "a", ["s0"], [])
     assert join_scenes.main([str(folder), "--out", str(tmp_path / "out")]) == 2
     assert "no finished scene" in capsys.readouterr().err
+
+
+def test_of_scenes_of_one_name_the_first_may_be_kept(tmp_path):
+    folders = [plan(tmp_path / "a", ["s0"], ["s0"]), plan(tmp_path / "b", ["s0", "s1"], ["s0", "s1"])]
+    assert join_scenes.main([*map(str, folders), "--out", str(tmp_path / "out"), "--first"]) == 0
+    assert [scene.id for scene in read_manifest(tmp_path / "out")] == ["s0", "s1"]
+    assert (tmp_path / "out" / "shards" / "s0.exr").read_text() == "a"

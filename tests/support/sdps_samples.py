@@ -1,0 +1,18 @@
+"""How samples of tests are made."""
+
+import numpy as np
+
+from sdps.data.augment import Augmentation
+from sdps.data.dataset import SampleOptions
+
+PLAIN = Augmentation(
+    exposure="paper", exposure_range=(1.0, 1.0), intensity_range=(1.0, 1.0), noise=0.0, clip=1e6
+)  # nothing happens
+
+
+def options(**changes: object) -> SampleOptions:
+    return SampleOptions(**{"seed": 0, "images": 4, "size": 32, "augmentation": Augmentation(), **changes})
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
