@@ -139,9 +139,8 @@ def _section(result: "Inference") -> SectionWriter:
     if "refined" in result.estimate.diagnostics:
         writer.strip("Refinement", _refinement_pictures(result, box))
     elif result.expected_error is not None:
-        expected = np.where(result.photos.mask, result.expected_error, np.nan)
-        tile = Tile("error to expect (yellow: 20 degrees)", pictures.error_map(expected, 20.0)[box])
-        writer.strip("How sure the network is", [tile])
+        caption, picture = _expected_picture(result.expected_error, result.photos.mask)
+        writer.strip("How sure the network is", [Tile(caption, picture[box])])
     return writer
 
 
@@ -163,11 +162,16 @@ def _refinement_pictures(result: "Inference", box: tuple[slice, slice]) -> list[
     most = float(np.percentile(residual[mask], 99))
     maps = (
         ("moved (yellow: 20 degrees)", pictures.error_map(np.where(mask, moved, np.nan), 20.0)),
-        ("error to expect (yellow: 20 degrees)", pictures.error_map(np.where(mask, expected, np.nan), 20.0)),
+        _expected_picture(expected, mask),
         (f"not explained (yellow: {most:.2f})", pictures.error_map(np.where(mask, residual, np.nan), most)),
     )
     before = Tile("normals before", pictures.normal_map(found["start"].normals, mask)[box], "normals")
     return [before, *(Tile(caption, picture[box]) for caption, picture in maps)]
+
+
+def _expected_picture(expected: np.ndarray, mask: np.ndarray) -> tuple[str, np.ndarray]:
+    """Return the errors to expect, in degrees, as a caption and a picture."""
+    return "error to expect (yellow: 20 degrees)", pictures.error_map(np.where(mask, expected, np.nan), 20.0)
 
 
 def _brightest(result: "Inference") -> slice:

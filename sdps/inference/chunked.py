@@ -18,7 +18,7 @@ from torch.nn import functional
 from render.shared.progress import stage
 from sdps.core.symmetry import Symmetry
 from sdps.inference.turned_views import AnyView
-from sdps.models.base import LightingNetwork, Lights, NormalNetwork, divide
+from sdps.models.base import KeepingNetwork, LightingNetwork, Lights, NormalNetwork, TurningNetwork, divide
 from sdps.models.observation_maps import predict_normals
 
 Autocast = Callable[[], AbstractContextManager[Any]]
@@ -68,7 +68,7 @@ def normal_map(
         view: Images whose sides are multiples of `network.size_multiple`.
         lights: Of all images, (1, L, ...); None for networks that are not told the lights.
         autocast: Makes the context in which the network runs.
-        symmetries: Of networks that turn their features: an answer for each, of the feature turned so. Others give one.
+        symmetries: Of a `TurningNetwork`: an answer for each, of the feature turned so. Others give one.
     """
     brightness = None if network.division == "none" else _brightness(network, view, lights)
     mask = view.mask
@@ -78,17 +78,19 @@ def normal_map(
         some = None if lights is None else Lights(lights.directions[:, part], lights.intensities[:, part])
         seen = network.observe(images, mask, some, brightness)
         with autocast():
-            if network.keeps:
+            if isinstance(network, KeepingNetwork):
                 kept.append(network.kept(seen))
             else:
                 feature = _maximum(feature, network.encode(seen))
         stage("normals", part.stop, len(view))
     with autocast():
-        if network.keeps:
+        if isinstance(network, KeepingNetwork):
             feature = network.fused(kept)
         assert feature is not None  # a view has an image
-        turned = [network.turned(feature, symmetry) for symmetry in symmetries] or [feature]
-        return [network.regress_with_error(each) for each in turned]
+        features = [feature]
+        if isinstance(network, TurningNetwork) and symmetries:
+            features = [network.turned(feature, symmetry) for symmetry in symmetries]
+        return [network.regress_with_error(each) for each in features]
 
 
 def _brightness(network: NormalNetwork, view: AnyView, lights: Lights | None) -> Tensor:

@@ -27,7 +27,7 @@ from sdps.inference.turned_views import (
     turned_context,
     turned_lights,
 )
-from sdps.models.base import Lights, NormalNetwork
+from sdps.models.base import Lights, NormalNetwork, TurningNetwork
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
 from sdps.models.lighting_variants import LCNetSecond
@@ -255,7 +255,7 @@ class Estimator(InferenceConfig):
         network = cast(NormalNetwork, model.network)
         symmetries = SYMMETRIES[: self.normal_views or 1]
         answers: list[tuple[Tensor, Tensor | None]] = []
-        if network.turns:
+        if isinstance(network, TurningNetwork):
             answers = normal_map(network, view, lights, self.arithmetic.autocast, symmetries)
         else:
             for number, symmetry in enumerate(symmetries):

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from render.shared.errors import InputError, unknown
-from sdps.models.base import DIVISIONS, Division, Observations
+from sdps.models.base import DIVISIONS, Division, KeepingNetwork, Observations
 from sdps.models.blocks import Convolution, initialise, max_over_images
 from sdps.models.nenet import MaxFusionNet
 
@@ -53,7 +53,7 @@ class NormalsAndShading(NamedTuple):
     shading: tuple[Tensor, Tensor]  # (B, Q, 1, H/4, W/4) after the attention, (B, Q, 1, H/2, W/2) before the fusion
 
 
-class AttentionNet(MaxFusionNet):
+class AttentionNet(MaxFusionNet, KeepingNetwork):
     """NENet with attention across the lights of a pixel.
 
     Of every image its feature at quarter size is kept until all images were seen: 16 bytes per pixel of the image, a
@@ -67,8 +67,6 @@ class AttentionNet(MaxFusionNet):
     Raises:
         InputError: an unknown division, or a negative number of blocks.
     """
-
-    keeps = True
 
     def __init__(self, *, blocks: int = 3, division: Division = "max", shading: bool = True) -> None:
         if division not in DIVISIONS:

@@ -101,8 +101,8 @@ class NormalNetwork(nn.Module, ABC):
     """Estimates normals from any number of images, in any order, by the maximum over their features.
 
     `encode` followed by `regress` lets a caller keep a running maximum, so that memory does not grow with the number
-    of images. A network with a `division` also needs each pixel's `brightness` over all images beforehand. One with
-    attention across lights needs the features of all images at once (`sdps.models.attention`).
+    of images. A network with a `division` also needs each pixel's `brightness` over all images beforehand. One
+    whose lights meet earlier needs all images at once (`KeepingNetwork`).
 
     Attributes:
         needs_lights: The network is told directions, and its images are divided by the intensities.
@@ -110,17 +110,12 @@ class NormalNetwork(nn.Module, ABC):
         division: Images are divided by each pixel's `norm` over all lights and channels (PS-FCN (Norm.), Chen et al.,
             TPAMI 2020), or by its `max`imum (ESSENCE-Net), which takes albedo away and leaves shading.
         size_multiple: Sides of images must be multiples of it.
-        keeps: Its lights meet pixel by pixel, so that a maximum over images does not do: `kept` takes of some images
-            what is needed of them, and `fused` makes the feature of all of it.
-        turns: Its feature turns with the scene, so that turned views need none of their own (`turned`).
     """
 
     needs_lights: bool = True
     needs_mask: bool = False
     division: Division = "none"
     size_multiple: int = 4
-    keeps: bool = False
-    turns: bool = False
 
     def observe(
         self,
@@ -161,7 +156,7 @@ class NormalNetwork(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, seen: Observations) -> Any:
-        """Return the feature of the given images, a maximum over theirs unless the network `keeps`."""
+        """Return the feature of the given images, a maximum over theirs but for a `KeepingNetwork`."""
 
     @abstractmethod
     def regress(self, feature: Any) -> Tensor:
@@ -171,21 +166,29 @@ class NormalNetwork(nn.Module, ABC):
         """Return the normals, and the angles to the true ones to expect, (B, 1, H, W) degrees, if it tells them."""
         return self.regress(feature), None
 
-    def kept(self, seen: Observations) -> Any:
-        """Return what `fused` needs of some of a scene's images; of networks that keep."""
-        raise NotImplementedError
-
-    def turned(self, feature: Any, symmetry: Symmetry) -> Any:
-        """Return the feature that the scene would have had if it were turned; of networks that turn."""
-        raise NotImplementedError
-
-    def fused(self, parts: list[Any]) -> Any:
-        """Return the feature of all of a scene's images, without gradients; of networks that keep."""
-        raise NotImplementedError
-
     def forward(self, seen: Observations) -> Tensor:
         """Return unit normals (B, 3, H, W)."""
         return self.regress(self.encode(seen))
+
+
+class KeepingNetwork(NormalNetwork):
+    """A normal network whose lights meet pixel by pixel, so that a running maximum over the images does not do."""
+
+    @abstractmethod
+    def kept(self, seen: Observations) -> Any:
+        """Return what `fused` needs of some of a scene's images."""
+
+    @abstractmethod
+    def fused(self, parts: list[Any]) -> Any:
+        """Return the feature of all of a scene's images, of what `kept` gave, without gradients."""
+
+
+class TurningNetwork(NormalNetwork):
+    """A normal network whose feature turns with the scene, so that turned views need none of their own."""
+
+    @abstractmethod
+    def turned(self, feature: Any, symmetry: Symmetry) -> Any:
+        """Return the feature that the turned scene would have had."""
 
 
 def divide(images: Tensor, intensities: Tensor) -> Tensor:

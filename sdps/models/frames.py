@@ -19,7 +19,7 @@ from torch.nn import functional
 from render.shared.errors import InputError, unknown
 from sdps.core.first_normals import first_normals, frames
 from sdps.core.symmetry import Symmetry
-from sdps.models.base import NormalNetwork, Observations
+from sdps.models.base import KeepingNetwork, Observations, TurningNetwork
 from sdps.models.blocks import SLOPE, conv, deconv
 
 FRAMES = ("normal", "camera")
@@ -75,7 +75,7 @@ class StagedNormals(NamedTuple):
     expected: Tensor  # (B, 1, H, W), distance to the true normals
 
 
-class FrameNet(NormalNetwork):
+class FrameNet(KeepingNetwork, TurningNetwork):
     """Normals pixel by pixel in frames of their own, then corrected by their surroundings.
 
     Args:
@@ -85,8 +85,6 @@ class FrameNet(NormalNetwork):
     """
 
     needs_mask = True
-    keeps = True
-    turns = True
 
     def __init__(self, *, width: int = 64, blocks: int = 4, frame: str = "normal") -> None:
         super().__init__()

@@ -28,7 +28,7 @@ from sdps.models import registry
 from sdps.models.attention import AttentionNet
 from sdps.models.base import LightingNetwork, Lights, NormalNetwork, Observations
 from sdps.models.checkpoint import TrainedModel
-from sdps.models.frames import FrameNet, StagedNormals
+from sdps.models.frames import FrameNet
 from sdps.models.lcnet import resize_input
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.models.upsfcn import UPSFCNLight
@@ -192,7 +192,7 @@ class NormalStage(Stage):
         return network.lights(network(*resize_input(batch.images, batch.mask)), self.config.read_out)
 
     def training_lights(self, batch: Batch) -> Lights | None:
-        """Return the lights the network is given in training, some of the way towards the true ones (`light_blend`)."""
+        """Return the lights given in training: with drawn errors, then some of the way to the true ones."""
         lights, limit = self.lights(batch), self.config.light_blend
         if lights is not None and self.config.light_error:
             lights = disturbed(lights, batch.seed.tolist(), self.config.light_error)
@@ -210,22 +210,12 @@ class NormalStage(Stage):
         side = self.config.crop or self.config.size
         images, mask, truth = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
         seen = self.network.observe(images, mask, lights)
-        if isinstance(self.network, FrameNet):
-            return self._frame_loss(self.network.staged(seen), truth, mask)
         if not isinstance(self.network, UPSFCNLight):
             return normal_loss(self.config, self.network, seen, truth, mask, batch.directions)
         normals, logits = self.network.with_lights(seen)
         loss, terms = plain_normal_loss(self.config, normals, truth, mask)
         terms["lighting_loss"] = self.network.lighting_loss(logits, batch.directions, batch.intensities)
         return loss + self.config.lighting_weight * terms["lighting_loss"], terms
-
-    def _frame_loss(self, staged: StagedNormals, truth: Tensor, mask: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of all that `FrameNet` tells of crops under the lights given."""
-        config = self.config
-        loss, terms = plain_normal_loss(config, staged.normals, truth, mask)
-        terms["pixel_loss"], _ = plain_normal_loss(config, staged.alone, truth, mask)
-        terms["expected_loss"] = expected_error_loss(staged.expected, staged.normals, truth, mask)
-        return loss + terms["pixel_loss"] + config.expected_weight * terms["expected_loss"], terms
 
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return the normal MAE on whole images, and the errors of lights that a model found or that were drawn."""
@@ -235,7 +225,7 @@ class NormalStage(Stage):
             "loss": float(masked_normal_loss(normals, batch.normals, batch.mask)),
             "normal_mae": normal_error(normals, batch),
         }
-        if isinstance(self.network, FrameNet) and lights is not None and self.config.light_error:
+        if lights is not None and self.config.light_error:
             drawn = disturbed(lights, batch.seed.tolist(), self.config.light_error)
             seen = self.network.observe(batch.images, batch.mask, drawn)
             values |= light_errors(drawn, batch, "_drawn")
@@ -260,6 +250,12 @@ def normal_loss(
         mask: (B, 1, H, W), 0 or 1.
         directions: (B, Q, 3), the true ones.
     """
+    if isinstance(network, FrameNet):
+        staged = network.staged(seen)
+        loss, terms = plain_normal_loss(config, staged.normals, truth, mask)
+        terms["pixel_loss"], _ = plain_normal_loss(config, staged.alone, truth, mask)
+        terms["expected_loss"] = expected_error_loss(staged.expected, staged.normals, truth, mask)
+        return loss + terms["pixel_loss"] + config.expected_weight * terms["expected_loss"], terms
     if not (isinstance(network, AttentionNet) and network.shades and config.shading_weight):
         return plain_normal_loss(config, network(seen), truth, mask)
     normals, maps = network.with_shading(seen)

@@ -284,4 +284,6 @@ class JointTraining(NormalTraining):
             raise InputError("options must be empty: the networks are those of the pair")
         if self.light_blend:
             raise InputError("light_blend must be 0: the normals' error reaches the lighting model through its lights")
+        if self.light_error:
+            raise InputError("light_error must be 0: the lights' own errors are what is to shrink")
         check_fields(self, "positive", "normal_weight")

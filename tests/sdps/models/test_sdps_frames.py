@@ -20,6 +20,7 @@ from sdps.models.registry import MODELS
 from sdps.training import recipes
 from sdps.training.stage_factory import create_stage
 from sdps.training.stages import disturbed
+from sdps.training.training_config import JointTraining
 
 
 def unit(*shape: int) -> Tensor:
@@ -179,6 +180,11 @@ def test_training_lights_err_and_validation_lights_do_not():
     with torch.no_grad():
         scores = stage.metrics(batch)
     assert scores["direction_mae_drawn"] > 0.1 and scores["normal_mae_drawn"] != scores["normal_mae"]
+
+
+def test_joint_training_draws_no_errors_onto_its_lights():
+    with pytest.raises(InputError, match="light_error must be 0"):
+        JointTraining(light_error=1.0)
 
 
 def test_the_chord_loss_grows_with_the_angle_and_knows_the_mask():
