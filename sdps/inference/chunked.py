@@ -18,7 +18,15 @@ from torch.nn import functional
 from render.shared.progress import stage
 from sdps.core.symmetry import Symmetry
 from sdps.inference.turned_views import AnyView
-from sdps.models.base import KeepingNetwork, LightingNetwork, Lights, NormalNetwork, TurningNetwork, divide
+from sdps.models.base import (
+    KeepingNetwork,
+    LightingNetwork,
+    Lights,
+    MeetingNetwork,
+    NormalNetwork,
+    TurningNetwork,
+    divide,
+)
 from sdps.models.observation_maps import predict_normals
 
 Autocast = Callable[[], AbstractContextManager[Any]]
@@ -49,6 +57,8 @@ def lighting_prediction(
         local.append(feature)
         shared = _maximum(shared, feature.amax(dim=1, keepdim=True))
     assert shared is not None  # a view has an image
+    if isinstance(network, MeetingNetwork):
+        local = [torch.cat(local, dim=1)]
     with autocast():
         predictions = [network.predict(feature, shared) for feature in local]
     return type(predictions[0])(*(torch.cat(parts, dim=1) for parts in zip(*predictions, strict=True)))

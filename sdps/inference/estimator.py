@@ -129,7 +129,8 @@ class Estimator(InferenceConfig):
             so that scoring them is refused. Diagnostics hold `seconds`, `precision` (what was computed in), `exposure`
             (factor applied for each network), `stray_light` (L, 3) (taken off before that) and, where classes of light
             were estimated, `confidence` (L,), the product of the probabilities of the two likeliest direction classes;
-            of normal models that tell it, `expected_error` (H, W), the error to expect in degrees, 0 off the object.
+            of lighting models that tell it, `expected_light_error` (L,), the error to expect of each direction, and of
+            normal models, `expected_error` (H, W), 0 off the object; both in degrees.
 
         Raises:
             InputError: sizes that do not fit, non-finite values, an empty mask, lights wanted without a lighting
@@ -219,6 +220,8 @@ class Estimator(InferenceConfig):
             lights = self._lighting_pass("second", scene, self.read_out, diagnostics, context)
         if lights.confidence is not None:
             diagnostics["confidence"] = lights.confidence[0].float().cpu().numpy()
+        if lights.expected is not None:
+            diagnostics["expected_light_error"] = lights.expected[0].float().cpu().numpy()
         return self._merged(known, lights)
 
     def _taken(self, found: Estimate, known: _Known, count: int, diagnostics: dict[str, Any]) -> Lights:
@@ -226,7 +229,8 @@ class Estimator(InferenceConfig):
         if known.directions is not None or len(found.light_directions) != count:
             raise InputError("found holds lights of other images, or of images whose lights are given")
         diagnostics["exposure"].update(found.diagnostics["exposure"])
-        diagnostics.update({name: found.diagnostics[name] for name in ("confidence",) if name in found.diagnostics})
+        told = ("confidence", "expected_light_error")
+        diagnostics.update({name: found.diagnostics[name] for name in told if name in found.diagnostics})
         return self._lights(found.light_directions, found.intensities)
 
     def _lighting_pass(

@@ -79,8 +79,9 @@ def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
     directions = torch.stack([symmetry.back.vectors(lights.directions.float()) for symmetry, lights in found]).mean(0)
     intensities = torch.stack([lights.intensities.float() for _, lights in found]).mean(0)
     sure = [lights.confidence.float() for _, lights in found if lights.confidence is not None]
-    confidence = torch.stack(sure).mean(0) if sure else None
-    return Lights(functional.normalize(directions, dim=-1), intensities, confidence)
+    errors = [lights.expected.float() for _, lights in found if lights.expected is not None]
+    confidence, expected = (torch.stack(values).mean(0) if values else None for values in (sure, errors))
+    return Lights(functional.normalize(directions, dim=-1), intensities, confidence, expected)
 
 
 def mean_normals(

@@ -28,6 +28,7 @@ class Lights(NamedTuple):
     directions: Tensor  # (B, Q, 3) float32, unit, from the surface to the light
     intensities: Tensor  # (B, Q) float32, positive, relative
     confidence: Tensor | None = None  # (B, Q) float32 in [0, 1], the product of the likeliest direction classes
+    expected: Tensor | None = None  # (B, Q) float32, the error of the direction to expect, in degrees
 
 
 class LightingNetwork(nn.Module, ABC):
@@ -87,6 +88,10 @@ class LightingNetwork(nn.Module, ABC):
         """Return the prediction of every image; the order of the images does not matter."""
         local = self.encode(images, mask, context)
         return self.predict(local, max_over_images(local, keepdim=True))
+
+
+class MeetingNetwork(LightingNetwork):
+    """A lighting network whose images meet more than once: `predict` must be given the features of all of them."""
 
 
 class Observations(NamedTuple):

@@ -19,6 +19,7 @@ from sdps.models.cnnps import CNNPS
 from sdps.models.frames import FrameNet
 from sdps.models.lcnet import LCNet
 from sdps.models.lighting_variants import LCNetReg, LCNetSecond, LCNetSoft
+from sdps.models.lightset import LightSetNet
 from sdps.models.nenet import NENet
 from sdps.models.upsfcn import UPSFCN, UPSFCNLight
 
@@ -98,7 +99,19 @@ def _entries() -> tuple[dict[str, ModelEntry], dict[str, Combination]]:
 
 NETWORKS: dict[str, type[nn.Module]] = {
     kind.__name__: kind
-    for kind in (LCNet, LCNetReg, LCNetSoft, LCNetSecond, NENet, AttentionNet, FrameNet, UPSFCN, UPSFCNLight, CNNPS)
+    for kind in (
+        LCNet,
+        LCNetReg,
+        LCNetSoft,
+        LCNetSecond,
+        LightSetNet,
+        NENet,
+        AttentionNet,
+        FrameNet,
+        UPSFCN,
+        UPSFCNLight,
+        CNNPS,
+    )
 }
 MODELS, COMBINATIONS = _entries()
 

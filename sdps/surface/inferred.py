@@ -140,6 +140,11 @@ class Inference:
             facts["light_confidence"] = dict(
                 zip(photos.files, np.round(np.asarray(confidence, float), 4).tolist(), strict=True)
             )
+        expected = self.estimate.diagnostics.get("expected_light_error")
+        if expected is not None:
+            facts["expected_light_error_degrees"] = dict(
+                zip(photos.files, np.round(np.asarray(expected, float), 2).tolist(), strict=True)
+            )
         if self.expected_error is not None:
             facts["expected_normal_error_degrees"] = round(float(self.expected_error[photos.mask].mean()), 2)
         refined = self.estimate.diagnostics.get("refined")

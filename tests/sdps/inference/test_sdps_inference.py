@@ -291,7 +291,21 @@ def test_a_network_that_tells_the_error_to_expect_tells_it_in_degrees(estimator:
     assert "expected_error" not in estimator.estimate(images, mask, lights, np.ones(6)).diagnostics
 
 
-@pytest.mark.parametrize("names", [("lcnet", "nenet"), ("lcnet-soft", "nenet-plus", "lcnet-second")])
+@pytest.mark.parametrize("views", [1, 2])
+def test_a_network_that_tells_the_error_of_lights_to_expect_tells_it(estimator: Estimator, views: int) -> None:
+    images, mask, _ = scene(size=50)
+    model = replace(estimator, lighting=trained("lightset"), light_views=views)
+    told = model.estimate(images, mask).diagnostics
+    assert told["expected_light_error"].shape == (6,) and "confidence" not in told
+    assert ((told["expected_light_error"] > 0.0) & (told["expected_light_error"] < 180.0)).all()
+    found = model.estimate(images, mask, found=model.estimate_lights(images, mask)).diagnostics
+    np.testing.assert_array_equal(found["expected_light_error"], told["expected_light_error"])
+    assert "expected_light_error" not in estimator.estimate(images, mask).diagnostics
+
+
+@pytest.mark.parametrize(
+    "names", [("lcnet", "nenet"), ("lightset", "nenet"), ("lcnet-soft", "nenet-plus", "lcnet-second")]
+)
 def test_lights_found_before_change_nothing(names: tuple[str, ...]) -> None:
     images, mask, lights = scene(size=72)
     gains = np.linspace(0.5, 2.0, 6)

@@ -1,0 +1,166 @@
+"""A lighting network whose images see each other at every stage: what one image leaves open, the others tell.
+
+LCNet looks at every image by itself, and lets them meet once, at the end, by a maximum. Here each image is first
+divided by what its pixels show on average over all images, which takes the albedo away; before every convolution the
+images meet by mean and maximum (as the lights of a pixel do in `sdps.models.frames`); and at the end they attend to
+each other, knowing how alike they look: images that look alike have lights that are near.
+
+Legend: B scenes, Q images of a scene, S = 64 pixels a side, C channels.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from render.shared.errors import InputError
+from sdps.core.lighting import LightClasses, ReadOut
+from sdps.models.base import Lights, MeetingNetwork
+from sdps.models.blocks import SLOPE, Convolution
+
+_SEEN = 6
+"""Channels of an image: its radiance, its shading, how bright it is as a whole, and the mask."""
+_WIDTHS = (48, 96, 128, 192)
+"""Channels at 32, 16, 8 and 4 pixels a side."""
+_FLOOR = 0.01
+"""Added to what images are divided by; full scale is 1."""
+_BRIGHTEST = 6.0
+"""Shading that counts as no more: highlights reach hundreds of times the average."""
+_USUAL_INTENSITY = 0.94
+"""Geometric mean of intensities drawn evenly from 0.2 to 2. Only their ratios can be told from images."""
+_LOG_USUAL = -2.0
+"""Logarithm of the error that an untrained network expects: 8 degrees."""
+
+
+class SetPrediction(NamedTuple):
+    """What is predicted of every image."""
+
+    directions: Tensor  # (B, Q, 3) float32, unit
+    intensities: Tensor  # (B, Q) float32, positive, relative
+    expected: Tensor  # (B, Q) float32, distance to the true direction
+
+
+class Level(nn.Module):
+    """Convolutions of every image, which also see the mean and the maximum over the images; half the side remains."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.own = Convolution(inputs, outputs, 3, 2, 1)
+        self.shared = Convolution(2 * inputs, outputs, 3, 2, 1, bias=False)
+        self.more = Convolution(outputs, outputs, 3, 1, 1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return features (B, Q, C', h / 2, w / 2) of features (B, Q, C, h, w)."""
+        pooled = torch.cat([features.mean(dim=1), features.max(dim=1).values], dim=1)
+        own = self.own(features.flatten(0, 1)).unflatten(0, features.shape[:2])
+        found = functional.leaky_relu(own + self.shared(pooled)[:, None], SLOPE).flatten(0, 1)
+        return (found + functional.leaky_relu(self.more(found), SLOPE)).unflatten(0, features.shape[:2])
+
+
+class Attention(nn.Module):
+    """The images of a scene attend to each other, the more to those that look alike as each head finds fit."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.before, self.between = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.ask = nn.Linear(width, 3 * width)
+        self.answer = nn.Linear(width, width)
+        self.alike = nn.Sequential(nn.Linear(2, 16), nn.LeakyReLU(SLOPE), nn.Linear(16, heads))
+        self.think = nn.Sequential(nn.Linear(width, 2 * width), nn.LeakyReLU(SLOPE), nn.Linear(2 * width, width))
+
+    def forward(self, tokens: Tensor, likeness: Tensor) -> Tensor:
+        """Return tokens (B, Q, C); likeness is (B, Q, Q, 2)."""
+        query, key, value = self.ask(self.before(tokens)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        bias = self.alike(likeness).permute(0, 3, 1, 2)  # (B, heads, Q, Q)
+        heard = functional.scaled_dot_product_attention(query, key, value, attn_mask=bias.to(query.dtype))
+        tokens = tokens + self.answer(heard.transpose(1, 2).flatten(2))
+        return tokens + self.think(self.between(tokens))
+
+
+class LightSetNet(MeetingNetwork):
+    """Regresses the light of every image, and the error to expect of it, from all images together.
+
+    Args:
+        width: Channels of an image once its map is read.
+        blocks: Layers of attention across the images.
+        heads: Of the attention.
+        intensity_range: Intensities drawn in training.
+    """
+
+    def __init__(
+        self, *, width: int = 256, blocks: int = 3, heads: int = 4, intensity_range: tuple[float, float] = (0.2, 2.0)
+    ) -> None:
+        super().__init__()
+        if blocks < 0 or width < 1 or heads < 1 or width % heads:
+            raise InputError(f"heads must divide width, and blocks be 0 or more, got {heads}, {width} and {blocks}")
+        self.classes = LightClasses(low=intensity_range[0], high=intensity_range[1])
+        ends = zip((_SEEN, *_WIDTHS), _WIDTHS, strict=False)
+        self.levels = nn.Sequential(*(Level(inputs, outputs) for inputs, outputs in ends))
+        self.read = nn.Linear(_WIDTHS[-1] * 16, width)
+        self.blocks = nn.ModuleList(Attention(width, heads) for _ in range(blocks))
+        self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 5))
+
+    def encode(self, images: Tensor, mask: Tensor, context: Tensor | None = None) -> Tensor:
+        """Return the object's radiance and the mask, (B, Q, 4, S, S), of half the images' resolution."""
+        masks = mask[:, None].expand(-1, images.shape[1], -1, -1, -1)
+        both = torch.cat([images * masks, masks], dim=2)
+        return functional.avg_pool2d(both.flatten(0, 1), 2).unflatten(0, images.shape[:2])
+
+    def predict(self, local: Tensor, shared: Tensor) -> SetPrediction:
+        """Return the prediction of every image; `local` is of all images of the scenes."""
+        with torch.no_grad(), torch.autocast(local.device.type, enabled=False):
+            seen, likeness = described(local.float())
+        tokens = self.read(self.levels(seen).flatten(2))
+        for block in self.blocks:
+            tokens = block(tokens, likeness)
+        # Never under autocast: a direction rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
+        with torch.autocast(local.device.type, enabled=False):
+            values = self.out(tokens.float())  # (B, Q, 5)
+            # Towards the camera at first; lights behind the object are not to be found.
+            directions = functional.normalize(values[..., :3] + values.new_tensor([0.0, 0.0, 0.5]), dim=-1)
+            strengths = values[..., 3]
+            intensities = _USUAL_INTENSITY * (strengths - strengths.mean(dim=1, keepdim=True)).exp()
+            return SetPrediction(directions, intensities, (values[..., 4] + _LOG_USUAL).exp())
+
+    def loss(self, prediction: SetPrediction, directions: Tensor, intensities: Tensor) -> dict[str, Tensor]:
+        """Return the chord of the directions, the error of the relative intensities, and that of the expected error."""
+        # The tiny constant keeps the gradient of a length finite where the estimate is perfect.
+        chord = ((prediction.directions - directions).square().sum(-1) + 1e-6).sqrt()  # (B, Q)
+        off = (intensities / prediction.intensities).log()
+        relative = (off - off.mean(dim=1, keepdim=True)).abs().mean()
+        likely = (chord.detach() / prediction.expected + prediction.expected.log()).mean()
+        total = chord.mean() + 0.5 * relative + 0.02 * likely
+        return {"total": total, "chord": chord.mean(), "relative": relative, "expected": likely}
+
+    def lights(self, prediction: SetPrediction, read_out: ReadOut = "centre") -> Lights:
+        """Return the regressed lights; there are no classes to read out."""
+        expected = torch.rad2deg(2.0 * (0.5 * prediction.expected).clamp(max=1.0).asin())
+        return Lights(prediction.directions, prediction.intensities, expected=expected)
+
+
+def described(local: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what the network sees of each image, (B, Q, 6, S, S), and how alike images look, (B, Q, Q, 2).
+
+    Args:
+        local: (B, Q, 4, S, S), the object's radiance and the mask.
+    """
+    radiance, mask = local[:, :, :3], local[:, :, 3:]
+    grey = radiance.mean(dim=2, keepdim=True)
+    average = grey.mean(dim=1, keepdim=True).clamp(min=0.0)  # less than nothing where a camera's black level is off
+    shading = (mask * grey / (average + _FLOOR)).clamp(-1.0, _BRIGHTEST)  # (B, Q, 1, S, S), without albedo
+    inside = mask.sum(dim=(2, 3, 4), keepdim=True).clamp(min=1.0)
+    level = (shading.sum(dim=(2, 3, 4), keepdim=True) / inside).clamp(min=0.0) + 0.05  # (B, Q, 1, 1, 1)
+    pattern = shading / level
+    seen = torch.cat([radiance.clamp(min=0.0).sqrt(), torch.asinh(pattern), level.log() * mask, mask], dim=2)
+    flat = pattern.flatten(2)  # (B, Q, S S)
+    about = (pattern - mask).flatten(2)
+    likeness = torch.stack([_cosines(flat), _cosines(about)], dim=-1)
+    return seen, likeness
+
+
+def _cosines(vectors: Tensor) -> Tensor:
+    """Return the cosines (B, Q, Q) between vectors (B, Q, N)."""
+    unit = functional.normalize(vectors, dim=-1)
+    return unit @ unit.transpose(1, 2)

@@ -1,0 +1,126 @@
+"""The lighting network whose images meet at every stage."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from render.shared.errors import InputError
+from sdps.inference.chunked import lighting_prediction
+from sdps.models.blocks import parameter_count
+from sdps.models.lightset import LightSetNet, SetPrediction, described
+from sdps.models.registry import MODELS
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    torch.manual_seed(5)
+
+
+@pytest.fixture
+def network() -> LightSetNet:
+    return LightSetNet(width=32, blocks=2, heads=2).eval()
+
+
+def scene(images: int = 5) -> tuple[Tensor, Tensor]:
+    """Return random images (1, Q, 3, 128, 128) and a mask that leaves a border."""
+    mask = torch.zeros(1, 1, 128, 128)
+    mask[..., 10:-20, 16:-8] = 1.0
+    return torch.rand(1, images, 3, 128, 128), mask
+
+
+class Chunks:
+    """A view of images in chunks of two."""
+
+    def __init__(self, images: Tensor, mask: Tensor) -> None:
+        self.images, self.mask = images, mask
+
+    def __len__(self) -> int:
+        return self.images.shape[1]
+
+    def __iter__(self):
+        for start in range(0, len(self), 2):
+            part = slice(start, min(start + 2, len(self)))
+            yield part, self.images[:, part]
+
+
+def test_it_has_the_parameters_of_the_registry():
+    assert parameter_count(LightSetNet()) == MODELS["lightset"].parameters
+
+
+def test_the_order_of_the_images_does_not_matter(network):
+    images, mask = scene()
+    order = torch.tensor([3, 0, 4, 1, 2])
+    with torch.no_grad():
+        one, other = network(images, mask), network(images[:, order], mask)
+    for first, second in zip(one, other, strict=True):
+        torch.testing.assert_close(first[:, order], second, atol=1e-5, rtol=1e-4)
+
+
+def test_chunks_give_what_all_images_at_once_give(network):
+    images, mask = scene()
+    with torch.inference_mode():
+        found = lighting_prediction(network, Chunks(images, mask), torch.inference_mode)
+        whole = network(images, mask)
+    for first, second in zip(found, whole, strict=True):
+        torch.testing.assert_close(first, second, atol=1e-5, rtol=1e-4)
+
+
+def test_albedo_does_not_change_the_shading():
+    local = torch.rand(1, 6, 4, 64, 64) + 0.3
+    local[:, :, 3] = 1.0
+    painted = local.clone()
+    painted[:, :, :3] *= torch.rand(1, 1, 1, 64, 64) + 0.5
+    (one, alike), (other, painted_alike) = described(local), described(painted)
+    torch.testing.assert_close(one[:, :, 3], other[:, :, 3], atol=0.02, rtol=0.02)  # but for the floor
+    torch.testing.assert_close(alike, painted_alike, atol=0.02, rtol=0.02)
+
+
+def test_images_that_look_alike_are_told_so():
+    local = torch.rand(1, 3, 4, 64, 64)
+    local[:, :, 3] = 1.0
+    local[:, 1, :3] = 0.5 * local[:, 0, :3]
+    _, alike = described(local)
+    assert alike[0, 0, 1].min() > 0.97 and alike[0, 0, 2, 1] < 0.5
+
+
+def test_what_lies_off_the_object_is_not_seen(network):
+    images, mask = scene()
+    elsewhere = images + (1 - mask[:, None]) * torch.rand_like(images)
+    with torch.no_grad():
+        for first, second in zip(network(images, mask), network(elsewhere, mask), strict=True):
+            torch.testing.assert_close(first, second)
+
+
+@pytest.mark.parametrize("values", [0.0, -0.01])
+def test_black_images_have_a_light(network, values):
+    images, mask = scene()
+    with torch.no_grad():
+        prediction = network(torch.full_like(images, values), mask)
+    assert all(torch.isfinite(part).all() for part in prediction)
+
+
+def test_the_scale_of_intensities_costs_nothing_and_the_ratios_do(network):
+    directions = functional.normalize(torch.randn(1, 4, 3), dim=-1)
+    strengths = torch.tensor([[0.3, 0.6, 1.2, 0.9]])
+    prediction = SetPrediction(directions, strengths, torch.full((1, 4), 0.1))
+    alike, other = (
+        network.loss(prediction, directions, scale * torch.tensor([[0.3, 0.6, 1.2, last]]))["relative"]
+        for scale, last in ((2.0, 0.9), (1.0, 1.8))
+    )
+    assert alike < 1e-6
+    assert math.isclose(other, 0.375 * math.log(2.0), rel_tol=1e-4)
+
+
+def test_expected_errors_are_told_in_degrees(network):
+    chord = torch.tensor([[2.0 * math.sin(math.radians(5.0)), 3.0]])
+    lights = network.lights(SetPrediction(torch.zeros(1, 2, 3), torch.ones(1, 2), chord))
+    np.testing.assert_allclose(lights.expected, [[10.0, 180.0]], rtol=1e-5)
+
+
+def test_options_that_build_nothing_are_refused():
+    with pytest.raises(InputError, match="heads must divide width"):
+        LightSetNet(width=30, heads=4)
