@@ -23,7 +23,9 @@ from render.shared.config import check_fields
 from render.shared.errors import InputError
 
 DEPTHS = (8, 10, 12, 14, 16)
-_GAUSSIAN_FROM = 64.0  # electrons; from here on a Poisson distribution is taken for a Gaussian one
+_SKEWNESS = 0.125
+"""Skewness of photon and reading noise together up to which they are drawn as one Gaussian: that of 64 electrons read
+without noise. Above it photons are counted by a Poisson distribution."""
 _REFERENCE_BITS = 12  # whose DN the ranges of black levels are given in
 
 
@@ -82,13 +84,14 @@ class Sensor:
     def expose(self, images: np.ndarray, rng: np.random.Generator) -> np.ndarray:  # (Q, H, W, 3) float32
         """Return DN, whole numbers in 0..`top`, of images as in `expected`."""
         electrons = self.expected(images)
-        few = electrons < _GAUSSIAN_FROM
-        counted = rng.poisson(electrons[few])
-        noise = rng.standard_normal(electrons.shape, dtype=np.float32)
         read = np.float32(self.read_noise)
-        counted = counted + read * noise[few]
+        noise = rng.standard_normal(electrons.shape, dtype=np.float32)
+        variance = electrons + read**2
+        deviation = np.sqrt(variance)
+        few = electrons > _SKEWNESS * variance * deviation
+        counted = rng.poisson(electrons[few]) + read * noise[few]
         # Sums of independent Gaussians: one draw has the variance of both noises.
-        noise *= np.sqrt(electrons + read**2)
+        noise *= deviation
         electrons += noise
         electrons[few] = counted
         electrons *= np.float32(self.gain)

@@ -37,6 +37,19 @@ def test_read_noise_is_what_a_black_image_has():
     assert sensor.expose(flat(0), rng("read")).std() / sensor.gain == pytest.approx(8, rel=0.02)
 
 
+@pytest.mark.parametrize(("electrons", "read_noise"), [(3.0, 0.0), (10.0, 2.0), (20.0, 15.0), (200.0, 0.0)])
+def test_moments_of_few_electrons_are_those_of_poisson_and_gaussian_noise_together(electrons, read_noise):
+    camera = replace(CLEAN, full_well=1e4, read_noise=read_noise, bits=16, black_level=8192.0)
+    counted = (camera.expose(flat(electrons / 1e4), rng("moments")) - 8192.0) / camera.gain
+    variance = electrons + read_noise**2
+    assert counted.mean() == pytest.approx(electrons, abs=5 * np.sqrt(variance / counted.size))
+    assert counted.var() == pytest.approx(variance, rel=0.03)
+    skewness = ((counted - counted.mean()) ** 3).mean() / counted.std() ** 3
+    truth = electrons / variance**1.5
+    # Below 0.125 one Gaussian, which has none, stands for both noises.
+    assert skewness == pytest.approx(truth if truth > 0.125 else 0.0, abs=0.04)
+
+
 @pytest.mark.parametrize("bits", [8, 12, 16])
 def test_quantisation_step_and_clipping_point(bits):
     ramp = np.linspace(0, 1.5, 300_000, dtype=np.float32).reshape(1, 300, -1, 1) * np.ones(3, np.float32)
