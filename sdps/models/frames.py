@@ -148,7 +148,9 @@ class FrameNet(KeepingNetwork, TurningNetwork):
 
     def fused(self, parts: list[Observations]) -> FusedMap:
         """Return the fused map of all of a scene's images, a few pixels at a time, without gradients."""
-        seen = _joined(parts)
+        # Autocast to bfloat16 refuses to join images of 16-bit floats.
+        with torch.autocast(parts[0].images.device.type, enabled=False):
+            seen = _joined(parts)
         inside, pixels = object_pixels(seen)
         count = max(1, _STRIP // seen.images.shape[1])
         found = [

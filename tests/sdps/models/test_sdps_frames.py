@@ -132,6 +132,13 @@ def test_neither_order_nor_chunks_of_images_matter(trained, monkeypatch):
     torch.testing.assert_close(chunked, whole, atol=0.02, rtol=0)  # images are kept in 16 bits
 
 
+def test_chunks_are_joined_under_bfloat16(trained):
+    parts = [observations(count) for count in (4, 5)]
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        found = trained.regress(trained.fused([trained.kept(part) for part in parts]))
+    assert found.dtype == torch.float32 and found.isfinite().all()
+
+
 def test_an_untrained_network_gives_the_first_normals():
     network, seen = FrameNet().eval(), observations(12)
     inside, pixels = object_pixels(seen)
