@@ -37,7 +37,11 @@ _PIXELS = {"cpu": 64, "cuda": 2048}
 
 
 def lighting_prediction(
-    network: LightingNetwork, view: AnyView, autocast: Autocast, context: Callable[[slice], Tensor] | None = None
+    network: LightingNetwork,
+    view: AnyView,
+    autocast: Autocast,
+    context: Callable[[slice], Tensor] | None = None,
+    seed: int = 0,
 ) -> Any:
     """Return a lighting network's prediction for all images, as its `forward` would.
 
@@ -46,6 +50,7 @@ def lighting_prediction(
         view: Images of 128x128.
         autocast: Makes the context in which the network runs.
         context: Further channels (1, n, C, 128, 128) for the images of a slice.
+        seed: For what a `MeetingNetwork` draws.
     """
     mask, local = view.mask, []
     shared: Tensor | None = None
@@ -58,7 +63,8 @@ def lighting_prediction(
         shared = _maximum(shared, feature.amax(dim=1, keepdim=True))
     assert shared is not None  # a view has an image
     if isinstance(network, MeetingNetwork):
-        local = [torch.cat(local, dim=1)]
+        with autocast():
+            return network.predict_many(torch.cat(local, dim=1), seed)
     with autocast():
         predictions = [network.predict(feature, shared) for feature in local]
     return type(predictions[0])(*(torch.cat(parts, dim=1) for parts in zip(*predictions, strict=True)))

@@ -84,6 +84,17 @@ def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
     return Lights(functional.normalize(directions, dim=-1), intensities, confidence, expected)
 
 
+def mean_opinion(one: Lights, other: Lights) -> Lights:
+    """Return the mean of two networks' lights: directions of unit length, the geometric mean of the intensities.
+
+    Confidence and expected error are those of the network that tells them: the mean errs less.
+    """
+    directions = functional.normalize(one.directions.float() + other.directions.float(), dim=-1)
+    intensities = (one.intensities.float() * other.intensities.float()).sqrt()
+    confidence = other.confidence if one.confidence is None else one.confidence
+    return Lights(directions, intensities, confidence, other.expected if one.expected is None else one.expected)
+
+
 def mean_normals(
     symmetries: Sequence[Symmetry], answers: Sequence[tuple[Tensor, Tensor | None]]
 ) -> tuple[Tensor, Tensor | None]:

@@ -93,6 +93,15 @@ class LightingNetwork(nn.Module, ABC):
 class MeetingNetwork(LightingNetwork):
     """A lighting network whose images meet more than once: `predict` must be given the features of all of them."""
 
+    def predict_many(self, local: Tensor, seed: int) -> Any:
+        """Return the prediction of a scene that may have more images than scenes of training.
+
+        Args:
+            local: (1, L, F, ...), features of all its images.
+            seed: For what is drawn; another for each turned view.
+        """
+        return self.predict(local, local)
+
 
 class Observations(NamedTuple):
     """What a normal network sees of a scene; made by `NormalNetwork.observe`."""

@@ -19,6 +19,8 @@ from sdps.core.lighting import LightClasses, ReadOut
 from sdps.models.base import Lights, MeetingNetwork
 from sdps.models.blocks import SLOPE, Convolution
 
+SIDE = 64
+"""Pixels a side that the network sees; larger images are averaged."""
 _SEEN = 6
 """Channels of an image: its radiance, its shading, how bright it is as a whole, and the mask."""
 _WIDTHS = (48, 96, 128, 192)
@@ -29,6 +31,8 @@ _BRIGHTEST = 6.0
 """Shading that counts as no more: highlights reach hundreds of times the average."""
 _USUAL_INTENSITY = 0.94
 """Geometric mean of intensities drawn evenly from 0.2 to 2. Only their ratios can be told from images."""
+_TOGETHER = 32
+"""Images that meet in use, about: many more than in training meet another mean, maximum and attention than it had."""
 _LOG_USUAL = -2.0
 """Logarithm of the error that an untrained network expects: 8 degrees."""
 
@@ -103,10 +107,10 @@ class LightSetNet(MeetingNetwork):
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 5))
 
     def encode(self, images: Tensor, mask: Tensor, context: Tensor | None = None) -> Tensor:
-        """Return the object's radiance and the mask, (B, Q, 4, S, S), of half the images' resolution."""
+        """Return the object's radiance and the mask, (B, Q, 4, S, S), of images of any side, 128 in use."""
         masks = mask[:, None].expand(-1, images.shape[1], -1, -1, -1)
         both = torch.cat([images * masks, masks], dim=2)
-        return functional.avg_pool2d(both.flatten(0, 1), 2).unflatten(0, images.shape[:2])
+        return functional.adaptive_avg_pool2d(both.flatten(0, 1), SIDE).unflatten(0, images.shape[:2])
 
     def predict(self, local: Tensor, shared: Tensor) -> SetPrediction:
         """Return the prediction of every image; `local` is of all images of the scenes."""
@@ -123,6 +127,19 @@ class LightSetNet(MeetingNetwork):
             strengths = values[..., 3]
             intensities = _USUAL_INTENSITY * (strengths - strengths.mean(dim=1, keepdim=True)).exp()
             return SetPrediction(directions, intensities, (values[..., 4] + _LOG_USUAL).exp())
+
+    def predict_many(self, local: Tensor, seed: int) -> SetPrediction:
+        """Return intensities of all images together, which alone have one scale, and directions group by group."""
+        together = self.predict(local, local)
+        groups = local.shape[1] // _TOGETHER
+        if groups < 2:
+            return together
+        directions, expected = torch.empty_like(together.directions), torch.empty_like(together.expected)
+        order = torch.randperm(local.shape[1], generator=torch.Generator().manual_seed(seed)).to(local.device)
+        for part in order.tensor_split(groups):
+            found = self.predict(local[:, part], local)
+            directions[:, part], expected[:, part] = found.directions, found.expected
+        return together._replace(directions=directions, expected=expected)
 
     def loss(self, prediction: SetPrediction, directions: Tensor, intensities: Tensor) -> dict[str, Tensor]:
         """Return the chord of the directions, the error of the relative intensities, and that of the expected error."""

@@ -69,6 +69,33 @@ def test_chunks_give_what_all_images_at_once_give(network):
         torch.testing.assert_close(first, second, atol=1e-5, rtol=1e-4)
 
 
+def test_many_images_meet_in_groups_but_share_one_scale(network, monkeypatch):
+    images, mask = scene(7)
+    with torch.no_grad():
+        local = network.encode(images, mask)
+        together = network.predict(local, local)
+        for first, second in zip(network.predict_many(local, 0), together, strict=True):
+            torch.testing.assert_close(first, second)  # too few to be parted
+        monkeypatch.setattr("sdps.models.lightset._TOGETHER", 3)
+        found, again, other = (network.predict_many(local, seed) for seed in (0, 0, 1))
+        order = torch.randperm(7, generator=torch.Generator().manual_seed(0))
+        groups = [network.predict(local[:, part], local) for part in order.tensor_split(2)]
+    torch.testing.assert_close(found.intensities, together.intensities)
+    torch.testing.assert_close(found.directions[:, order], torch.cat([group.directions for group in groups], dim=1))
+    torch.testing.assert_close(found.expected[:, order], torch.cat([group.expected for group in groups], dim=1))
+    torch.testing.assert_close(found.directions, again.directions)
+    assert (found.directions - other.directions).abs().max() > 1e-4
+
+
+def test_images_of_any_side_are_seen_alike(network):
+    images, mask = scene(2)
+    small = [functional.avg_pool2d(part.flatten(0, 1), 2) for part in (images * mask[:, None], mask[:, None])]
+    assert torch.equal(small[1] > 0, small[1] == 1)  # the mask's border lies on even pixels
+    with torch.no_grad():
+        one, other = network.encode(images, mask), network.encode(small[0][None], small[1])
+    torch.testing.assert_close(one, other)
+
+
 def test_albedo_does_not_change_the_shading():
     local = torch.rand(1, 6, 4, 64, 64) + 0.3
     local[:, :, 3] = 1.0
