@@ -343,7 +343,9 @@ def load_estimator(
     """
     device = default_device(device)
     files = {"lighting": lighting, "also": also, "normals": normals, "second": second}
-    models = {place: None if file is None else load_model(file, device, _ROLES[place]) for place, file in files.items()}
+    models: dict[str, Any] = {
+        place: None if file is None else load_model(file, device, _ROLES[place]) for place, file in files.items()
+    }
     return Estimator(**models, device=device, **options)
 
 
