@@ -27,7 +27,7 @@ from sdps.models.base import (
     TurningNetwork,
     divide,
 )
-from sdps.models.observation_maps import predict_normals
+from sdps.models.cnnps import predict_normals
 
 Autocast = Callable[[], AbstractContextManager[Any]]
 _GREY_VALUES = 2**26

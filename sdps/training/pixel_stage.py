@@ -18,7 +18,7 @@ from render.shared.seeds import derived_seed
 from sdps.core.metrics import angle_degrees
 from sdps.data.dataset import Batch
 from sdps.models.base import Lights
-from sdps.models.observation_maps import observation_maps, predict_normals, rotate_about_view
+from sdps.models.cnnps import observation_maps, predict_normals, rotate_about_view
 from sdps.training.stages import NormalStage
 from sdps.training.training_config import PixelTraining
 

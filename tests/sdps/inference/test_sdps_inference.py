@@ -20,7 +20,7 @@ from sdps.data.dataset import Batch
 from sdps.inference import chunked, image_source
 from sdps.inference.estimator import Estimator, load_estimator
 from sdps.models.checkpoint import TrainedModel, save_weights
-from sdps.models.observation_maps import predict_normals
+from sdps.models.cnnps import predict_normals
 from sdps.models.registry import create
 from sdps.training.joint import SecondStage
 from sdps.training.training_config import LightingTraining

@@ -60,9 +60,9 @@ def test_the_context_of_a_second_pass_turns_with_its_vectors(symmetry: Symmetry)
 def test_the_mean_of_lights_undoes_the_turns() -> None:
     true = torch.nn.functional.normalize(torch.rand(1, 4, 3), dim=-1)
     gains = torch.rand(1, 4)
-    found = [(symmetry, Lights(symmetry.vectors(true), gains, gains)) for symmetry in SYMMETRIES]
+    found = [(symmetry, Lights(symmetry.vectors(true), gains, gains, gains)) for symmetry in SYMMETRIES]
     mean = mean_lights(found)
-    for one, two in zip(mean, (true, gains, gains), strict=True):
+    for one, two in zip(mean, (true, gains, gains, gains), strict=True):
         torch.testing.assert_close(one, two)
 
 

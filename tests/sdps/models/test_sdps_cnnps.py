@@ -15,8 +15,7 @@ from sdps.core.metrics import angle_degrees, normal_mae
 from sdps.data.dataset import Batch
 from sdps.models.base import Lights
 from sdps.models.blocks import parameter_count
-from sdps.models.cnnps import CNNPS, MAP_SIDE
-from sdps.models.observation_maps import observation_maps, predict_normals, rotate_about_view
+from sdps.models.cnnps import CNNPS, MAP_SIDE, observation_maps, predict_normals, rotate_about_view
 from sdps.training.pixel_stage import PixelStage, draw_lights, draw_pixels, sample_pixels
 from sdps.training.training_config import PixelTraining
 

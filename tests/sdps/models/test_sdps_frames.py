@@ -14,8 +14,8 @@ from sdps.core.losses import chord_normal_loss, expected_error_loss
 from sdps.core.symmetry import Symmetry
 from sdps.models.base import Lights, Observations
 from sdps.models.blocks import parameter_count
+from sdps.models.cnnps import rotate_about_view
 from sdps.models.frames import FrameNet, Pixels, described, object_pixels
-from sdps.models.observation_maps import rotate_about_view
 from sdps.models.registry import MODELS
 from sdps.training import recipes
 from sdps.training.stage_factory import create_stage
