@@ -169,14 +169,12 @@ def refusals(found: Found) -> str:
 def lighting_only(found: Found, chosen: Sequence[Method]) -> Found:
     """Leave out methods whose lights are those of another that tells lights alone."""
     alone = {_lights_of(method) for method in chosen if method.lights and not method.normals}
-    kept = [
-        method.name for method in chosen if not (method.normals and not method.second and _lights_of(method) in alone)
-    ]
+    kept = [method.name for method in chosen if not (method.normals and _lights_of(method) in alone)]
     return {name: found[name] for name in kept}
 
 
-def _lights_of(method: Method) -> tuple[str, str, str | None, int | None]:
-    return method.lights, method.also, method.read_out, method.light_views
+def _lights_of(method: Method) -> tuple[str, str, str, str | None, int | None]:
+    return method.lights, method.also, method.second, method.read_out, method.light_views
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

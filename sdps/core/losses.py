@@ -64,10 +64,16 @@ def chord_normal_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
     return ((distances * mask).sum(dim=(1, 2, 3)) / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)).mean()
 
 
-def expected_error_loss(expected: Tensor, normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
-    """Return how badly expected errors describe those made: the negative log-likelihood of exponential distributions.
+def expected_distance_loss(expected: Tensor, distances: Tensor) -> Tensor:
+    """Return how badly each expected distance describes that made: the negative log-likelihood of an exponential one.
 
-    It is least where the expected distance is the mean of those that occur. The normals learn nothing by it.
+    It is least on average where the expected distance, positive, is the mean of those that occur. Any shape.
+    """
+    return distances / expected + expected.log()
+
+
+def expected_error_loss(expected: Tensor, normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean over scenes of `expected_distance_loss` over the object's pixels; normals learn nothing by it.
 
     Args:
         expected: (B, 1, H, W) expected distances |n - truth|, positive.
@@ -76,7 +82,7 @@ def expected_error_loss(expected: Tensor, normals: Tensor, truth: Tensor, mask: 
         mask: (B, 1, H, W), 0 or 1; a scene without object pixels adds zero.
     """
     distances = (normals.detach() - truth).norm(dim=1, keepdim=True)
-    each = (distances / expected + expected.log()) * mask
+    each = expected_distance_loss(expected, distances) * mask
     return (each.sum(dim=(1, 2, 3)) / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)).mean()
 
 

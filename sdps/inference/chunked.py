@@ -53,18 +53,16 @@ def lighting_prediction(
         seed: For what a `MeetingNetwork` draws.
     """
     mask, local = view.mask, []
-    shared: Tensor | None = None
     for part, images in view:
         extra = None if context is None else context(part)
         with autocast():
             feature = network.encode(images, mask, extra)  # (1, n, F, 8, 8)
         stage("lights", part.stop, len(view))
         local.append(feature)
-        shared = _maximum(shared, feature.amax(dim=1, keepdim=True))
-    assert shared is not None  # a view has an image
     if isinstance(network, MeetingNetwork):
         with autocast():
             return network.predict_many(torch.cat(local, dim=1), seed)
+    shared = torch.cat([feature.amax(dim=1, keepdim=True) for feature in local], dim=1).amax(dim=1, keepdim=True)
     with autocast():
         predictions = [network.predict(feature, shared) for feature in local]
     return type(predictions[0])(*(torch.cat(parts, dim=1) for parts in zip(*predictions, strict=True)))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from sdps.core.symmetry import Symmetry
+from sdps.core.symmetry import SYMMETRIES, Symmetry
 from sdps.inference.image_source import View
 from sdps.models.base import Lights
 
@@ -87,12 +87,11 @@ def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
 def mean_opinion(one: Lights, other: Lights) -> Lights:
     """Return the mean of two networks' lights: directions of unit length, the geometric mean of the intensities.
 
-    Confidence and expected error are those of the network that tells them: the mean errs less.
+    Confidence and expected error are the mean over the networks that tell them: the mean errs less.
     """
-    directions = functional.normalize(one.directions.float() + other.directions.float(), dim=-1)
-    intensities = (one.intensities.float() * other.intensities.float()).sqrt()
-    confidence = other.confidence if one.confidence is None else one.confidence
-    return Lights(directions, intensities, confidence, other.expected if one.expected is None else one.expected)
+    upright = SYMMETRIES[0]
+    mean = mean_lights([(upright, one), (upright, other)])
+    return mean._replace(intensities=(one.intensities.float() * other.intensities.float()).sqrt())
 
 
 def mean_normals(

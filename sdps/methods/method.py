@@ -49,6 +49,11 @@ class Method:
     refined: bool = False
     paper: str = ""
 
+    @property
+    def own_lights(self) -> bool:
+        """Whether it finds other lights than one lighting model alone does."""
+        return bool(self.second or self.also)
+
     def models(self) -> set[str]:
         """Return the runs whose weights it needs."""
         return {self.lights, self.also, self.normals, self.second} - {NONE, TRUE_LIGHTS, *CLASSICAL}

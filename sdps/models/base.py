@@ -91,7 +91,15 @@ class LightingNetwork(nn.Module, ABC):
 
 
 class MeetingNetwork(LightingNetwork):
-    """A lighting network whose images meet more than once: `predict` must be given the features of all of them."""
+    """A lighting network whose images meet more than once: `predict` is given all their features, and no maximum."""
+
+    @abstractmethod
+    def predict(self, local: Tensor, shared: Tensor | None = None) -> Any:
+        """Return the prediction of every image from the features (B, Q, F, ...) of all of them."""
+
+    def forward(self, images: Tensor, mask: Tensor, context: Tensor | None = None) -> Any:
+        """Return the prediction of every image; the order of the images does not matter."""
+        return self.predict(self.encode(images, mask, context))
 
     def predict_many(self, local: Tensor, seed: int) -> Any:
         """Return the prediction of a scene that may have more images than scenes of training.
@@ -100,7 +108,7 @@ class MeetingNetwork(LightingNetwork):
             local: (1, L, F, ...), features of all its images.
             seed: For what is drawn; another for each turned view.
         """
-        return self.predict(local, local)
+        return self.predict(local)
 
 
 class Observations(NamedTuple):

@@ -4,6 +4,8 @@ import torch
 from torch import Tensor, nn
 
 SLOPE = 0.1
+LOG_USUAL = -2.0
+"""Logarithm of the error, a distance of unit vectors, that an untrained network expects: 8 degrees."""
 
 
 class Convolution(nn.Conv2d):
@@ -29,6 +31,11 @@ def deconv(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(
         nn.ConvTranspose2d(inputs, outputs, 4, stride=2, padding=1, bias=False), nn.LeakyReLU(SLOPE, inplace=True)
     )
+
+
+def chord_degrees(distances: Tensor) -> Tensor:
+    """Return the angles in degrees between unit vectors that lie so far apart; from 2 on, 180."""
+    return torch.rad2deg(2.0 * (0.5 * distances).clamp(max=1.0).asin())
 
 
 def max_over_images(features: Tensor, *, keepdim: bool = False) -> Tensor:

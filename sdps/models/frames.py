@@ -20,7 +20,7 @@ from render.shared.errors import InputError, unknown
 from sdps.core.first_normals import first_normals, frames
 from sdps.core.symmetry import Symmetry
 from sdps.models.base import KeepingNetwork, Observations, TurningNetwork
-from sdps.models.blocks import SLOPE, conv, deconv
+from sdps.models.blocks import LOG_USUAL, SLOPE, chord_degrees, conv, deconv
 
 FRAMES = ("normal", "camera")
 _SEEN, _KNOWN = 10, 7
@@ -29,8 +29,6 @@ _DARK = 1e-3
 """Radiance below which nothing is seen; full scale is 1."""
 _MAP = 32
 """Channels of the fused map besides the normals."""
-_LOG_USUAL = -2.0
-"""Logarithm of the error that an untrained network expects: 8 degrees."""
 _STRIP = 2**13
 """Pixels times lights that are worked on at once in inference."""
 
@@ -126,7 +124,7 @@ class FrameNet(KeepingNetwork, TurningNetwork):
 
     def regress_with_error(self, feature: FusedMap) -> tuple[Tensor, Tensor | None]:
         normals, distance = self.corrected(feature)
-        return normals, torch.rad2deg(2.0 * (0.5 * distance).clamp(max=1.0).asin())
+        return normals, chord_degrees(distance)
 
     def corrected(self, feature: FusedMap) -> tuple[Tensor, Tensor]:
         """Return unit normals (B, 3, H, W), float32, and the expected distance (B, 1, H, W) to the true ones."""
@@ -135,7 +133,7 @@ class FrameNet(KeepingNetwork, TurningNetwork):
         half = self.smaller(entered)
         back = self.back(torch.cat([self.quarter(half), half], dim=1))
         change = self.leave(torch.cat([back, entered], dim=1)).float()
-        return functional.normalize(normals + change[:, :3], dim=1), (change[:, 3:] + _LOG_USUAL).exp()
+        return functional.normalize(normals + change[:, :3], dim=1), (change[:, 3:] + LOG_USUAL).exp()
 
     def turned(self, feature: FusedMap, symmetry: Symmetry) -> FusedMap:
         """Return the fused map of the turned scene: its pixels see their lights in frames that turn with them."""

@@ -16,8 +16,9 @@ from torch.nn import functional
 
 from render.shared.errors import InputError
 from sdps.core.lighting import LightClasses, ReadOut
+from sdps.core.losses import expected_distance_loss
 from sdps.models.base import Lights, MeetingNetwork
-from sdps.models.blocks import SLOPE, Convolution
+from sdps.models.blocks import LOG_USUAL, SLOPE, Convolution, chord_degrees
 
 SIDE = 64
 """Pixels a side that the network sees; larger images are averaged."""
@@ -33,8 +34,6 @@ _USUAL_INTENSITY = 0.94
 """Geometric mean of intensities drawn evenly from 0.2 to 2. Only their ratios can be told from images."""
 _TOGETHER = 32
 """Images that meet in use, about: many more than in training meet another mean, maximum and attention than it had."""
-_LOG_USUAL = -2.0
-"""Logarithm of the error that an untrained network expects: 8 degrees."""
 
 
 class SetPrediction(NamedTuple):
@@ -112,7 +111,7 @@ class LightSetNet(MeetingNetwork):
         both = torch.cat([images * masks, masks], dim=2)
         return functional.adaptive_avg_pool2d(both.flatten(0, 1), SIDE).unflatten(0, images.shape[:2])
 
-    def predict(self, local: Tensor, shared: Tensor) -> SetPrediction:
+    def predict(self, local: Tensor, shared: Tensor | None = None) -> SetPrediction:
         """Return the prediction of every image; `local` is of all images of the scenes."""
         with torch.no_grad(), torch.autocast(local.device.type, enabled=False):
             seen, likeness = described(local.float())
@@ -126,18 +125,18 @@ class LightSetNet(MeetingNetwork):
             directions = functional.normalize(values[..., :3] + values.new_tensor([0.0, 0.0, 0.5]), dim=-1)
             strengths = values[..., 3]
             intensities = _USUAL_INTENSITY * (strengths - strengths.mean(dim=1, keepdim=True)).exp()
-            return SetPrediction(directions, intensities, (values[..., 4] + _LOG_USUAL).exp())
+            return SetPrediction(directions, intensities, (values[..., 4] + LOG_USUAL).exp())
 
     def predict_many(self, local: Tensor, seed: int) -> SetPrediction:
         """Return intensities of all images together, which alone have one scale, and directions group by group."""
-        together = self.predict(local, local)
+        together = self.predict(local)
         groups = local.shape[1] // _TOGETHER
         if groups < 2:
             return together
         directions, expected = torch.empty_like(together.directions), torch.empty_like(together.expected)
         order = torch.randperm(local.shape[1], generator=torch.Generator().manual_seed(seed)).to(local.device)
         for part in order.tensor_split(groups):
-            found = self.predict(local[:, part], local)
+            found = self.predict(local[:, part])
             directions[:, part], expected[:, part] = found.directions, found.expected
         return together._replace(directions=directions, expected=expected)
 
@@ -147,14 +146,13 @@ class LightSetNet(MeetingNetwork):
         chord = ((prediction.directions - directions).square().sum(-1) + 1e-6).sqrt()  # (B, Q)
         off = (intensities / prediction.intensities).log()
         relative = (off - off.mean(dim=1, keepdim=True)).abs().mean()
-        likely = (chord.detach() / prediction.expected + prediction.expected.log()).mean()
+        likely = expected_distance_loss(prediction.expected, chord.detach()).mean()
         total = chord.mean() + 0.5 * relative + 0.02 * likely
         return {"total": total, "chord": chord.mean(), "relative": relative, "expected": likely}
 
     def lights(self, prediction: SetPrediction, read_out: ReadOut = "centre") -> Lights:
         """Return the regressed lights; there are no classes to read out."""
-        expected = torch.rad2deg(2.0 * (0.5 * prediction.expected).clamp(max=1.0).asin())
-        return Lights(prediction.directions, prediction.intensities, expected=expected)
+        return Lights(prediction.directions, prediction.intensities, expected=chord_degrees(prediction.expected))
 
 
 def described(local: Tensor) -> tuple[Tensor, Tensor]:

@@ -137,14 +137,10 @@ class Inference:
             facts["stray_light"] = round(float(self.estimate.diagnostics["stray_light"].mean()), 6)
         confidence = self.estimate.diagnostics.get("confidence")
         if confidence is not None:
-            facts["light_confidence"] = dict(
-                zip(photos.files, np.round(np.asarray(confidence, float), 4).tolist(), strict=True)
-            )
+            facts["light_confidence"] = _by_file(photos, confidence, 4)
         expected = self.estimate.diagnostics.get("expected_light_error")
         if expected is not None:
-            facts["expected_light_error_degrees"] = dict(
-                zip(photos.files, np.round(np.asarray(expected, float), 2).tolist(), strict=True)
-            )
+            facts["expected_light_error_degrees"] = _by_file(photos, expected, 2)
         if self.expected_error is not None:
             facts["expected_normal_error_degrees"] = round(float(self.expected_error[photos.mask].mean()), 2)
         refined = self.estimate.diagnostics.get("refined")
@@ -215,6 +211,11 @@ def check_out(out: Path, photographs: Path) -> None:
         raise InputError(f"--out {out}: holds the photographs; choose another folder")
 
 
+def _by_file(photos: Photographs, values: np.ndarray, digits: int) -> dict[str, float]:
+    """Return rounded values (L,) by the names of the photographs; JSON ready."""
+    return dict(zip(photos.files, np.round(np.asarray(values, float), digits).tolist(), strict=True))
+
+
 def _about_refined(diagnostics: dict[str, Any], photos: Photographs) -> dict[str, Any]:
     """Say how far refinement went, what to expect of it, and which photographs it explains worst; JSON ready."""
     refined, start, expected = diagnostics["refined"], diagnostics["start"], diagnostics["trust"]
@@ -228,7 +229,7 @@ def _about_refined(diagnostics: dict[str, Any], photos: Photographs) -> dict[str
         "normals_moved_degrees": round(float(moved.mean()), 2),
         "lights_moved_degrees": round(float(turned.mean()), 2),
         "expected_normal_error_degrees": round(float(expected.normals[mask].mean()), 2),
-        "expected_light_error_degrees": dict(zip(photos.files, expected.lights.round(2).tolist(), strict=True)),
+        "expected_light_error_degrees": _by_file(photos, expected.lights, 2),
         "residual": round(float(refined.pixel_residual[mask].mean()), 4),
         "unexplained": [name for name, value in zip(photos.files, residual, strict=True) if value > limit],
         "body": refined.body.round(4).tolist(),
