@@ -109,6 +109,8 @@ class LightSetNet(MeetingNetwork):
         """Return the object's radiance and the mask, (B, Q, 4, S, S), of images of any side, 128 in use."""
         masks = mask[:, None].expand(-1, images.shape[1], -1, -1, -1)
         both = torch.cat([images * masks, masks], dim=2)
+        if both.shape[-2:] == (SIDE, SIDE):
+            return both  # torch would take an average of every single pixel
         return functional.adaptive_avg_pool2d(both.flatten(0, 1), SIDE).unflatten(0, images.shape[:2])
 
     def predict(self, local: Tensor, shared: Tensor | None = None) -> SetPrediction:

@@ -1,6 +1,7 @@
 """docs/scripts/join_scenes.py: the finished scenes of several folders as one."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import join_scenes
@@ -59,3 +60,17 @@ def test_of_scenes_of_one_name_the_first_may_be_kept(tmp_path):
     assert join_scenes.main([*map(str, folders), "--out", str(tmp_path / "out"), "--first"]) == 0
     assert [scene.id for scene in read_manifest(tmp_path / "out")] == ["s0", "s1"]
     assert (tmp_path / "out" / "shards" / "s0.exr").read_text() == "a"
+
+
+def test_a_folder_gives_so_many_training_scenes_and_all_its_validation_scenes(tmp_path, capsys):
+    first, second = (
+        plan(tmp_path / "a", ["s0", "s1", "s2", "s3"], ["s0", "s1", "s3"]),
+        plan(tmp_path / "b", ["t0"], ["t0"]),
+    )
+    write_manifest(second, [replace(scene, split="val") for scene in read_manifest(second)])
+    out = ["--out", str(tmp_path / "out")]
+    assert join_scenes.main([str(first), str(second), *out, "--train", "2", "0"]) == 0
+    assert [scene.id for scene in read_manifest(tmp_path / "out")] == ["s0", "s1", "t0"]
+    for wrong, about in ((["4", "0"], "3 finished training scenes"), (["1"], "each of 2 folders")):
+        assert join_scenes.main([str(first), str(second), *out, "--train", *wrong]) == 2
+        assert about in capsys.readouterr().err
