@@ -3,10 +3,10 @@
     python docs/scripts/join_scenes.py out/world/data out/ship/data --out out/mix/data
     python docs/scripts/join_scenes.py out/world/data out/ship/data --out out/less/data --train 800 0
 
-Scenes that have no shard yet are left out. Shards are linked where the file system allows it, else copied. Plans of
-different presets number their shapes alike: render different parts of them (`sdps render-data --shard`), so that no
-name is met twice. With `--train` a folder gives so many of its training scenes, evenly spread, and all its validation
-scenes: sets to compare, with the same validation.
+Scenes that have no shard yet are left out. Shards are linked where the file system allows it, else copied. Plans
+number their shapes alike: give each a prefix (`--set data.prefix=world-`), so that no name is met twice. With `--train`
+a folder gives so many of its training scenes, evenly spread, and all its validation scenes: sets to compare, with the
+same validation.
 """
 
 import argparse
@@ -44,8 +44,8 @@ def join(folders: Sequence[Path], out: Path, *, first: bool = False, train: Sequ
                 if first:
                     continue
                 raise InputError(
-                    f"{folder}: scene {scene.id} is in {origins[scene.id]} too; render different parts with --shard, "
-                    "or add --first"
+                    f"{folder}: scene {scene.id} is in {origins[scene.id]} too; render one of them with another "
+                    "data.prefix, or add --first"
                 )
             origins[scene.id] = folder
             scenes.append(scene)
@@ -86,9 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folders", nargs="+", type=Path, help="data folders")
     parser.add_argument("--out", type=Path, required=True, help="data folder to write")
     parser.add_argument("--first", action="store_true", help="of scenes of one name keep the first folder's")
-    parser.add_argument(
-        "--train", nargs="+", type=int, default=(), help="training scenes of each (default: all)"
-    )
+    parser.add_argument("--train", nargs="+", type=int, default=(), help="training scenes of each (default: all)")
     args = parser.parse_args(arguments)
     try:
         count = join(args.folders, args.out, first=args.first, train=args.train)

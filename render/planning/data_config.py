@@ -8,6 +8,7 @@ from render.planning.mesh_family import MeshFamily
 from render.records.manifest import COMPOSITION, OWN_MESHES
 from render.shared.config import check_fields
 from render.shared.errors import InputError, unknown
+from render.shared.files import is_plain_name
 
 UPRIGHT = ("sculpture", "bunny", COMPOSITION)  # families that stand; others have no up
 LARGEST_SCALE = 10.0  # of a view
@@ -22,6 +23,8 @@ class DataConfig:
 
     Attributes:
         seed: Root seed; 0 is a seed like any other.
+        prefix: Put before the name of every scene, which is family and number otherwise: so folders of several seeds
+            or presets join without meeting a name twice.
         families: Seeded shape families, or `meshes`, and how many shapes of each.
         meshes: Mesh files that are the family `meshes`: each once in a seeded order, then again in other poses. Whole
             files are kept for validation, so that none is in both splits.
@@ -64,6 +67,7 @@ class DataConfig:
     """
 
     seed: int = 0
+    prefix: str = ""
     families: dict[str, int] = field(default_factory=lambda: {"blobby": 8, "sculpture": 8})
     meshes: MeshFamily | None = None
     views: int = 2
@@ -96,6 +100,8 @@ class DataConfig:
     def __post_init__(self) -> None:
         check_fields(self, "at least 1", "views", "materials_per_view", "light_count", "spp", "tiles")
         check_fields(self, "not negative", "seed")
+        if self.prefix and not is_plain_name(self.prefix):
+            raise InputError(f"prefix: {self.prefix!r} is no name of a file; use letters, digits, '-', '_' and '.'")
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 from 16 up, got {self.size}")
         for name in ("bounces", "composition_bounces"):

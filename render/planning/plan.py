@@ -275,7 +275,7 @@ def _plan_view(
         "bounces": config.composition_bounces if family == COMPOSITION else config.bounces,
         "light_distances": _near(config, keys),
     }
-    name = f"{family}-{number:05d}-v{view}"
+    name = f"{config.prefix}{family}-{number:05d}-v{view}"
     return [SceneSpec(id=f"{name}-m{slot}", material=material, **common) for slot, material in enumerate(surface)]
 
 

@@ -88,6 +88,13 @@ def test_impossible_distances_are_refused(change, message):
         replace(SMALL, **change)
 
 
+def test_a_prefix_changes_names_and_nothing_else():
+    plain, named = plan(SMALL), plan(replace(SMALL, prefix="a-"))
+    assert [replace(scene, id=f"a-{scene.id}") for scene in plain] == named
+    with pytest.raises(InputError, match="is no name of a file"):
+        replace(SMALL, prefix="../")
+
+
 def test_another_material_per_view_keeps_the_first_ones():
     before, after = by_id(plan(SMALL)), by_id(plan(replace(SMALL, materials_per_view=4)))
     assert all(after[name] == scene for name, scene in before.items())

@@ -40,7 +40,7 @@ def test_shards_are_copied_where_links_are_refused(tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "out" / "shards").iterdir()] == ["s0.exr"]
 
 
-@pytest.mark.parametrize(("names", "finished", "about"), [(["s0"], ["s0"], "--shard"), (["s1"], [], "")])
+@pytest.mark.parametrize(("names", "finished", "about"), [(["s0"], ["s0"], "data.prefix"), (["s1"], [], "")])
 def test_names_met_twice_are_refused_unless_they_are_not_rendered(tmp_path, capsys, names, finished, about):
     folders = [plan(tmp_path / "a", ["s0"], ["s0"]), plan(tmp_path / "b", names, finished)]
     code = join_scenes.main([*map(str, folders), "--out", str(tmp_path / "out")])
