@@ -58,7 +58,7 @@ def _of_normals(network: Any, lights: Any, batch: Batch) -> tuple[np.ndarray, np
     """Return expected and actual errors of the object's pixels, (P,) each; None where the network tells none."""
     told = Lights(batch.directions, batch.intensities)
     if lights is not None:
-        told = lights.lights(lights(batch.images, batch.mask), "expectation")
+        told = lights.lights(lights(batch.images, batch.mask), "expectation").doubted()
     normals, expected = network.regress_with_error(network.encode(network.observe(batch.images, batch.mask, told)))
     if expected is None:
         return None

@@ -6,7 +6,7 @@
 
 48 scenes of shapes that no network was trained on, 96 lights; of every other scene only the 19 to 38 lights within 50
 degrees of the camera. Random intensities. The start is `sdps-plus` with nothing given, or `psfcn` with the true lights
-(`--lights`) or with wrong ones, to be refined (`--light-error`).
+(`--lights`) or with wrong ones, to be refined (`--light-error`); `--start` names another method.
 Scenes, starts and results are kept under --out, so a run that was stopped goes on. With `--merltest FOLDER`, the scenes
 that `sdps eval-merltest` rendered are taken instead.
 """
@@ -66,6 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--images", type=int, nargs="+", default=[0], help="of each scene (default: all)")
     parser.add_argument("--lights", action="store_true", help="lights are given")
     parser.add_argument("--light-error", type=float, default=0.0, help="degrees; intensities are off by 1 %% a degree")
+    parser.add_argument("--start", default="", help="method to start from, as sdps-frames")
     parser.add_argument("--merltest", type=Path, help="folder with the scenes of eval-merltest")
     parser.add_argument("--every", type=int, default=1, help="take every so many scenes")
     parser.add_argument("--fit", action="store_true", help="print the constants of sdps/refinement/trust.py")
@@ -76,8 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     for (number, spec), images in tqdm([(spec, images) for images in args.images for spec in specs], disable=None):
         tag = f"{'merltest' if args.merltest else 'dev'}-{images or 'all'}{'-given' if args.lights else ''}"
         tag += f"-{args.light_error:g}" if args.light_error else ""
+        tag += f"-{args.start}" if args.start else ""
         scene = Scene(folder, spec, not args.merltest and number % 2 == 1, images, args.merltest is not None)
-        results.append((scene, *_refined(scene, args.out / tag, args.lights, args.light_error)))
+        results.append((scene, *_refined(scene, args.out / tag, args.start, args.lights, args.light_error)))
     for line in _fit(results) if args.fit else _table(results):
         sys.stdout.write(f"{line}\n")
     return 0
@@ -89,22 +91,23 @@ def _rendered(out: Path) -> Path:
     return out / "data" if (out / "data").is_dir() else out
 
 
-def _refined(scene: Scene, out: Path, given: bool, wrong: float) -> tuple[dict[str, np.ndarray], Refined]:
+def _refined(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> tuple[dict[str, np.ndarray], Refined]:
     """Return the start and what refinement makes of it, read back where it is there."""
     path = out / f"{scene.name.replace('/', '_')}.npz"
     if not path.exists():
         lit = given or wrong > 0.0
-        method = parse("true+psfcn" if lit else "sdps-plus", finder(None))
+        method = parse(name or ("true+psfcn" if lit else "sdps-plus"), finder(None))
         runner = Runner(method, finder(None), InferenceConfig(light_views=None if lit else 8, normal_views=1))
         told = _turned(scene, wrong) if lit else (None, None)
         start = runner.estimate(scene.images, scene.mask, *told)
         known = frozenset({"directions", "intensities"}) if given else frozenset()
         gains = start.intensities if told[1] is None else told[1]
-        found = refine(scene.images, scene.mask, start.normals, start.light_directions, gains, known=known)
+        begun = scene.images, scene.mask, start.normals, start.light_directions, gains
+        found = refine(*begun, known=known, expected=start.diagnostics.get("expected_error"))
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary, temporary.open("wb") as file:
-            begun = {"normals": start.normals, "lights": start.light_directions, "gains": gains}
-            np.savez(file, **{f"start_{name}": value for name, value in begun.items()}, **vars(found))
+            kept_start = {"normals": start.normals, "lights": start.light_directions, "gains": gains}
+            np.savez(file, **{f"start_{name}": value for name, value in kept_start.items()}, **vars(found))
     return kept(path)
 
 

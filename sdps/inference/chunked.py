@@ -89,7 +89,7 @@ def normal_map(
     feature: Any = None
     kept: list[Any] = []
     for part, images in view:
-        some = None if lights is None else Lights(lights.directions[:, part], lights.intensities[:, part])
+        some = None if lights is None else lights.part(part)
         seen = network.observe(images, mask, some, brightness)
         with autocast():
             if isinstance(network, KeepingNetwork):

@@ -230,7 +230,7 @@ class Estimator(InferenceConfig):
             diagnostics["confidence"] = lights.confidence[0].float().cpu().numpy()
         if lights.expected is not None:
             diagnostics["expected_light_error"] = lights.expected[0].float().cpu().numpy()
-        return self._merged(known, lights)
+        return self._merged(known, lights.doubted())
 
     def _taken(self, found: Estimate, known: _Known, count: int, diagnostics: dict[str, Any]) -> Lights:
         """Return lights (1, L, ...) that were estimated before, and what was noted of them."""
@@ -239,7 +239,9 @@ class Estimator(InferenceConfig):
         diagnostics["exposure"].update(found.diagnostics["exposure"])
         told = ("confidence", "expected_light_error")
         diagnostics.update({name: found.diagnostics[name] for name in told if name in found.diagnostics})
-        return self._lights(found.light_directions, found.intensities)
+        lights = self._lights(found.light_directions, found.intensities)
+        errors = found.diagnostics.get("expected_light_error")
+        return lights._replace(expected=None if errors is None else self._tensor(errors)).doubted()
 
     def _lighting_pass(
         self, place: str, scene: ObjectImages, read_out: ReadOut, diagnostics: dict[str, Any], context: Any = None
@@ -310,12 +312,17 @@ class Estimator(InferenceConfig):
         return _Known(directions, strengths, balance)
 
     def _lights(self, directions: np.ndarray, intensities: np.ndarray) -> Lights:
-        return Lights(*(torch.from_numpy(part)[None].to(self.device) for part in (directions, intensities)))
+        return Lights(self._tensor(directions), self._tensor(intensities))
+
+    def _tensor(self, values: np.ndarray) -> Tensor:
+        """Return values of all images, (L, ...), as (1, L, ...) where the networks are."""
+        return torch.from_numpy(values)[None].to(self.device)
 
     def _merged(self, known: _Known, lights: Lights) -> Lights:
         """Return the lights with what is known in place of what was estimated."""
         pairs = zip(known[:2], lights[:2], strict=True)
-        return Lights(*(lit.float() if one is None else torch.from_numpy(one)[None].to(lit) for one, lit in pairs))
+        merged = Lights(*(lit.float() if one is None else self._tensor(one) for one, lit in pairs))
+        return merged._replace(expected=lights.expected if known.directions is None else None)
 
 
 def load_estimator(

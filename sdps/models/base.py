@@ -17,6 +17,8 @@ Division = Literal["none", "norm", "max"]
 """What each pixel of the images is divided by; see `NormalNetwork`."""
 DIVISIONS: tuple[Division, ...] = get_args(Division)
 
+USUAL_LIGHT_ERROR = 6.0
+"""Degrees to expect of the directions of lighting networks that tell no error themselves."""
 _TINY = 1e-8
 _SCALE_FLOOR = 1e-4
 """Added to what a pixel is divided by: far below any lit pixel, but keeps black ones from dividing by zero."""
@@ -28,7 +30,17 @@ class Lights(NamedTuple):
     directions: Tensor  # (B, Q, 3) float32, unit, from the surface to the light
     intensities: Tensor  # (B, Q) float32, positive, relative
     confidence: Tensor | None = None  # (B, Q) float32 in [0, 1], the product of the likeliest direction classes
-    expected: Tensor | None = None  # (B, Q) float32, the error of the direction to expect, in degrees
+    expected: Tensor | None = None  # (B, Q) float32, the error of the direction to expect, in degrees; None: not told
+
+    def part(self, some: slice) -> "Lights":
+        """Return the lights of some images."""
+        return Lights(*(None if each is None else each[:, some] for each in self))
+
+    def doubted(self) -> "Lights":
+        """Return estimated lights with errors to expect, the usual ones where none are told."""
+        if self.expected is not None:
+            return self
+        return self._replace(expected=torch.full_like(self.intensities, USUAL_LIGHT_ERROR))
 
 
 class LightingNetwork(nn.Module, ABC):
@@ -117,6 +129,7 @@ class Observations(NamedTuple):
     images: Tensor  # (B, Q, 3, H, W), divided by the light intensities if the network is told the lights
     directions: Tensor | None = None  # (B, Q, 3)
     mask: Tensor | None = None  # (B, 1, H, W)
+    light_errors: Tensor | None = None  # (B, Q), degrees to expect of the directions; None: they are exact
 
 
 class NormalNetwork(nn.Module, ABC):
@@ -151,19 +164,20 @@ class NormalNetwork(nn.Module, ABC):
         Args:
             images: Exposed images, under lights of the intensities in `lights`.
             mask: 0 or 1.
-            lights: May be None for networks that are not told the lights.
+            lights: May be None for networks that are not told the lights. Those that tell no errors count as exact.
             brightness: `brightness(...)` of all images of the scene where `images` are only some; see `division`.
         """
-        directions = None
+        directions = light_errors = None
         if self.needs_lights:
             assert lights is not None
             images, directions = divide(images, lights.intensities), lights.directions
+            light_errors = lights.expected
         if self.division != "none":
             found = brightness if brightness is not None else self.brightness(images)
             # The published norm is that of 32 images of 3 channels, whatever the number of images here.
             scale = (32 * 3 * found).sqrt() if self.division == "norm" else found
             images = images / (scale + _SCALE_FLOOR)
-        return Observations(images, directions, mask if self.needs_mask else None)
+        return Observations(images, directions, mask if self.needs_mask else None, light_errors)
 
     def brightness(self, images: Tensor) -> Tensor:
         """Return what a pixel is divided by, (B, 1, 1, H, W), of images (B, Q, 3, H, W) over their intensities.

@@ -5,7 +5,8 @@ nothing else. So each pixel's lights are turned into the frame of a first normal
 it, the view in the plane of x and z. There all normals are near z, whatever way the surface faces, and one pixel
 teaches what others of another orientation need. Images of a pixel meet by their mean and maximum (as in Deep Sets,
 Zaheer et al., NeurIPS 2017), a few times over, without convolutions; convolutions see the fused map, once for a scene
-and not once for an image.
+and not once for an image. The network is told what error to expect of each light: it may trust those that are given,
+and know better than those that were estimated badly.
 
 Legend: B scenes, Q images of a scene, H and W the sides, N pixels of all objects, C channels.
 """
@@ -23,10 +24,12 @@ from sdps.models.base import KeepingNetwork, Observations, TurningNetwork
 from sdps.models.blocks import LOG_USUAL, SLOPE, chord_degrees, conv, deconv
 
 FRAMES = ("normal", "camera")
-_SEEN, _KNOWN = 10, 7
+_SEEN, _KNOWN = 11, 7
 """Values of a pixel under one light, and those it has under all."""
 _DARK = 1e-3
 """Radiance below which nothing is seen; full scale is 1."""
+_DOUBTFUL = 10.0
+"""Degrees to expect of a light that count as 1."""
 _MAP = 32
 """Channels of the fused map besides the normals."""
 _STRIP = 2**13
@@ -55,6 +58,7 @@ class Pixels(NamedTuple):
 
     values: Tensor  # (N, Q, 3) float32, exposed images over the light intensities
     directions: Tensor  # (N, Q, 3) float32, unit
+    errors: Tensor  # (N, Q) float32, degrees to expect of the directions
 
 
 class FusedMap(NamedTuple):
@@ -115,9 +119,14 @@ class FrameNet(KeepingNetwork, TurningNetwork):
         return StagedNormals(fused.normals, *self.corrected(fused))
 
     def encode(self, seen: Observations) -> FusedMap:
-        """Return the fused map of all of a scene's images."""
+        """Return the fused map of all of a scene's images; without gradients a few pixels at a time."""
         inside, pixels = object_pixels(seen)
-        return self._mapped(self._per_pixel(pixels), inside)
+        count = max(1, len(pixels.values) if torch.is_grad_enabled() else _STRIP // seen.images.shape[1])
+        found = [
+            self._per_pixel(Pixels(*(part.float() for part in some)))
+            for some in zip(*(each.split(count) for each in pixels), strict=True)
+        ]
+        return self._mapped(torch.cat(found), inside)
 
     def regress(self, feature: FusedMap) -> Tensor:
         return self.corrected(feature)[0]
@@ -145,22 +154,16 @@ class FrameNet(KeepingNetwork, TurningNetwork):
         return seen._replace(images=seen.images.half())
 
     def fused(self, parts: list[Observations]) -> FusedMap:
-        """Return the fused map of all of a scene's images, a few pixels at a time, without gradients."""
+        """Return the fused map of all of a scene's images."""
         # Autocast to bfloat16 refuses to join images of 16-bit floats.
         with torch.autocast(parts[0].images.device.type, enabled=False):
             seen = _joined(parts)
-        inside, pixels = object_pixels(seen)
-        count = max(1, _STRIP // seen.images.shape[1])
-        found = [
-            self._per_pixel(Pixels(*(part.float() for part in some)))
-            for some in zip(*(each.split(count) for each in pixels), strict=True)
-        ]
-        return self._mapped(torch.cat(found) if found else pixels.values.new_zeros(0, 3 + _MAP), inside)
+        return self.encode(seen)
 
     def _per_pixel(self, pixels: Pixels) -> Tensor:
         """Return normals and features of pixels, (N, 3 + 32)."""
         with torch.no_grad(), torch.autocast(pixels.values.device.type, enabled=False):
-            first, scale, residual = first_normals(*pixels)
+            first, scale, residual = first_normals(pixels.values, pixels.directions)
             camera = torch.eye(3, device=first.device).expand(len(first), 3, 3)
             axes = frames(first) if self.frame == "normal" else camera  # (N, 3, 3)
             start = (axes @ first[..., None])[..., 0]  # the first normal in the frame
@@ -185,7 +188,8 @@ def _joined(parts: list[Observations]) -> Observations:
     """Return all of a scene's images together."""
     images = torch.cat([part.images for part in parts], dim=1)
     directions = torch.cat([part.directions for part in parts if part.directions is not None], dim=1)
-    return Observations(images, directions, parts[0].mask)
+    errors = [part.light_errors for part in parts if part.light_errors is not None]
+    return Observations(images, directions, parts[0].mask, torch.cat(errors, dim=1) if errors else None)
 
 
 def pooled(tokens: Tensor) -> Tensor:
@@ -199,11 +203,12 @@ def object_pixels(seen: Observations) -> tuple[Tensor, Pixels]:
     inside = seen.mask[:, 0] > 0.5
     values = seen.images.permute(0, 3, 4, 1, 2)[inside]  # (N, Q, 3)
     which = torch.arange(len(inside), device=inside.device).repeat_interleave(inside.flatten(1).sum(1))
-    return inside, Pixels(values, seen.directions[which].to(values.dtype))
+    errors = torch.zeros_like(seen.directions[..., 0]) if seen.light_errors is None else seen.light_errors
+    return inside, Pixels(values, seen.directions[which].to(values.dtype), errors[which].to(values.dtype))
 
 
 def described(pixels: Pixels, axes: Tensor, start: Tensor, scale: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what the network is told of each light of a pixel, (N, Q, 10), and of the pixel, (N, 7).
+    """Return what the network is told of each light of a pixel, (N, Q, 11), and of the pixel, (N, 7).
 
     Args:
         pixels: What they showed.
@@ -212,7 +217,7 @@ def described(pixels: Pixels, axes: Tensor, start: Tensor, scale: Tensor, residu
         scale: (N, 3), radiance of a Lambertian surface of the pixel's colour that faces the light.
         residual: (N,), mean absolute error of that surface, relative to `scale`.
     """
-    values, directions = pixels
+    values, directions, errors = pixels
     relative = values / (scale + 0.1 * scale.mean(dim=1, keepdim=True) + _DARK)[:, None]  # all equal on matte surfaces
     local = directions @ axes.transpose(1, 2)  # (N, Q, 3)
     view = axes[:, :, 2]  # (N, 3), z of the camera
@@ -220,7 +225,8 @@ def described(pixels: Pixels, axes: Tensor, start: Tensor, scale: Tensor, residu
     # Brightness as it was exposed tells what is noise and what is clipped. The inverse hyperbolic sine keeps highlights
     # in range, and zero at zero.
     brightness = torch.asinh(4.0 * values.mean(dim=-1, keepdim=True))
-    seen = torch.cat([torch.asinh(2.0 * relative), local, half, brightness], dim=-1)
+    doubt = errors[..., None] / _DOUBTFUL
+    seen = torch.cat([torch.asinh(2.0 * relative), local, half, brightness, doubt], dim=-1)
     facing = (view * start).sum(dim=1, keepdim=True)
     known = torch.cat([start[:, :2], facing, torch.log(scale + _DARK), residual[:, None]], dim=-1)
     return seen, known

@@ -3,6 +3,7 @@
 The trainer (`sdps.training.trainer`) knows nothing else about them.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import Any, NamedTuple, cast, get_args
@@ -189,7 +190,7 @@ class NormalStage(Stage):
         if self.lighting is None:
             return Lights(batch.directions, batch.intensities)
         network = cast(LightingNetwork, self.lighting.network)
-        return network.lights(network(*resize_input(batch.images, batch.mask)), self.config.read_out)
+        return network.lights(network(*resize_input(batch.images, batch.mask)), self.config.read_out).doubted()
 
     def training_lights(self, batch: Batch) -> Lights | None:
         """Return the lights given in training: with drawn errors, then some of the way to the true ones."""
@@ -198,11 +199,12 @@ class NormalStage(Stage):
             lights = disturbed(lights, batch.seed.tolist(), self.config.light_error)
         if self.lighting is None or lights is None or not limit:
             return lights
-        drawn = [generator(seed, "light_blend").uniform(0.0, limit) for seed in batch.seed.tolist()]
+        drawn = [min(generator(seed, "light_blend").uniform(0.0, limit), 1.0) for seed in batch.seed.tolist()]
         share = torch.tensor(drawn, device=batch.images.device)[:, None]  # (B, 1)
         directions = torch.lerp(lights.directions.float(), batch.directions, share[..., None])  # (B, Q, 3)
         intensities = torch.lerp(lights.intensities.float(), batch.intensities, share)  # (B, Q)
-        return Lights(functional.normalize(directions, dim=-1), intensities)
+        expected = None if lights.expected is None else (1.0 - share) * lights.expected.float()
+        return Lights(functional.normalize(directions, dim=-1), intensities, expected=expected)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the configured normal loss on the crops, and the lighting loss of models that learn both."""
@@ -282,6 +284,8 @@ def plain_normal_loss(
 
 _BENT, _SCATTERED, _UNEVEN = 0.10, 0.06, 0.08
 """How far `disturbed` moves lights: all alike, each by itself, and in intensity."""
+_STRAYED = math.degrees(math.sqrt(math.pi / 2 * (_BENT**2 + _SCATTERED**2)))
+"""Mean error of directions that `disturbed` moves by the share 1: both parts move them across by Gaussian steps."""
 
 
 def disturbed(lights: Lights, seeds: list[int], limit: float) -> Lights:
@@ -291,7 +295,7 @@ def disturbed(lights: Lights, seeds: list[int], limit: float) -> Lights:
     strays by itself; intensities err with the direction, and by themselves. A scene's share of all that is drawn
     evenly from 0 to `limit`.
     """
-    directions, intensities = [], []
+    directions, intensities, expected = [], [], []
     for scene, seed in enumerate(seeds):
         rng = generator(seed, "light_error")
         share, count = rng.uniform(0.0, limit), lights.directions.shape[1]
@@ -301,9 +305,11 @@ def disturbed(lights: Lights, seeds: list[int], limit: float) -> Lights:
         given = lights.directions[scene].cpu().numpy()
         directions.append(given @ bend.T + own)
         intensities.append(np.exp(given @ slope + noise))
+        expected.append(np.full(count, share * _STRAYED))
     moved = torch.from_numpy(np.stack(directions)).to(lights.directions)
     factors = torch.from_numpy(np.stack(intensities)).to(lights.intensities)
-    return Lights(functional.normalize(moved, dim=-1), lights.intensities * factors)
+    errors = torch.from_numpy(np.stack(expected)).to(lights.intensities)
+    return Lights(functional.normalize(moved, dim=-1), lights.intensities * factors, expected=errors)
 
 
 def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:

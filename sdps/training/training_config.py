@@ -186,7 +186,8 @@ class NormalTraining(TrainingConfig):
         read_out: How light classes become lights: `centre` (argmax, the paper's), `expectation` (soft-argmax) or
             `peak` (parabolic).
         light_blend: Largest share of the way to the true lights that estimated ones are moved, drawn evenly for each
-            training sample. Many images and test-time augmentation give better lights than a sample's few images.
+            training sample; of shares drawn above 1 the lights are the true ones. Many images and test-time
+            augmentation give better lights than a sample's few images.
         light_error: Size of the errors drawn onto the lights in training, 1 for those of lights estimated from few
             images. So a network learns what estimated lights are worth, and no lighting model has to run.
         crop: Side of the random crop the network sees (0: the whole image); the lighting model always sees the whole.
@@ -218,8 +219,8 @@ class NormalTraining(TrainingConfig):
         super().__post_init__()
         if self.crop and (self.crop % 4 or not 16 <= self.crop <= self.size):
             raise InputError(f"crop must be 0 or a multiple of 4 from 16 to size ({self.size}), got {self.crop}")
-        if not 0.0 <= self.light_blend <= 1.0:
-            raise InputError(f"light_blend must be in [0, 1], got {self.light_blend}")
+        if not 0.0 <= self.light_blend <= 10.0:
+            raise InputError(f"light_blend must be in [0, 10], got {self.light_blend}")
         if not 0.0 <= self.min_object < 1.0:
             raise InputError(f"min_object must be in [0, 1), got {self.min_object}")
         check_fields(

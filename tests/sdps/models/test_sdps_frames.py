@@ -90,14 +90,14 @@ def test_a_frame_has_the_normal_along_z_and_the_view_in_its_xz_plane():
 
 
 def test_what_a_pixel_is_told_does_not_change_when_it_turns_about_the_view():
-    values, lights = torch.rand(20, 9, 3), unit(20, 9)
+    values, lights, errors = torch.rand(20, 9, 3), unit(20, 9), torch.rand(20, 9)
     turned = rotate_about_view(lights, 1.1)
     told = []
     for directions in (lights, turned):
         first, scale, error = first_normals(values, directions)
         axes = frames(first)
         start = (axes @ first[..., None])[..., 0]
-        told.append(described(Pixels(values, directions), axes, start, scale, error))
+        told.append(described(Pixels(values, directions, errors), axes, start, scale, error))
     for one, other in zip(*told, strict=True):
         torch.testing.assert_close(one, other, atol=2e-3, rtol=1e-3)
 
@@ -144,7 +144,7 @@ def test_an_untrained_network_gives_the_first_normals():
     inside, pixels = object_pixels(seen)
     with torch.no_grad():
         found = network(seen).permute(0, 2, 3, 1)[inside]
-    torch.testing.assert_close(found, first_normals(*pixels)[0], atol=1e-4, rtol=0)
+    torch.testing.assert_close(found, first_normals(pixels.values, pixels.directions)[0], atol=1e-4, rtol=0)
 
 
 def test_a_mask_without_pixels_gives_a_map(trained):
@@ -172,6 +172,8 @@ def test_light_errors_are_those_of_the_seed_and_grow_with_the_limit():
     many = [disturbed(lights, [seed, seed + 1], 1.0) for seed in range(0, 200, 2)]
     angles = torch.stack([(each.directions * lights.directions).sum(-1).clamp(-1, 1).acos() for each in many])
     assert 4.0 < math.degrees(angles.mean()) < 9.0
+    expected = torch.stack([each.expected for each in many])
+    assert 0.8 < math.degrees(angles.mean()) / expected.mean() < 1.25
     assert all((each.intensities > 0).all() for each in many)
 
 
@@ -221,3 +223,17 @@ def _batch():
     seen = observations(6, 16)
     return Batch(seen.images, seen.mask, unit(1, 16, 16).permute(0, 3, 1, 2) * seen.mask, seen.directions,
                  torch.ones(1, 6), torch.zeros(1, 2, dtype=torch.int64), torch.tensor([5]))  # fmt: skip
+
+
+def test_the_network_knows_which_lights_to_doubt(trained):
+    seen, errors = observations(9), torch.full((1, 9), 8.0)
+    with torch.no_grad():
+        exact, told, doubted = (trained(seen._replace(light_errors=each)) for each in (None, torch.zeros(1, 9), errors))
+        parts = [
+            Observations(seen.images[:, some], seen.directions[:, some], seen.mask, errors[:, some])
+            for some in (slice(4), slice(4, 9))
+        ]
+        joined = trained.regress(trained.fused(parts))
+    torch.testing.assert_close(exact, told)
+    torch.testing.assert_close(joined, doubted)
+    assert (exact - doubted).abs().max() > 1e-3
