@@ -34,7 +34,8 @@ class Lights(NamedTuple):
 
     def part(self, some: slice) -> "Lights":
         """Return the lights of some images."""
-        return Lights(*(None if each is None else each[:, some] for each in self))
+        sure, expected = (None if each is None else each[:, some] for each in (self.confidence, self.expected))
+        return Lights(self.directions[:, some], self.intensities[:, some], sure, expected)
 
     def doubted(self) -> "Lights":
         """Return estimated lights with errors to expect, the usual ones where none are told."""
