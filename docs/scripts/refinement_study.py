@@ -102,12 +102,11 @@ def _refined(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> t
         start = runner.estimate(scene.images, scene.mask, *told)
         known = frozenset({"directions", "intensities"}) if given else frozenset()
         gains = start.intensities if told[1] is None else told[1]
-        begun = scene.images, scene.mask, start.normals, start.light_directions, gains
-        found = refine(*begun, known=known, expected=start.diagnostics.get("expected_error"))
+        found = refine(scene.images, scene.mask, start.normals, start.light_directions, gains, known=known)
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary, temporary.open("wb") as file:
-            kept_start = {"normals": start.normals, "lights": start.light_directions, "gains": gains}
-            np.savez(file, **{f"start_{name}": value for name, value in kept_start.items()}, **vars(found))
+            begun = {"normals": start.normals, "lights": start.light_directions, "gains": gains}
+            np.savez(file, **{f"start_{name}": value for name, value in begun.items()}, **vars(found))
     return kept(path)
 
 

@@ -172,7 +172,7 @@ class Runner:
         refined = refine(
             images, mask, estimate.normals, estimate.light_directions, begun,
             known=frozenset(name for key, name in names.items() if given.get(key) is not None),
-            stray=self.config.stray_light, saturation=saturation, expected=estimate.diagnostics.get("expected_error"),
+            stray=self.config.stray_light, saturation=saturation,
         )  # fmt: skip
         told = given.get("lights") is not None
         expected = trust(refined, mask, estimate.normals, estimate.light_directions, given=told)

@@ -74,7 +74,6 @@ class Problem(NamedTuple):
             of intensity 1 if the brightest parts reflected everything; None where it is left out.
         twice: How much brighter it would be by what bounces again.
         ready: Bounced light is off the images, and they are divided by G.
-        sure: (P,) float32, how sure the start is of each normal, beside the others: about 1; None for all alike.
     """
 
     mask: np.ndarray
@@ -84,7 +83,6 @@ class Problem(NamedTuple):
     bounced: Tensor | None = None
     twice: float = 0.0
     ready: bool = False
-    sure: Tensor | None = None
 
     def direct(self, made: Factors, whiteness: float) -> Tensor:  # (P, 3, L)
         """Return the images without the light that bounced, if the brightest parts have this albedo."""
@@ -140,8 +138,7 @@ def solve(
         if number % _TRIED_EVERY == 0:
             images = _explained(problem, state, made, free)
         loss = data_term(made, images, problem.kept)
-        near = weights.near * _misfit(float(loss.detach()))
-        held = (near if problem.sure is None else near * problem.sure) + weights.dark * faint  # (P,)
+        held = weights.near * _misfit(float(loss.detach())) + weights.dark * faint  # (P,)
         loss = loss + (held * (1.0 - (made.normals * begun).sum(dim=1))).mean()
         loss = loss + _priors(state, made, beside, weights, part)
         if "directions" in free:

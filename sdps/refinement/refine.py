@@ -32,7 +32,6 @@ _SHARPEST, _BROADEST = 300.0, 10.0
 _START_HEIGHT = -4.0
 _LIT_SHARE = 0.1
 _LEAST_ALBEDO = 1e-3
-_SUREST = 1.0  # degrees; no method knows its normals better
 _BRIGHTEST, _WHITENESS = 0.95, 0.3  # quantile of the brightest parts, and the albedo they begin with
 _PART = 4096  # pixels worked on at once where arrays of all images are made
 CACHE_BYTES = 2**30
@@ -79,7 +78,6 @@ def refine(
     config: RefineConfig | None = None,
     stray: bool = True,
     saturation: float = np.inf,
-    expected: np.ndarray | None = None,
 ) -> Refined:
     """Refine normals and lights.
 
@@ -93,8 +91,6 @@ def refine(
         config: Iterations and rates.
         stray: Take stray light off the images.
         saturation: Radiance from which on a channel is clipped; such observations count for nothing.
-        expected: (H, W) errors in degrees that the method expects of its normals: where they are small, these count
-            more. None: all count alike.
 
     Raises:
         InputError: fewer than four images, shapes that do not fit, or an object that is black.
@@ -106,8 +102,6 @@ def refine(
     values = _gathered(scene)
     problem = problem_of(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
-    doubts = None if expected is None else expected[scene.rows, scene.columns]
-    problem = problem._replace(sure=_sureness(doubts, problem.mask, stride))
     free = frozenset(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
     with progress_bar(None, total=before + config.iterations + fine, desc="refine", unit="iteration") as bar:
@@ -119,19 +113,10 @@ def refine(
         state = move(problem, start, iterations=config.iterations)
         if stride > 1:
             problem, state = _finer(values, scene.mask, problem, stride, state, full)
-            problem = problem._replace(sure=_sureness(doubts, problem.mask, 1))
         if fine:
             weights = Weights(curl=(config.fine_curl, config.fine_curl))
             state = move(problem, state, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
     return _result(scene, problem, state)
-
-
-def _sureness(expected: np.ndarray | None, mask: np.ndarray, stride: int) -> Tensor | None:  # (P,)
-    """Return how sure a method is of a grid's normals: the inverse of the errors it expects, 1 on average."""
-    if expected is None:
-        return None
-    found = 1.0 / np.maximum(expected[::stride, ::stride][mask], _SUREST)
-    return torch.from_numpy((found / found.mean()).astype(np.float32))
 
 
 def _advance(bar: Any) -> Callable[[], None]:
