@@ -184,8 +184,8 @@ def test_methods_that_can_be_used_are_listed():
 @pytest.mark.parametrize(
     ("lit", "refine", "images", "expected"),
     [
-        (False, False, 96, "sdps-frames (lcnet-soft + lightset + frames)"),
-        (False, None, 7, "sdps-frames (lcnet-soft + lightset + frames)"),  # too few to refine
+        (False, False, 96, "sdps-frames (lightset + frames)"),
+        (False, None, 7, "sdps-frames (lightset + frames)"),  # too few to refine
         (False, None, 96, "sdps-plus (lcnet-soft + nenet-plus), refined"),
         (False, True, 96, "sdps-plus (lcnet-soft + nenet-plus), refined"),
         (True, False, 96, "frames, true lights"),

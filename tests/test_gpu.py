@@ -78,7 +78,7 @@ def test_auto_precision_trains_and_stays_finite(data: Path, tmp_path: Path) -> N
 
 
 @needs_torch
-@pytest.mark.parametrize("method", ["sdps-plus", "lcnet+psfcn", "true+psfcn", "true+frames", "lcnet-soft+frames"])
+@pytest.mark.parametrize("method", ["sdps-plus", "lcnet+psfcn", "true+psfcn", "true+frames", "lightset+frames"])
 def test_inference_gives_what_the_cpu_does(method: str) -> None:
     normals, mask = sphere_normals(96, radius=0.7)
     lights = hemisphere_lights(12, np.random.default_rng(0))

@@ -153,6 +153,6 @@ def _mean_scores(draws: list[dict[str, float]]) -> dict[str, float]:
 
 def build_tables(results: list[SceneScores], lighting: list[Method], normals: list[Method]) -> list[Table]:
     """Return table A where every model has its row, and table B."""
-    both = [method for method in normals if method.own_lights]  # rows of both tables
-    first = [lighting_table(results, [*lighting, *both], all_rows=True)] if lighting else []
+    second = [method for method in normals if method.second]  # rows of both tables
+    first = [lighting_table(results, [*lighting, *second], all_rows=True)] if lighting else []
     return [*first, normal_table(results, normals, all_rows=bool(lighting))]

@@ -24,7 +24,6 @@ from sdps.inference.turned_views import (
     TurnedView,
     mean_lights,
     mean_normals,
-    mean_opinion,
     turned_context,
     turned_lights,
 )
@@ -33,7 +32,7 @@ from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
 from sdps.models.lighting_variants import LCNetSecond
 
-_ROLES = {"lighting": ("lighting",), "also": ("lighting",), "normals": ("normals", "pixels"), "second": ("second",)}
+_ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels"), "second": ("second",)}
 _CHUNK_PIXELS = {"cpu": 2**17}
 """On CPUs fewer images at once: their feature maps fit the caches, a quarter to a half faster with the same result."""
 
@@ -57,8 +56,6 @@ class Estimator(InferenceConfig):
         normals: Trained model that gives normals, by convolution or pixel by pixel; None for lights alone.
         second: Trained second lighting pass. It sees the normals that `normals` finds at 128x128 under the first
             lights; `normals` then works again, under the second lights.
-        also: Another trained lighting model: the lights are the mean of both networks' (directions normalised,
-            intensities geometric). Each errs in its own way, so the mean is nearer to the truth.
         device: Where all networks are.
         chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images. None: what
             suits the device.
@@ -70,7 +67,6 @@ class Estimator(InferenceConfig):
     lighting: TrainedModel | None
     normals: TrainedModel | None
     second: TrainedModel | None = None
-    also: TrainedModel | None = None
     device: torch.device
     chunk_pixels: int | None = None
 
@@ -84,8 +80,6 @@ class Estimator(InferenceConfig):
             raise InputError(f"second: {self.second.name!r} sees estimated normals; give a normal model too")
         if self.second is not None and self.lighting is None:
             raise InputError(f"second: {self.second.name!r} starts from estimated lights; give a lighting model too")
-        if self.also is not None and self.lighting is None:
-            raise InputError(f"also: {self.also.name!r} is a second opinion on lights; give a lighting model too")
         if self.chunk_pixels is not None and self.chunk_pixels < 1:
             raise InputError(f"chunk_pixels must be at least 1, got {self.chunk_pixels}")
 
@@ -215,8 +209,6 @@ class Estimator(InferenceConfig):
         """Return the lights (1, L, ...) after one or two passes; what is known stays."""
         read_out = self.read_out if self.second is None else "expectation"
         lights = self._lighting_pass("lighting", scene, read_out, diagnostics)
-        if self.also is not None:
-            lights = mean_opinion(lights, self._lighting_pass("also", scene, read_out, diagnostics))
         if self.second is not None:
             first = self._merged(known, lights)
             small = self._view(scene, "normals", known.balance, resize_input, INPUT_SIZE**2, diagnostics)
@@ -330,7 +322,6 @@ def load_estimator(
     lighting: str | Path | None = None,
     normals: str | Path,
     second: str | Path | None = None,
-    also: str | Path | None = None,
     device: str | torch.device | None = None,
     **options: Any,
 ) -> Estimator:
@@ -340,7 +331,6 @@ def load_estimator(
         lighting: Safetensors of a lighting model; None for known lights only, or a normal model that is told none.
         normals: Safetensors of a normal model.
         second: Safetensors of a second lighting pass.
-        also: Safetensors of a lighting model whose lights are averaged with those of `lighting`.
         device: Torch device; CUDA when there is one, else CPU.
         options: Other fields of `Estimator`; the defaults are those of every command
         (`sdps.inference.inference_config`).
@@ -349,7 +339,7 @@ def load_estimator(
         InputError: a file is missing, damaged, or of a model for something else.
     """
     device = default_device(device)
-    files = {"lighting": lighting, "also": also, "normals": normals, "second": second}
+    files = {"lighting": lighting, "normals": normals, "second": second}
     models: dict[str, Any] = {
         place: None if file is None else load_model(file, device, _ROLES[place]) for place, file in files.items()
     }

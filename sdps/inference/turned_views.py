@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from sdps.core.symmetry import SYMMETRIES, Symmetry
+from sdps.core.symmetry import Symmetry
 from sdps.inference.image_source import View
 from sdps.models.base import Lights
 
@@ -73,25 +73,23 @@ def turned_context(symmetry: Symmetry, context: Callable[[slice], Tensor] | None
 
 
 def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
-    """Return the mean of lights found in turned views, each turned back: directions of unit length."""
+    """Return the mean of lights found in turned views, each turned back: directions of unit length.
+
+    The error to expect of the mean is less than of one view, by what averages out: squared, by the mean squared
+    distance of the views' directions from their mean. At least a share of 1 / sqrt(views) is left.
+    """
     if len(found) == 1:
         return found[0][1]
-    directions = torch.stack([symmetry.back.vectors(lights.directions.float()) for symmetry, lights in found]).mean(0)
+    directions = torch.stack([symmetry.back.vectors(lights.directions.float()) for symmetry, lights in found])
+    mean = functional.normalize(directions.mean(0), dim=-1)  # (B, Q, 3)
     intensities = torch.stack([lights.intensities.float() for _, lights in found]).mean(0)
     sure = [lights.confidence.float() for _, lights in found if lights.confidence is not None]
     errors = [lights.expected.float() for _, lights in found if lights.expected is not None]
     confidence, expected = (torch.stack(values).mean(0) if values else None for values in (sure, errors))
-    return Lights(functional.normalize(directions, dim=-1), intensities, confidence, expected)
-
-
-def mean_opinion(one: Lights, other: Lights) -> Lights:
-    """Return the mean of two networks' lights: directions of unit length, the geometric mean of the intensities.
-
-    Confidence and expected error are the mean over the networks that tell them: the mean errs less.
-    """
-    upright = SYMMETRIES[0]
-    mean = mean_lights([(upright, one), (upright, other)])
-    return mean._replace(intensities=(one.intensities.float() * other.intensities.float()).sqrt())
+    if expected is not None:
+        spread = torch.rad2deg((directions - mean).square().sum(-1).mean(0).sqrt())  # (B, Q)
+        expected = (expected.square() - spread.square()).clamp(min=expected.square() / len(found)).sqrt()
+    return Lights(mean, intensities, confidence, expected)
 
 
 def mean_normals(

@@ -27,7 +27,6 @@ class Method:
         lights: A lighting model (run or file), `true` for lights that are given, or empty for none.
         normals: A normal model, a classical method, or empty for lighting alone.
         second: A second lighting pass, or empty.
-        also: A lighting model whose lights are averaged with those of `lights`, or empty.
         intensities: `true` where only the intensities are given, else empty.
         read_out: How light classes become lights; None for the configuration's.
         light_views: Test-time augmentation of lights: turned views averaged over where the configuration does not say;
@@ -41,7 +40,6 @@ class Method:
     lights: str = NONE
     normals: str = NONE
     second: str = NONE
-    also: str = NONE
     intensities: str = NONE
     read_out: ReadOut | None = None
     light_views: int | None = None
@@ -49,25 +47,20 @@ class Method:
     refined: bool = False
     paper: str = ""
 
-    @property
-    def own_lights(self) -> bool:
-        """Whether it finds other lights than one lighting model alone does."""
-        return bool(self.second or self.also)
-
     def models(self) -> set[str]:
         """Return the runs whose weights it needs."""
-        return {self.lights, self.also, self.normals, self.second} - {NONE, TRUE_LIGHTS, *CLASSICAL}
+        return {self.lights, self.normals, self.second} - {NONE, TRUE_LIGHTS, *CLASSICAL}
 
 
-def label(lights: str, normals: str, second: str = NONE, *, also: str = NONE, combination: str = NONE) -> str:
+def label(lights: str, normals: str, second: str = NONE, *, combination: str = NONE) -> str:
     """Name what parts make together, by the combination's name and its parts where it has one."""
-    parts = (lights, normals, second, also)
+    parts = (lights, normals, second)
     suffix = " (shipped)" if any(part.startswith(pretrained.SHIPPED) for part in parts) else ""
-    lights, normals, second, also = (part.removeprefix(pretrained.SHIPPED) for part in parts)
+    lights, normals, second = (part.removeprefix(pretrained.SHIPPED) for part in parts)
     if lights == TRUE_LIGHTS:
         text = f"{normals}, true lights"
     else:
-        text = " + ".join(part for part in (lights, also, second, normals) if part)
+        text = " + ".join(part for part in (lights, second, normals) if part)
     return (f"{combination} ({text})" if combination else text) + suffix
 
 
@@ -78,20 +71,18 @@ def combined(
     *,
     paper: str = "",
     intensities: str = NONE,
-    also: str = NONE,
     combination: str = NONE,
 ) -> Method:
     """Return the method of parts that go together, with its label; asked for as a combination, with its views."""
     pair = COMBINATIONS[combination] if combination else None
     views: dict[str, Any] = {field: getattr(pair, field, None) for field in VIEWS}
     named = combination if any(views.values()) else NONE  # others are their parts, and called so
-    name = label(*map(stem, (lights, normals, second)), also=stem(also), combination=named)
+    name = label(*map(stem, (lights, normals, second)), combination=named)
     return Method(
         name=name + (", true intensities" if intensities else ""),
         lights=lights,
         normals=normals,
         second=second,
-        also=also,
         intensities=intensities,
         paper=paper,
         **views,

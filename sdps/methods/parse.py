@@ -29,13 +29,10 @@ def combine(
     prefix = pretrained.SHIPPED if normals and normals.startswith(pretrained.SHIPPED) else ""
     name = normals.removeprefix(prefix) if normals else NONE
     combination = name if name in COMBINATIONS else NONE
-    also = NONE
     if combination:
         pair = COMBINATIONS[combination]
         if pair.second and lights != TRUE_LIGHTS:  # of lights that are given nothing is left to correct
             second = second or prefix + pair.second
-        if pair.also and not lights:  # other lights than the combination's own stand alone
-            also = prefix + pair.also
         lights = lights or prefix + pair.lighting
         normals = prefix + pair.normals
     if normals is None:
@@ -45,9 +42,7 @@ def combine(
         _check_classical(normals, lights, second, intensities)
     if second and lights in (NONE, TRUE_LIGHTS):
         raise InputError("--second corrects estimated lights; name a lighting model with --lights")
-    method = combined(
-        lights, normals, second or NONE, intensities=intensities or NONE, also=also, combination=combination
-    )
+    method = combined(lights, normals, second or NONE, intensities=intensities or NONE, combination=combination)
     for needed in sorted(method.models()):
         find(needed)
     return method

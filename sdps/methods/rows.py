@@ -35,7 +35,7 @@ NORMAL_ROWS = (  # lighting, normals, second, row of the paper
     ("lcnet-soft", "nenet-plus", "lcnet-second", ""),
     ("lcnet-soft", "attention", NONE, ""),
     (TRUE_LIGHTS, "attention", NONE, ""),
-    ("lcnet-soft", "frames", NONE, ""),
+    ("lightset", "frames", NONE, ""),
     (TRUE_LIGHTS, "frames", NONE, ""),
     ("lcnet", "least-squares", NONE, ""),
     (TRUE_LIGHTS, "least-squares", NONE, ""),
@@ -63,7 +63,7 @@ def lighting_methods(
         read_outs: tuple[ReadOut, ...] = ("centre", "expectation", "peak")
         others = (how for how in read_outs if how != config.read_out)
         methods += [Method(name=f"lcnet, {how}", lights="lcnet", read_out=how) for how in others]
-    available, told = pretrained.shipped(), {name for way in ways for name in (way.lights, way.also)}
+    available, told = pretrained.shipped(), {way.lights for way in ways}
     kept = [
         Method(name=label(pretrained.SHIPPED + name, NONE), lights=pretrained.SHIPPED + name, paper=MODELS[name].paper)
         for name in names
@@ -75,7 +75,7 @@ def lighting_methods(
 
 def with_views(rows: Sequence[Method], ways: Sequence[Method]) -> list[Method]:
     """Return rows of lights, and after them those that one of `ways` averages over turned views, averaged so."""
-    counts = {name: way.light_views for way in ways if way.light_views for name in (way.lights, way.also)}
+    counts = {way.lights: way.light_views for way in ways if way.light_views}
     averaged = [
         replace(row, name=f"{row.name}, {count} views", light_views=count, paper="")
         for row in rows
@@ -112,13 +112,13 @@ def _every_row() -> list[Method]:
     rows = [combined(lights, normals, second, paper=paper) for lights, normals, second, paper in NORMAL_ROWS]
     for name, pair in COMBINATIONS.items():
         if pair.light_views or pair.normal_views:
-            rows.append(combined(pair.lighting, pair.normals, pair.second, also=pair.also, combination=name))
+            rows.append(combined(pair.lighting, pair.normals, pair.second, combination=name))
     return rows
 
 
 def as_shipped(method: Method) -> Method:
     """Return the same way with the weights that travel with the package, where it needs any."""
-    parts = {part: getattr(method, part) for part in ("lights", "also", "normals", "second")}
+    parts = {part: getattr(method, part) for part in ("lights", "normals", "second")}
     placed = {part: pretrained.SHIPPED + name for part, name in parts.items() if name in method.models()}
     return replace(method, name=f"{method.name} (shipped)", **placed) if placed else method
 
@@ -134,7 +134,7 @@ def _with_row(method: Method) -> Method:
 
 def paper_row(method: Method) -> str:
     """Return the row of the paper's table of normals that a combination is, or an empty string."""
-    if method.intensities or method.refined or method.also:
+    if method.intensities or method.refined:
         return ""
     parts = tuple(part.removeprefix(pretrained.SHIPPED) for part in (method.lights, method.normals, method.second))
     return next((row[3] for row in NORMAL_ROWS if row[:3] == parts), "")

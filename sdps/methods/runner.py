@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sdps.models.checkpoint import TrainedModel
 
 _digest = cache(file_hash)
-_PLACES = ("lights", "also", "second", "normals")
+_PLACES = ("lights", "second", "normals")
 Found = dict[tuple[Hashable, ...], Estimate]
 """Estimated lights by what they depend on."""
 
@@ -55,14 +55,13 @@ class Runner:
         def model(name: str) -> "TrainedModel | None":
             return _loaded(self.files[name]) if name in self.files else None
 
-        lighting, also, second, normals = (model(getattr(method, place)) for place in _PLACES)
+        lighting, second, normals = (model(getattr(method, place)) for place in _PLACES)
         self.estimator = None
         if lighting is not None or normals is not None:
             self.estimator = Estimator(
                 lighting=lighting,
                 normals=normals,
                 second=second,
-                also=also,
                 device=default_device(),
                 **self.config.options(),
             )
@@ -126,7 +125,7 @@ class Runner:
     def _lights(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
         """Estimate the lights, or take what another method with the same lighting networks found."""
         found = {} if found is None else found
-        places = _PLACES if self.method.second else ("lights", "also")  # a second pass sees normals
+        places = _PLACES if self.method.second else ("lights",)  # a second pass sees normals
         names = [name for place in places if (name := getattr(self.method, place)) != NONE]
         used = (_digest(self.files[name]) for name in names)
         options = self.config.options() | ({} if self.method.second else {"normal_views": None, "rotations": None})

@@ -65,7 +65,6 @@ class Combination:
         lighting: Lighting model.
         normals: Normal model.
         second: Second lighting pass, or empty.
-        also: Lighting model whose lights are averaged with those of `lighting`, or empty.
         summary: One line.
         paper: Row of the paper's table, if any.
         light_views: Test-time augmentation of lights: turned views averaged over; None for what the caller wants.
@@ -75,7 +74,6 @@ class Combination:
     lighting: str
     normals: str
     second: str = ""
-    also: str = ""
     summary: str = ""
     paper: str = ""
     light_views: int | None = None
@@ -83,7 +81,7 @@ class Combination:
 
     def members(self) -> tuple[str, ...]:
         """Return the names of the models."""
-        return tuple(name for name in (self.lighting, self.also, self.normals, self.second) if name)
+        return tuple(name for name in (self.lighting, self.normals, self.second) if name)
 
     def parameters(self) -> int:
         """Return the trainable scalars of all of them."""

@@ -303,21 +303,6 @@ def test_a_network_that_tells_the_error_of_lights_to_expect_tells_it(estimator: 
     assert "expected_light_error" not in estimator.estimate(images, mask).diagnostics
 
 
-def test_two_lighting_networks_are_averaged(estimator: Estimator) -> None:
-    images, mask, _ = scene(size=50)
-    one, other = (replace(estimator, lighting=trained(name), light_views=2) for name in ("lcnet-soft", "lightset"))
-    both = replace(one, also=other.lighting)
-    found, first, second = (each.estimate_lights(images, mask) for each in (both, one, other))
-    total = first.light_directions + second.light_directions
-    mean = total / np.linalg.norm(total, axis=1, keepdims=True)
-    np.testing.assert_allclose(found.light_directions, mean, atol=1e-5)
-    np.testing.assert_allclose(found.intensities**2, first.intensities * second.intensities, rtol=1e-4)
-    assert {"confidence", "expected_light_error"} <= found.diagnostics.keys()
-    assert found.diagnostics["exposure"].keys() == {"lighting", "also"}
-    with pytest.raises(InputError, match="second opinion on lights"):
-        replace(both, lighting=None)
-
-
 @pytest.mark.parametrize(
     "names", [("lcnet", "nenet"), ("lightset", "nenet"), ("lcnet-soft", "nenet-plus", "lcnet-second")]
 )

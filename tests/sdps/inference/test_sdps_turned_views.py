@@ -66,6 +66,21 @@ def test_the_mean_of_lights_undoes_the_turns() -> None:
         torch.testing.assert_close(one, two)
 
 
+def test_the_mean_of_views_is_expected_to_err_less_by_what_averages_out() -> None:
+    """Views err by 3 degrees together and by 4 each for itself: 5 in all, and sqrt(3^2 + 4^2 / 8) the mean."""
+    rng, common, own = torch.Generator().manual_seed(0), 3.0, 4.0
+    noise = torch.randn(8, 1, 4000, 2, generator=rng) * torch.deg2rad(torch.tensor(own)) / 2**0.5
+    noise[..., 0] += torch.deg2rad(torch.tensor(common))
+    directions = torch.nn.functional.normalize(torch.cat([noise, torch.ones(8, 1, 4000, 1)], dim=-1), dim=-1)
+    gains, told = torch.ones(1, 4000), torch.full((1, 4000), 5.0)
+    views = zip(SYMMETRIES, directions, strict=True)
+    mean = mean_lights([(each, Lights(each.vectors(one), gains, expected=told)) for each, one in views])
+    made = angle_degrees(mean.directions.numpy(), np.array([0.0, 0.0, 1.0]))
+    assert mean.expected is not None
+    assert float(mean.expected.square().mean().sqrt()) == pytest.approx(float(np.sqrt((made**2).mean())), rel=0.03)
+    assert float(mean.expected.min()) > 4.99 / 8**0.5
+
+
 def estimator(lights: int, normals: int) -> Estimator:
     torch.manual_seed(0)
     metadata = {"config": to_plain(LightingTraining())}
