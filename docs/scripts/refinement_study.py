@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=1, help="take every so many scenes")
     parser.add_argument("--fit", action="store_true", help="print the constants of sdps/refinement/trust.py")
     args = parser.parse_args(argv)
-    folder = args.merltest or _rendered(args.out / "scenes")
+    folder = args.merltest or rendered(args.out / "scenes")
     specs = list(enumerate(read_manifest(folder)))[:: args.every]
     results = []
     for (number, spec), images in tqdm([(spec, images) for images in args.images for spec in specs], disable=None):
@@ -85,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _rendered(out: Path) -> Path:
+def rendered(out: Path) -> Path:
     command = [sys.executable, "-m", "pipelines.cli", "render-data", "--preset", str(_PRESET), "--out", str(out)]
     subprocess.run(command, check=True)
     return out / "data" if (out / "data").is_dir() else out
