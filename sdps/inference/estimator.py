@@ -31,8 +31,6 @@ from sdps.models.base import Lights, NormalNetwork, TurningNetwork
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
 from sdps.models.lighting_variants import LCNetSecond
-from sdps.models.lightset_second import LightSetSecond
-from functools import partial
 
 _ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels"), "second": ("second",)}
 _CHUNK_PIXELS = {"cpu": 2**17}
@@ -213,14 +211,11 @@ class Estimator(InferenceConfig):
         lights = self._lighting_pass("lighting", scene, read_out, diagnostics)
         if self.second is not None:
             first = self._merged(known, lights)
-            network = cast(LCNetSecond | LightSetSecond, self.second.network)
-            side = 32 if isinstance(network, LightSetSecond) else INPUT_SIZE
-            fit = partial(resize_input, side=side)
-            small = self._view(scene, "normals", known.balance, fit, side**2, diagnostics)
+            small = self._view(scene, "normals", known.balance, resize_input, INPUT_SIZE**2, diagnostics)
             normals, mask = self._normals(small, first)[0], small.mask
 
             def context(part: slice) -> Tensor:
-                return network.context(normals, mask, first.part(part))
+                return LCNetSecond.context(normals, mask, first.directions[:, part])
 
             lights = self._lighting_pass("second", scene, self.read_out, diagnostics, context)
         if lights.confidence is not None:
@@ -250,7 +245,7 @@ class Estimator(InferenceConfig):
         view: View | KeptView = KeptView(read) if views > 1 else read
         found = []
         for number, symmetry in enumerate(SYMMETRIES[:views]):
-            turned, extra = TurnedView(view, symmetry), turned_context(symmetry, context, getattr(network, "vectors", 0))
+            turned, extra = TurnedView(view, symmetry), turned_context(symmetry, context)
             with repeat(number, views):
                 prediction = lighting_prediction(network, turned, self.arithmetic.autocast, extra, seed=number)
             found.append((symmetry, network.lights(prediction, read_out)))

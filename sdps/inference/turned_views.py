@@ -60,15 +60,14 @@ class KeptView:
 AnyView = View | KeptView | TurnedView
 
 
-def turned_context(symmetry: Symmetry, context: Callable[[slice], Tensor] | None, vectors: int) -> Callable[[slice], Tensor] | None:
+def turned_context(symmetry: Symmetry, context: Callable[[slice], Tensor] | None) -> Callable[[slice], Tensor] | None:
     """Return what gives the turned channels of a second pass: normals and shading (1, n, 4, h, w)."""
     if context is None:
         return None
 
     def turned(part: slice) -> Tensor:
         channels = symmetry.images(context(part))
-        turning = channels[:, :, : 3 * vectors].unflatten(2, (vectors, 3))
-        return torch.cat([symmetry.vectors(turning, dim=3).flatten(2, 3), channels[:, :, 3 * vectors :]], dim=2)
+        return torch.cat([symmetry.vectors(channels[:, :, :3], dim=2), channels[:, :, 3:]], dim=2)
 
     return turned
 

@@ -137,16 +137,16 @@ class LCNet(LightingTrunk):
         return Lights(directions, intensities, peaks[0] * peaks[1])
 
 
-def resize_input(images: Tensor, mask: Tensor, side: int = INPUT_SIZE) -> tuple[Tensor, Tensor]:
+def resize_input(images: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Bring images (B, Q, 3, H, W) and mask (B, 1, H, W) to the 128x128 that LCNet's last layers need.
 
     Bilinear, without keeping the aspect ratio, as the authors' test code, but averaged when shrinking, which is what a
     rendered 128-pixel image is.
     """
-    size = (side, side)
+    size = (INPUT_SIZE, INPUT_SIZE)
     if images.shape[-2:] == size:
         return images, mask
-    shrink = max(images.shape[-2:]) > side
+    shrink = max(images.shape[-2:]) > INPUT_SIZE
     resized = functional.interpolate(images.flatten(0, 1), size, mode="bilinear", antialias=shrink)
     mask = functional.interpolate(mask, size, mode="bilinear", antialias=shrink)
     return resized.unflatten(0, images.shape[:2]), mask

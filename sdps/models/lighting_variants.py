@@ -96,12 +96,9 @@ class LCNetSecond(LCNetSoft):
     def __init__(self, **options: Any) -> None:
         super().__init__(context=4, widths=(128, 128, 128), **options)
 
-    vectors = 1
-    """Channels of the context, three by three, that turn with the scene."""
-
     @staticmethod
-    def context(normals: Tensor, mask: Tensor, lights: Lights) -> Tensor:
-        """Return normals and shading (B, Q, 4, S, S) of normals (B, 3, S, S), mask (B, 1, S, S) and lights."""
-        normals, directions = normals * mask, lights.directions
+    def context(normals: Tensor, mask: Tensor, directions: Tensor) -> Tensor:
+        """Return normals and shading (B, Q, 4, S, S) of normals (B, 3, S, S), mask (B, 1, S, S) and directions."""
+        normals = normals * mask
         shading = torch.einsum("bchw,bqc->bqhw", normals, directions).clamp(min=0.0)[:, :, None]
         return torch.cat([normals[:, None].expand(-1, directions.shape[1], -1, -1, -1), shading], dim=2)

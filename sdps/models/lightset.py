@@ -92,9 +92,6 @@ class LightSetNet(MeetingNetwork):
         intensity_range: Intensities drawn in training.
     """
 
-    further = 0
-    """Channels of an image beside those of `described`."""
-
     def __init__(
         self, *, width: int = 256, blocks: int = 3, heads: int = 4, intensity_range: tuple[float, float] = (0.2, 2.0)
     ) -> None:
@@ -102,7 +99,7 @@ class LightSetNet(MeetingNetwork):
         if blocks < 0 or width < 1 or heads < 1 or width % heads:
             raise InputError(f"heads must divide width, and blocks be 0 or more, got {heads}, {width} and {blocks}")
         self.classes = LightClasses(low=intensity_range[0], high=intensity_range[1])
-        ends = zip((_SEEN + self.further, *_WIDTHS), _WIDTHS, strict=False)
+        ends = zip((_SEEN, *_WIDTHS), _WIDTHS, strict=False)
         self.levels = nn.Sequential(*(Level(inputs, outputs) for inputs, outputs in ends))
         self.read = nn.Linear(_WIDTHS[-1] * 16, width)
         self.blocks = nn.ModuleList(Attention(width, heads) for _ in range(blocks))
@@ -120,18 +117,11 @@ class LightSetNet(MeetingNetwork):
         """Return the prediction of every image; `local` is of all images of the scenes."""
         with torch.no_grad(), torch.autocast(local.device.type, enabled=False):
             seen, likeness = described(local.float())
-        return self.answer(self.attended(self.read(self.levels(seen).flatten(2)), likeness))
-
-    def attended(self, tokens: Tensor, likeness: Tensor) -> Tensor:
-        """Return the tokens (B, Q, C) of images that have attended to each other."""
+        tokens = self.read(self.levels(seen).flatten(2))
         for block in self.blocks:
             tokens = block(tokens, likeness)
-        return tokens
-
-    def answer(self, tokens: Tensor) -> SetPrediction:
-        """Return what the tokens (B, Q, C) of all images say."""
         # Never under autocast: a direction rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
-        with torch.autocast(tokens.device.type, enabled=False):
+        with torch.autocast(local.device.type, enabled=False):
             values = self.out(tokens.float())  # (B, Q, 5)
             # Towards the camera at first; lights behind the object are not to be found.
             directions = functional.normalize(values[..., :3] + values.new_tensor([0.0, 0.0, 0.5]), dim=-1)
@@ -174,21 +164,17 @@ def described(local: Tensor) -> tuple[Tensor, Tensor]:
         local: (B, Q, 4, S, S), the object's radiance and the mask.
     """
     radiance, mask = local[:, :, :3], local[:, :, 3:]
-    pattern, level = without_albedo(radiance.mean(dim=2, keepdim=True), mask)
+    grey = radiance.mean(dim=2, keepdim=True)
+    average = grey.mean(dim=1, keepdim=True).clamp(min=0.0)  # less than nothing where a camera's black level is off
+    shading = (mask * grey / (average + _FLOOR)).clamp(-1.0, _BRIGHTEST)  # (B, Q, 1, S, S), without albedo
+    inside = mask.sum(dim=(2, 3, 4), keepdim=True).clamp(min=1.0)
+    level = (shading.sum(dim=(2, 3, 4), keepdim=True) / inside).clamp(min=0.0) + 0.05  # (B, Q, 1, 1, 1)
+    pattern = shading / level
     seen = torch.cat([radiance.clamp(min=0.0).sqrt(), torch.asinh(pattern), level.log() * mask, mask], dim=2)
     flat = pattern.flatten(2)  # (B, Q, S S)
     about = (pattern - mask).flatten(2)
     likeness = torch.stack([_cosines(flat), _cosines(about)], dim=-1)
     return seen, likeness
-
-
-def without_albedo(grey: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Return grey images (B, Q, 1, S, S) over each pixel's mean, of mean 1 each, and that mean, (B, Q, 1, 1, 1)."""
-    average = grey.mean(dim=1, keepdim=True).clamp(min=0.0)  # less than nothing where a camera's black level is off
-    shading = (mask * grey / (average + _FLOOR)).clamp(-1.0, _BRIGHTEST)
-    inside = mask.sum(dim=(2, 3, 4), keepdim=True).clamp(min=1.0)
-    level = (shading.sum(dim=(2, 3, 4), keepdim=True) / inside).clamp(min=0.0) + 0.05
-    return shading / level, level
 
 
 def _cosines(vectors: Tensor) -> Tensor:

@@ -20,7 +20,6 @@ from sdps.models.frames import FrameNet
 from sdps.models.lcnet import LCNet
 from sdps.models.lighting_variants import LCNetReg, LCNetSecond, LCNetSoft
 from sdps.models.lightset import LightSetNet
-from sdps.models.lightset_second import LightSetSecond
 from sdps.models.nenet import NENet
 from sdps.models.upsfcn import UPSFCN, UPSFCNLight
 
@@ -106,7 +105,6 @@ NETWORKS: dict[str, type[nn.Module]] = {
         LCNetSoft,
         LCNetSecond,
         LightSetNet,
-        LightSetSecond,
         NENet,
         AttentionNet,
         FrameNet,

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any, cast
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -12,11 +11,8 @@ from sdps.core.losses import masked_normal_loss
 from sdps.data.dataset import Batch, SampleOptions
 from sdps.models.base import LightingNetwork, Lights, NormalNetwork, Observations
 from sdps.models.checkpoint import TrainedModel
-from sdps.models.lcnet import resize_input
-from sdps.models.lightset_second import LightSetSecond
-from sdps.core.symmetry import SYMMETRIES
-from sdps.inference.turned_views import mean_lights
-from render.shared.seeds import generator
+from sdps.models.lcnet import INPUT_SIZE, resize_input
+from sdps.models.lighting_variants import LCNetSecond
 from sdps.training.stages import (
     LightingStage,
     Part,
@@ -53,6 +49,8 @@ class SecondStage(LightingStage):
         model: str = "lcnet-second",
         name: str | None = None,
     ) -> None:
+        if config.size != INPUT_SIZE:
+            raise InputError(f"size must be {INPUT_SIZE} for {model}, as its first pass has it, got {config.size}")
         super().__init__(config, model=model, name=name)
         self.lighting, self.normals = freeze(lighting), freeze(normals)
 
@@ -70,30 +68,11 @@ class SecondStage(LightingStage):
     @torch.no_grad()
     def context(self, batch: Batch) -> Tensor:
         """Return normals and shading (B, Q, 4, S, S) of the first pass."""
-        images, mask = batch.images, batch.mask
-        if not isinstance(self.network, LightSetSecond):
-            images, mask = resize_input(images, mask)
+        images, mask = resize_input(batch.images, batch.mask)
         network = cast(LightingNetwork, self.lighting.network)
-        # Another view than the second look has, so that their errors differ; at times the mean of four, nearer to use.
-        rng = generator(int(batch.seed[0]), "first_views")
-        count = 4 if rng.random() < 0.15 else 1
-        found = []
-        for which in rng.choice(np.arange(1, 8), count, replace=False):
-            symmetry = SYMMETRIES[which]
-            prediction = network(symmetry.images(images).contiguous(), symmetry.images(mask).contiguous())
-            found.append((symmetry, network.lights(prediction, "expectation")))
-        first = found[0][1]
-        lights = mean_lights(found) if count > 1 else first._replace(directions=found[0][0].back.vectors(first.directions))
-        self.first = lights
+        lights = network.lights(network(images, mask), "expectation")
         estimator = cast(NormalNetwork, self.normals.network)
-        if isinstance(self.network, LightSetSecond):
-            images, mask = resize_input(images, mask, 32)
-        normals = estimator(estimator.observe(images, mask, lights.doubted()))
-        return type(self.network).context(normals, mask, lights)
-
-    def metrics(self, batch: Batch) -> dict[str, float]:
-        """Return the metrics, and those of the first lights."""
-        return super().metrics(batch) | light_errors(self.first, batch, "_first")
+        return LCNetSecond.context(estimator(estimator.observe(images, mask, lights)), mask, lights.directions)
 
 
 class JointStage(Stage):
