@@ -2,8 +2,8 @@
 
     python docs/scripts/study_errors.py --methods shipped:lightset,shipped:sdps-frames,true+shipped:frames --every 3
 
-Scenes are those of refinement_study.py, rendered where they are not yet. Lights are averaged over eight views, normals
-over as many as the method has. Methods trained in a folder are found with --models.
+Scenes are those of refinement_study.py, rendered where they are not yet. Test-time augmentation of lights is
+eight-fold, that of normals the method's own. Methods trained in a folder are found with --models.
 """
 
 import argparse
@@ -16,11 +16,12 @@ from refinement_study import Scene, rendered
 
 from render.records.manifest import read_manifest
 from render.shared.errors import InputError
-from sdps.core.metrics import angle_degrees, intensity_error
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.parse import parse
 from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
+
+_METRICS = ("direction_mae", "intensity_error", "normal_mae")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -28,35 +29,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--methods", required=True, help="as for `sdps eval-diligent`, with commas between them")
     parser.add_argument("--out", type=Path, default=Path("out/refinement"), help="folder of the study")
-    parser.add_argument("--models", type=Path, help="folder of runs whose weights come before the shipped ones")
+    parser.add_argument("--models", type=Path, help="folder of runs whose weights come before the pretrained ones")
     parser.add_argument("--every", type=int, default=1, help="take every so many scenes")
     args = parser.parse_args(argv)
     folder = rendered(args.out / "scenes")
     specs, find = read_manifest(folder)[:: args.every], finder(args.models)
-    sys.stdout.write(
-        "method, lights, scenes: directions, intensities, normals, expected error of directions (degrees)\n"
-    )
     for name in args.methods.split(","):
         runner = Runner(parse(name, find), find, InferenceConfig(light_views=8))
         for narrow in (False, True):
-            found = [_errors(Scene(folder, spec, narrow, 0, False), runner) for spec in specs]
-            means = "  ".join(f"{value:.3f}" for value in np.mean(found, axis=0))
-            sys.stdout.write(f"{name}, {'narrow' if narrow else 'all around'}, {len(found)}: {means}\n")
+            scores = [_scores(Scene(folder, spec, narrow, 0, False), runner) for spec in specs]
+            means = ", ".join(f"{metric} {np.mean([each[metric] for each in scores]):.3f}" for metric in scores[0])
+            sys.stdout.write(f"{name}, lights {'near the camera' if narrow else 'all around'}: {means}\n")
             sys.stdout.flush()
     return 0
 
 
-def _errors(scene: Scene, runner: Runner) -> tuple[float, float, float, float]:
-    """Return the errors of directions, intensities and normals, and the one expected of directions; nan: not told."""
+def _scores(scene: Scene, runner: Runner) -> dict[str, float]:
+    """Return what the method got wrong of what it estimated, and the error it expected of its light directions."""
     found = runner.estimate(scene.images, scene.mask, scene.lights, scene.gains, {})
-    directions = gains = normals = np.nan
-    if found.light_directions.size:
-        directions = float(angle_degrees(found.light_directions, scene.lights).mean())
-    if found.intensities.size:
-        gains = intensity_error(found.intensities, scene.gains)
-    if found.normals.size:
-        normals = float(angle_degrees(found.normals[scene.mask], scene.normals[scene.mask]).mean())
-    return directions, gains, normals, float(np.mean(found.diagnostics.get("expected_light_error", np.nan)))
+    scores = runner.score(found, scene.mask, scene.normals, scene.lights, scene.gains)
+    kept = {metric: scores[metric] for metric in _METRICS if metric in scores}
+    expected = found.diagnostics.get("expected_light_error")
+    return kept if expected is None else kept | {"expected_light_error": float(np.mean(expected))}
 
 
 if __name__ == "__main__":
