@@ -43,8 +43,7 @@ __all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "
 AUTO = "auto"
 _LEARNED = ("sdps-frames", "sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
 _CALIBRATED = ("frames", "psfcn", "robust-least-squares")
-"""Tried in this order; the parts may be trained or shipped one by one. Refinement leaves out the first: from there it
-ends no nearer to the truth (docs/studies/refinement.md)."""
+"""Tried in this order; the parts may be trained or shipped one by one."""
 _FALLBACK = "pf14"
 
 _log = logging.getLogger(__name__)
@@ -219,8 +218,7 @@ def _runner(
     """Return the method of an expression with its networks; `lit`: the light directions are known."""
     find = _finder(models)
     plain = method.removesuffix(f"+{REFINE}")
-    refines = plain != method or (images >= FEWEST_IMAGES if refine is None else refine)
-    chosen = _told(_automatic(lit, refines, find) if plain == AUTO else plain, lit, find)
+    chosen = _told(_automatic(lit, find) if plain == AUTO else plain, lit, find)
     if refine is None:
         refine = by_networks(chosen) and images >= FEWEST_IMAGES
     return Runner(refined(chosen) if refine or plain != method else chosen, find, config)
@@ -242,9 +240,9 @@ def _told(text: str, lit: bool, find: Callable[[str], Path]) -> Method:
     return parse(text if "+" in text else f"{TRUE_LIGHTS}+{text}", find)
 
 
-def _automatic(lit: bool, refines: bool, find: Callable[[str], Path]) -> str:
-    """Return the best method whose weights are there, as it is or as the start of refinement."""
-    for name in (_CALIBRATED if lit else _LEARNED)[refines:]:
+def _automatic(lit: bool, find: Callable[[str], Path]) -> str:
+    """Return the best method whose weights are there."""
+    for name in _CALIBRATED if lit else _LEARNED:
         try:
             _told(name, lit, find)
         except InputError:

@@ -186,10 +186,10 @@ def test_methods_that_can_be_used_are_listed():
     [
         (False, False, 96, "sdps-frames (lightset + frames)"),
         (False, None, 7, "sdps-frames (lightset + frames)"),  # too few to refine
-        (False, None, 96, "sdps-plus (lcnet-soft + nenet-plus), refined"),
-        (False, True, 96, "sdps-plus (lcnet-soft + nenet-plus), refined"),
+        (False, None, 96, "sdps-frames (lightset + frames), refined"),
+        (False, True, 7, "sdps-frames (lightset + frames), refined"),
         (True, False, 96, "frames, true lights"),
-        (True, None, 96, "psfcn, true lights, refined"),
+        (True, None, 96, "frames, true lights, refined"),
     ],
 )
 def test_the_automatic_method_depends_on_what_follows(

@@ -156,7 +156,7 @@ class Runner:
     def _refine(
         self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any], saturation: float
     ) -> Estimate:
-        """Refine an estimate, or keep it where refinement cannot be trusted; lights it was given stay."""
+        """Refine an estimate, or keep it where refinement cannot be trusted; light directions it was given stay."""
         from sdps.refinement.refine import refine
         from sdps.refinement.trust import trust
 
@@ -164,17 +164,15 @@ class Runner:
             raise InputError(
                 f"{self.method.name}: refinement needs lights; put a lighting model before it, as in lcnet+"
             )
-        names = {"lights": "directions", "intensities": "intensities"}
         begun = given.get("intensities")
         if begun is None:
             begun = estimate.intensities if len(estimate.intensities) else np.ones(len(images), np.float32)
+        lit = given.get("lights") is not None
         refined = refine(
             images, mask, estimate.normals, estimate.light_directions, begun,
-            known=frozenset(name for key, name in names.items() if given.get(key) is not None),
-            stray=self.config.stray_light, saturation=saturation,
+            directions_given=lit, stray=self.config.stray_light, saturation=saturation,
         )  # fmt: skip
-        told = given.get("lights") is not None
-        expected = trust(refined, mask, estimate.normals, estimate.light_directions, given=told)
+        expected = trust(refined, mask, estimate.normals, estimate.light_directions, given=lit)
         diagnostics = estimate.diagnostics | {"refined": refined, "start": estimate, "trust": expected}
         if expected.doubt:
             return replace(estimate, diagnostics=diagnostics)

@@ -74,7 +74,7 @@ def refine(
     lights: np.ndarray,
     intensities: np.ndarray,
     *,
-    known: frozenset[str] = frozenset(),
+    directions_given: bool = False,
     config: RefineConfig | None = None,
     stray: bool = True,
     saturation: float = np.inf,
@@ -87,7 +87,8 @@ def refine(
         normals: (H, W, 3) unit, where a method put them.
         lights: (L, 3) unit directions from the surface to the light.
         intensities: (L,) or (L, 3).
-        known: `directions`, `intensities` or both, where these are given and must stay.
+        directions_given: The light directions are known and stay. Intensities always move: they also take up what
+            distant light and the reflectance model miss in each image, which normals would otherwise take up.
         config: Iterations and rates.
         stray: Take stray light off the images.
         saturation: Radiance from which on a channel is clipped; such observations count for nothing.
@@ -102,7 +103,7 @@ def refine(
     values = _gathered(scene)
     problem = problem_of(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
-    free = frozenset(State._fields) - {f"log_{name}" if name == "intensities" else name for name in known}
+    free = frozenset(State._fields) - ({"directions"} if directions_given else set())
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
     with progress_bar(None, total=before + config.iterations + fine, desc="refine", unit="iteration") as bar:
         move = partial(solve, free=free, boost=config.boost, weights=Weights(), after=_advance(bar))

@@ -95,10 +95,10 @@ def test_refinement_of_a_white_cavity_gains_from_bounced_light() -> None:
     start = np.zeros((*mask.shape, 3))
     start[mask] = normals * [0.7, 0.7, 1.0]
     start[mask] /= np.linalg.norm(start[mask], axis=-1, keepdims=True)
-    known, errors = frozenset({"directions", "intensities"}), []
+    errors = []
     for bounces in (0, 2):
         config = RefineConfig(iterations=300, iterations_before=150, bounces=bounces)
-        made = refine(images, mask, start, lights, np.ones(16), known=known, config=config, stray=False)
+        made = refine(images, mask, start, lights, np.ones(16), directions_given=True, config=config, stray=False)
         errors.append(angle_degrees(made.normals[mask], normals).mean())
     assert errors[1] < 0.9 * errors[0]
 
