@@ -21,7 +21,7 @@ _FLAT = 0.1
 _WINDOW = 5  # pixels that a residual is averaged over
 _BEST, _LEAST = 0.008, 0.001  # the residual of a perfect model, and the least above it that is told apart
 _UPRIGHT, _STILL, _FAINT = 0.1, 0.3, 0.003
-_GIVEN = 0.5  # share of the error that is left where the lights' directions are given, as rendered scenes have it
+_GIVEN = 0.8  # share of the error that is left where the light directions are given, as rendered scenes have it
 
 NORMAL = (4.804, 0.613, -0.505, 0.232, 0.016, -0.310, 0.298)
 """Of log degrees per pixel: constant, misfit, images, the lights' spread, residual of the pixel, its n_z, how far its
@@ -57,8 +57,8 @@ def trust(found: Refined, mask: np.ndarray, normals: np.ndarray, lights: np.ndar
         mask: (H, W) bool.
         normals: (H, W, 3) unit, its start.
         lights: (L, 3) unit, its start.
-        given: The lights' directions were given: half the error is expected of normals, none of lights, and the start
-            is kept for no error that is expected.
+        given: The light directions were given: four fifths of the error are expected of normals, none of lights, and
+            the start is kept for no error that is expected.
     """
     of_normals, of_lights, moved = features(found, mask, normals, lights)
     expected = np.zeros(mask.shape, np.float32)
