@@ -87,8 +87,7 @@ def refine(
         normals: (H, W, 3) unit, where a method put them.
         lights: (L, 3) unit directions from the surface to the light.
         intensities: (L,) or (L, 3).
-        directions_given: The light directions are known and stay. Intensities always move: they also take up what
-            distant light and the reflectance model miss in each image, which normals would otherwise take up.
+        directions_given: Directions stay. Intensities always move: they also take up what the model misses in an image.
         config: Iterations and rates.
         stray: Take stray light off the images.
         saturation: Radiance from which on a channel is clipped; such observations count for nothing.
