@@ -227,16 +227,16 @@ def test_exchanging_files_compiles_nothing_again(tmp_path, packed):
         dr.eval(dr.while_loop(state, lambda k, _: k < count, lambda k, v: (k + 1, v + family.eval(k, wi, wo))))
 
     total(packed)
-    hashes, sets = set(), (["nickel", "nylon"], ["brass", "teflon", "pvc"], ["steel", "delrin"]) * 4
-    for number, names in enumerate(sets):
+    hashes = set()
+    for number, names in enumerate((["nickel", "nylon"], ["brass", "teflon", "pvc"], ["steel", "delrin"])):
         folder = tmp_path / str(number)
         family = rgl_bsdf.PackedRgl([rgl.write(folder / f"{name}.bsdf", brdf(name)) for name in names])
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             total(family)
             hashes |= {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
-    # Dr.Jit has other versions of some kernels, by where tables lie in memory, but not one per set of files.
-    assert len(hashes) <= len(sets) // 2
+    # Dr.Jit has a second version of some kernels, by where tables lie in memory, but not one per set of files.
+    assert len(hashes) <= 2
 
 
 @pytest.mark.parametrize(("number", "incidence"), [(0, 30), (1, 75), (2, 45)])
