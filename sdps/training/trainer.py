@@ -6,6 +6,7 @@ a run that was stopped and resumed takes the same steps on the same batches as o
 several processes share every batch and take the steps one process would take.
 """
 
+import copy
 import logging
 import math
 import time
@@ -206,6 +207,8 @@ class Trainer:
         self.optimiser = _optimiser(stage.network, config)
         average = get_ema_multi_avg_fn(config.ema)
         self.average = AveragedModel(stage.network, multi_avg_fn=average) if config.ema else None
+        self._start = copy.deepcopy(stage.network) if config.start_share else None
+        self._blend = copy.deepcopy(self._start)
         if config.compile:
             stage.network.compile()
         self._loss: nn.Module = _Loss(stage)
@@ -298,9 +301,17 @@ class Trainer:
             self.save_weights(values, "-best")
         return values
 
+    @torch.no_grad()
     def _kept(self) -> nn.Module:
-        """Return the network that is validated and saved: the trained one, or its moving average."""
-        return self.stage.network if self.average is None else self.average.module
+        """Return the network that is validated and saved: trained, averaged over time, or a mean with the start."""
+        kept: nn.Module = self.stage.network if self.average is None else self.average.module
+        if self._blend is None or self._start is None:
+            return kept
+        first, last = self._start.state_dict(), kept.state_dict()
+        for name, weight in self._blend.state_dict().items():  # shares memory with the network
+            counts = not weight.is_floating_point()
+            weight.copy_(last[name] if counts else torch.lerp(last[name], first[name], self.config.start_share))
+        return self._blend
 
     def _diverged(self, what: str) -> InputError:
         """Build the error that ends a run which has left the numbers, and say what is left of it."""

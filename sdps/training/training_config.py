@@ -24,6 +24,9 @@ class TrainingConfig:
         seed: Root seed of weights, order, image subsets and augmentation.
         start: What of the same network training starts from: a run, `shipped:<name>` or a `.safetensors` file; empty
             for random weights.
+        start_share: Share of the start in the weights that are validated and saved; the rest is what was trained (0:
+            all of it). Averages of fine-tuned weights and those before them are often better than both (Wortsman et
+            al., Robust fine-tuning of zero-shot models, CVPR 2022, eq. 1, whose alpha is 1 less this).
         epochs: Passes over the training scenes, unless `steps` or `minutes` is set.
         steps: Optimiser steps to take instead.
         minutes: Minutes of training to spend instead, counted across resumed runs.
@@ -64,6 +67,7 @@ class TrainingConfig:
 
     seed: int = 0
     start: str = ""
+    start_share: float = 0.0
     epochs: float = 20.0
     steps: int | None = None
     minutes: float | None = None
@@ -117,7 +121,9 @@ class TrainingConfig:
             raise InputError(f"accumulate {self.accumulate} must divide batch_scenes {self.batch_scenes}")
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 and at least 16, got {self.size}")
-        for name in ("warmup", "ema", "cooldown"):
+        if self.start_share and not self.start:
+            raise InputError(f"start_share is {self.start_share}, but there is no start; name one, or leave it out")
+        for name in ("start_share", "warmup", "ema", "cooldown"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InputError(f"{name} must be in [0, 1), got {getattr(self, name)}")
         if self.schedule == "halving" and any(not 0.0 < epoch < self.epochs for epoch in self.halve_after):

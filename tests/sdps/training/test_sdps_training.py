@@ -231,6 +231,20 @@ def test_averaged_weights_are_validated_saved_and_resumed(folder: Path, tmp_path
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
 
 
+def test_weights_that_are_kept_may_hold_a_share_of_the_start(folder: Path, tmp_path: Path) -> None:
+    config = replace(QUICK, start="before", start_share=0.25, steps=2)
+    stage = NormalStage(config)
+    first = {name: weight.clone() for name, weight in stage.network.state_dict().items()}
+    result = train(stage, folder, tmp_path / "whole")
+    saved, last = load_file(result.weights["nenet"]), stage.network.state_dict()
+    for name, weight in last.items():
+        assert torch.allclose(saved[name], 0.25 * first[name] + 0.75 * weight, atol=1e-7), name
+    assert not torch.equal(saved["normal.weight"], last["normal.weight"])
+    train(NormalStage(config), folder, tmp_path / "parts", loggers=[StopAt(1)])
+    train(NormalStage(config), folder, tmp_path / "parts")
+    assert_same_run(tmp_path / "whole", tmp_path / "parts")
+
+
 def test_fine_tuning_together_reaches_the_lighting_network_through_the_lights(folder: Path, tmp_path: Path) -> None:
     def model(name: str) -> TrainedModel:
         return TrainedModel(name, create(name), {}, {"config": {"augmentation": {}}, "data": "d", "step": 1})
@@ -428,6 +442,8 @@ def test_schedules_of_the_paper() -> None:
         ({"steps": 5, "minutes": 1.0}, "both set"),
         ({"accumulate": 3}, "must divide"),
         ({"epochs": 12.0}, "halve_after"),
+        ({"start_share": 0.5}, "there is no start"),
+        ({"start": "other", "start_share": 1.0}, r"start_share must be in \[0, 1\)"),
         ({"size": 96}, "must be 128 for LCNet, .* or 64 for a run that others start from"),
         ({"learnin_rate": 1.0}, "did you mean 'training.learning_rate'"),
         ({"augmentation": {"noise": 2.0}}, "noise"),
