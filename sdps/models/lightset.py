@@ -130,17 +130,19 @@ class LightSetNet(MeetingNetwork):
             return SetPrediction(directions, intensities, (values[..., 4] + LOG_USUAL).exp())
 
     def predict_many(self, local: Tensor, seed: int) -> SetPrediction:
-        """Return intensities of all images together, which alone have one scale, and directions group by group."""
+        """Return what groups of images say; all images together give the intensities of a group their scale."""
         together = self.predict(local)
         groups = local.shape[1] // _TOGETHER
         if groups < 2:
             return together
-        directions, expected = torch.empty_like(together.directions), torch.empty_like(together.expected)
+        found = SetPrediction(*(torch.empty_like(part) for part in together))
         order = torch.randperm(local.shape[1], generator=torch.Generator().manual_seed(seed)).to(local.device)
         for part in order.tensor_split(groups):
-            found = self.predict(local[:, part])
-            directions[:, part], expected[:, part] = found.directions, found.expected
-        return together._replace(directions=directions, expected=expected)
+            some = self.predict(local[:, part])
+            scale = (together.intensities[:, part] / some.intensities).log().mean(dim=1, keepdim=True).exp()
+            found.directions[:, part], found.expected[:, part] = some.directions, some.expected
+            found.intensities[:, part] = some.intensities * scale
+        return found
 
     def loss(self, prediction: SetPrediction, directions: Tensor, intensities: Tensor) -> dict[str, Tensor]:
         """Return the chord of the directions, the error of the relative intensities, and that of the expected error."""
