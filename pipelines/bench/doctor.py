@@ -5,16 +5,16 @@ import ctypes
 import importlib.metadata
 import os
 import platform
-import shutil
 import sys
 from pathlib import Path
 
 from render.backend import llvm, variant
+from render.planning.budget import free_bytes, gigabytes
 from render.shapes.primitives import bunny
 from render.shared.errors import InputError
 
 PACKAGES = ("mitsuba", "drjit", "torch", "numpy", "scipy", "trimesh", "OpenEXR", "scikit-image", "safetensors")
-LOW_DISK_GB = 5.0
+DEMO_BYTES = 5_000_000_000
 CUDA_TESTED = (
     "nothing by the authors, who had no GPU; `make test-gpu` compares rendering, training and inference there with the "
     "CPU's (not: several GPUs, torch.compile)"
@@ -65,16 +65,19 @@ def examine(folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
     lines += _variant_lines(problems)
     lines.append(("arithmetic", arithmetic("auto", default_device()).describe()))
     lines.append(("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())))
-    free = shutil.disk_usage(folder).free / 1e9
-    lines.append(("free disk", f"{free:.1f} GB"))
-    if free < LOW_DISK_GB:
-        problems.append(f"disk: {free:.1f} GB free; the demo preset wants {LOW_DISK_GB:.0f} GB, choose another --out")
+    lines.append(("free disk", _disk_line(free_bytes(folder))))
     try:
         lines.append(("bunny mesh", f"{len(bunny().faces):,} triangles"))
     except InputError as error:
         lines.append(("bunny mesh", "not there"))
         problems.append(f"bunny mesh: {error}")
     return lines, problems
+
+
+def _disk_line(free: int) -> str:
+    """Describe the free bytes; a small disk is no fault, since rendering itself refuses what does not fit."""
+    low = f"; the demo takes about {gigabytes(DEMO_BYTES)}, choose another --out" if free < DEMO_BYTES else ""
+    return gigabytes(free) + low
 
 
 def _variant_lines(problems: list[str]) -> list[tuple[str, str]]:

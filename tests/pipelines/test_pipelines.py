@@ -143,6 +143,12 @@ def test_doctor_reports_variant_and_cores(capsys):
         assert re.search(rf"^{name}\s+\S", text, re.MULTILINE)
 
 
+def test_doctor_passes_on_a_small_disk_and_says_so(capsys, monkeypatch):
+    monkeypatch.setattr("pipelines.bench.doctor.free_bytes", lambda folder: 3_200_000_000)
+    assert main(["doctor"]) == 0
+    assert "3.2 GB; the demo takes about 5.0 GB, choose another --out" in capsys.readouterr().out
+
+
 def test_list_flags_take_commas_and_repetition():
     assert split_list(["a,b", "c", " d ,"]) == ["a", "b", "c", "d"]
     assert scenes.slug("lambertian:0.8/0.3/0.1") == "lambertian-0.8-0.3-0.1"
