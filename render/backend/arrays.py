@@ -20,20 +20,25 @@ def upload(kind: type, values: np.ndarray) -> Any:
     On the CPU Dr.Jit uses NumPy's memory as it is, and compiles loads by its alignment, which is a matter of luck. The
     copy is gathered by an index the kernel cannot see through, for which alignment does not matter.
     """
-    source = kind(np.ascontiguousarray(values))
+    source = _data(kind, values)
     copy = dr.gather(kind, source, dr.arange(mi.UInt32, dr.width(source)) + opaque(mi.UInt32(0)))
     dr.eval(copy)
     return copy
 
 
+def _data(kind: type, values: np.ndarray) -> Any:
+    """Return values, flat, as data. A single one goes into Dr.Jit's own memory: to gather it is a plain load."""
+    return opaque(kind(values.item()) if values.size == 1 else kind(np.ascontiguousarray(values).ravel()))
+
+
 def table(values: Any) -> "mi.Float":
     """Return a flat opaque float32 array of `values`, for kernels that gather from it."""
-    return opaque(mi.Float(np.ascontiguousarray(values, np.float32).ravel()))
+    return _data(mi.Float, np.asarray(values, np.float32))
 
 
 def integers(values: Any) -> "mi.UInt32":
     """Return a flat opaque UInt32 array of `values`, for kernels that gather from it."""
-    return opaque(mi.UInt32(np.ascontiguousarray(values, np.uint32).ravel()))
+    return _data(mi.UInt32, np.asarray(values, np.uint32))
 
 
 def packets(values: Any) -> "mi.Float":

@@ -28,8 +28,9 @@ class PackedRgl:
     """K `.bsdf` files for kernels that index them by number; a packed family like `PackedMaterials`.
 
     An index selects among the plugin instances by `dr.switch`. Their tables are data to the kernel and instances of
-    equal table sizes share one piece of code, so exchanging such files, or their number, compiles nothing again (but
-    for a rare second version of a kernel, by where the tables lie in memory).
+    equal table sizes share one piece of code, so exchanging such files, or their number, seldom compiles anything:
+    Mitsuba 3.9 leaves `m_reduction` of isotropic files unset, so a file has, by chance, one of three pieces of code,
+    which differ in signs that do not matter to it.
 
     Args:
         materials: At least one file.

@@ -176,7 +176,7 @@ def test_packed_files_evaluate_as_their_plugin(packed, files, number):
     si.wi = wi
     expected = np.array(plugin.eval(mi.BSDFContext(), si, wo, True))
     index = dr.full(mi.UInt32, number, 3000)
-    # Not to the bit: `measured` rounds differently by where its tables lie in memory.
+    # Not to the bit: `measured` leaves `m_reduction` of isotropic files unset, and its value changes the rounding.
     close = partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-6)
     close(np.array(packed.eval(index, wi, wo)), expected)
     close(np.array(packed.eval_at(index, packed.prepare(wi, wo))), expected)
@@ -227,16 +227,17 @@ def test_exchanging_files_compiles_nothing_again(tmp_path, packed):
         dr.eval(dr.while_loop(state, lambda k, _: k < count, lambda k, v: (k + 1, v + family.eval(k, wi, wo))))
 
     total(packed)
-    hashes = set()
-    for number, names in enumerate((["nickel", "nylon"], ["brass", "teflon", "pvc"], ["steel", "delrin"])):
+    hashes, sets = set(), [["nickel", "nylon"], ["brass", "teflon", "pvc"], ["steel", "delrin"]] * 4
+    for number, names in enumerate(sets):
         folder = tmp_path / str(number)
         family = rgl_bsdf.PackedRgl([rgl.write(folder / f"{name}.bsdf", brdf(name)) for name in names])
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             total(family)
             hashes |= {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
-    # Dr.Jit has a second version of some kernels, by where tables lie in memory, but not one per set of files.
-    assert len(hashes) <= 2
+    # Mitsuba leaves `m_reduction` of isotropic files unset, so each is one of three pieces of code: below 2, 4, others.
+    # A kernel that switches among files holds one, two or all three of them.
+    assert len(hashes) <= 2**3 - 1 < len(sets)
 
 
 @pytest.mark.parametrize(("number", "incidence"), [(0, 30), (1, 75), (2, 45)])

@@ -20,6 +20,7 @@ from render.records import ledger
 from render.records.ledger import Ledger
 from render.records.manifest import SceneSpec, View
 from render.records.shards import file_hash
+from render.running.crew import LocalCrew
 from render.running.supervisor import RunOptions, render_supervised
 from render.shared.errors import InputError
 
@@ -245,10 +246,13 @@ def test_half_written_shards_are_swept(tmp_path):
 # ---- The real renderer -----------------------------------------------------------------------------
 
 
-def test_real_processes_write_the_bytes_of_a_plain_run_whatever_fails_beside_them(tmp_path):
+def test_real_processes_write_the_bytes_of_a_plain_run_whatever_fails_beside_them(tmp_path, monkeypatch):
     """Two processes; one scene's material file is missing, another one blocks its process, which is then killed."""
+    from render.running import rendered
     from render.running.worker import render_scenes
 
+    commit = "0" * 40  # a file of the checkout that changes meanwhile would show in the headers
+    monkeypatch.setattr(rendered, "_stamped", commit)
     config = DataConfig(families={"blobby": 4}, views=1, materials_per_view=2, light_count=4, size=24, spp=4)
     scenes = plan(config)
     assert render_scenes(scenes, tmp_path / "plain") == 8
@@ -267,7 +271,7 @@ def test_real_processes_write_the_bytes_of_a_plain_run_whatever_fails_beside_the
 
     helper = threading.Thread(target=kill_the_blocked_one, daemon=True)
     helper.start()
-    summary = render_supervised(mixed, tmp_path, RunOptions(workers=2))
+    summary = render_supervised(mixed, tmp_path, crew=LocalCrew(tmp_path, tmp_path, workers=2, commit=commit))
     helper.join()
     assert (summary.done, len(summary.failed)) == (4, 4)
     reasons = {line["id"]: line["reason"] for line in summary.failed}
