@@ -37,7 +37,7 @@ def main() -> int:
         lit = scene.images[int(np.argmax(scene.lights @ np.array([-0.4, 0.5, 0.77])))]
         maps = [
             pictures.tone_map(lit, pictures.auto_exposure(lit[None], scene.mask)),
-            pictures.normal_map(begun["normals"], scene.mask), _errors(scene, begun["normals"]),
+            pictures.normal_map(begun.normals, scene.mask), _errors(scene, begun.normals),
             pictures.normal_map(found.normals, scene.mask), _errors(scene, found.normals),
             pictures.error_map(np.where(scene.mask, expected(scene, begun, found).normals, np.nan), _YELLOW),
         ]  # fmt: skip

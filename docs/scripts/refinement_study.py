@@ -27,6 +27,7 @@ from render.records.shards import read_shard
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
 from render.shared.seeds import generator
+from sdps.core.estimate import Estimate
 from sdps.core.metrics import angle_degrees, intensity_error
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.parse import parse
@@ -34,10 +35,11 @@ from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
 from sdps.refinement.refine import refine
 from sdps.refinement.refined import Refined
-from sdps.refinement.trust import Trust, features, trust
+from sdps.refinement.trust import NORMAL, Trust, features, trust
 
 _PRESET = Path(__file__).with_suffix(".yaml")
 _NARROW = np.cos(np.radians(50.0))
+_TOLD = "expected_error"
 _LOSS = 0.3  # degrees; what counts as losing
 _OFFSET = 0.05  # degrees, added before the logarithm
 
@@ -91,7 +93,7 @@ def rendered(out: Path) -> Path:
     return out / "data" if (out / "data").is_dir() else out
 
 
-def _refined(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> tuple[dict[str, np.ndarray], Refined]:
+def _refined(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> tuple[Estimate, Refined]:
     """Return the start and what refinement makes of it, read back where it is there."""
     path = out / f"{scene.name.replace('/', '_')}.npz"
     if not path.exists():
@@ -105,14 +107,19 @@ def _refined(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> t
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             begun = {"normals": start.normals, "lights": start.light_directions, "gains": gains}
+            if _TOLD in start.diagnostics:
+                begun |= {_TOLD: start.diagnostics[_TOLD]}
             np.savez(file, **{f"start_{name}": value for name, value in begun.items()}, **vars(found))
     return kept(path)
 
 
-def kept(path: Path) -> tuple[dict[str, np.ndarray], Refined]:
+def kept(path: Path) -> tuple[Estimate, Refined]:
     """Return a start and its refinement, read back."""
     with np.load(path) as archive:
-        begun = {name: archive[f"start_{name}"] for name in ("normals", "lights", "gains")}
+        begun = Estimate(
+            *(archive[f"start_{name}"] for name in ("normals", "lights", "gains")),
+            {_TOLD: archive[f"start_{_TOLD}"]} if f"start_{_TOLD}" in archive else {},
+        )
         return begun, Refined(**{name: archive[name] for name in Refined.__dataclass_fields__})
 
 
@@ -127,27 +134,27 @@ def _turned(scene: Scene, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     return (lights / np.linalg.norm(lights, axis=1, keepdims=True)).astype(np.float32), gains.astype(np.float32)
 
 
-def _errors(scene: Scene, normals: np.ndarray, lights: np.ndarray, gains: np.ndarray) -> tuple[float, float, float]:
+def _errors(scene: Scene, found: Estimate) -> tuple[float, float, float]:
     return (
-        float(angle_degrees(normals[scene.mask], scene.normals[scene.mask]).mean()),
-        float(angle_degrees(lights, scene.lights).mean()),
-        intensity_error(gains, scene.gains),
+        float(angle_degrees(found.normals[scene.mask], scene.normals[scene.mask]).mean()),
+        float(angle_degrees(found.light_directions, scene.lights).mean()),
+        intensity_error(found.intensities, scene.gains),
     )
 
 
-def expected(scene: Scene, begun: dict[str, np.ndarray], found: Refined) -> Trust:
+def expected(scene: Scene, begun: Estimate, found: Refined) -> Trust:
     """Return the errors to expect."""
-    given = np.allclose(begun["lights"], found.light_directions, atol=1e-6)  # of unit length but for rounding
-    return trust(found, scene.mask, begun["normals"], begun["lights"], given=given)
+    given = np.allclose(begun.light_directions, found.light_directions, atol=1e-6)  # of unit length but for rounding
+    return trust(found, scene.mask, begun, given=given)
 
 
-def _table(results: list[tuple[Scene, dict[str, np.ndarray], Refined]]) -> Iterator[str]:
+def _table(results: list[tuple[Scene, Estimate, Refined]]) -> Iterator[str]:
     """Yield a line a scene, then means by shape: start, refined, refined with the guard; errors that are expected."""
     rows, doubts = [], 0
     yield f"{'scene':28s} {'material':26s}   L  normals       lights        intensities    expected  doubt"
     for scene, begun, found in results:
-        before = _errors(scene, **begun)
-        after = _errors(scene, found.normals, found.light_directions, found.grey_intensities)
+        before = _errors(scene, begun)
+        after = _errors(scene, Estimate(found.normals, found.light_directions, found.grey_intensities))
         judged = expected(scene, begun, found)
         doubts += bool(judged.doubt)
         rows.append((scene.shape, before, after, before if judged.doubt else after))
@@ -167,7 +174,7 @@ def _table(results: list[tuple[Scene, dict[str, np.ndarray], Refined]]) -> Itera
     yield from _reliability(results)
 
 
-def _reliability(results: list[tuple[Scene, dict[str, np.ndarray], Refined]], bins: int = 8) -> Iterator[str]:
+def _reliability(results: list[tuple[Scene, Estimate, Refined]], bins: int = 8) -> Iterator[str]:
     """Yield the mean error by eighths of the expected one, every scene with the same weight."""
     normals, lights = [], []
     for scene, begun, found in results:
@@ -182,21 +189,44 @@ def _reliability(results: list[tuple[Scene, dict[str, np.ndarray], Refined]], bi
             yield f"reliability, {name}: expected {part[0].mean():6.2f}, actual {part[1].mean():6.2f}"
 
 
-def _fit(results: list[tuple[Scene, dict[str, np.ndarray], Refined]]) -> Iterator[str]:
-    """Yield constants: least squares of the logarithms, every scene with the same weight, then the right mean."""
-    parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {"NORMAL": [], "LIGHT": [], "START": []}
+Pairs = list[tuple[str, np.ndarray, np.ndarray]]  # shape, features (N, K), actual degrees (N,)
+
+
+def _fit(results: list[tuple[Scene, Estimate, Refined]]) -> Iterator[str]:
+    """Yield the constants, and how far off shapes are that were left out, with all features and without the last."""
+    parts: dict[str, Pairs] = {"NORMAL": [], "LIGHT": [], "START": []}
     for scene, begun, found in results:
-        of_normals, of_lights, moved = features(found, scene.mask, begun["normals"], begun["lights"])
+        of_normals, of_lights, moved = features(found, scene.mask, begun)
         actual = angle_degrees(found.normals[scene.mask], scene.normals[scene.mask])
-        parts["NORMAL"].append((of_normals, actual))
-        parts["LIGHT"].append((of_lights, angle_degrees(found.light_directions, scene.lights)))
-        parts["START"].append((moved[None], np.array([_errors(scene, **begun)[0]])))
+        parts["NORMAL"].append((scene.shape, of_normals, actual))
+        parts["LIGHT"].append((scene.shape, of_lights, angle_degrees(found.light_directions, scene.lights)))
+        parts["START"].append((scene.shape, moved[None], np.array([_errors(scene, begun)[0]])))
     for name, pairs in parts.items():
-        weights = np.concatenate([np.full(len(y), 1.0 / np.sqrt(len(y))) for _, y in pairs])
-        x, y = (np.concatenate(values) for values in zip(*pairs, strict=True))
-        found, *_ = np.linalg.lstsq(x * weights[:, None], np.log(y + _OFFSET) * weights, rcond=None)
-        found[0] += np.log(np.average(y, weights=weights**2) / np.average(np.exp(x @ found), weights=weights**2))
-        yield f"{name} = ({', '.join(f'{value:.3f}' for value in found)})"
+        yield f"{name} = ({', '.join(f'{value:.3f}' for value in _powers(pairs))})"
+    for width in sorted({len(NORMAL), parts["NORMAL"][0][1].shape[1]}):
+        each, means = _left_out([(shape, x[:, :width], y) for shape, x, y in parts["NORMAL"]])
+        yield f"NORMAL, {width} features, shapes left out: logarithms off by {each:.2f}, of means {means:.2f} (rms)"
+
+
+def _powers(pairs: Pairs) -> np.ndarray:
+    """Return constants (K,): least squares of the logarithms, every scene with the same weight, then the right mean."""
+    weights = np.concatenate([np.full(len(y), 1.0 / np.sqrt(len(y))) for _, _, y in pairs])
+    x, y = np.concatenate([x for _, x, _ in pairs]), np.concatenate([y for _, _, y in pairs])
+    found, *_ = np.linalg.lstsq(x * weights[:, None], np.log(y + _OFFSET) * weights, rcond=None)
+    found[0] += np.log(np.average(y, weights=weights**2) / np.average(np.exp(x @ found), weights=weights**2))
+    return found
+
+
+def _left_out(pairs: Pairs) -> tuple[float, float]:
+    """Fit without each shape in turn; return how far the logarithms of its errors, and of their means, are off."""
+    each, means = [], []
+    for left in {shape for shape, _, _ in pairs}:
+        found = _powers([pair for pair in pairs if pair[0] != left])
+        for _, x, y in (pair for pair in pairs if pair[0] == left):
+            told = np.exp(x @ found)
+            each.append(np.square(np.log((told + _OFFSET) / (y + _OFFSET))).mean())
+            means.append(np.log(told.mean() / y.mean()) ** 2)
+    return float(np.sqrt(np.mean(each))), float(np.sqrt(np.mean(means)))
 
 
 if __name__ == "__main__":

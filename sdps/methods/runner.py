@@ -172,7 +172,7 @@ class Runner:
             images, mask, estimate.normals, estimate.light_directions, begun,
             directions_given=lit, stray=self.config.stray_light, saturation=saturation,
         )  # fmt: skip
-        expected = trust(refined, mask, estimate.normals, estimate.light_directions, given=lit)
+        expected = trust(refined, mask, estimate, given=lit)
         diagnostics = estimate.diagnostics | {"refined": refined, "start": estimate, "trust": expected}
         if expected.doubt:
             return replace(estimate, diagnostics=diagnostics)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
+from sdps.core.estimate import Estimate
 from sdps.core.metrics import angle_degrees
 from sdps.refinement.refined import Refined
 
@@ -21,11 +22,13 @@ _FLAT = 0.1
 _WINDOW = 5  # pixels that a residual is averaged over
 _BEST, _LEAST = 0.008, 0.001  # the residual of a perfect model, and the least above it that is told apart
 _UPRIGHT, _STILL, _FAINT = 0.1, 0.3, 0.003
-_GIVEN = 0.8  # share of the error that is left where the light directions are given, as rendered scenes have it
+_GIVEN = 0.8  # share of the error that is left where light directions are given and no network tells what it expects
 
 NORMAL = (4.804, 0.613, -0.505, 0.232, 0.016, -0.310, 0.298)
 """Of log degrees per pixel: constant, misfit, images, the lights' spread, residual of the pixel, its n_z, how far its
 normal has moved."""
+NORMAL_TOLD = (0.094, 0.220, -0.251, -0.588, 0.090, -0.300, 0.026, 0.448, 0.872)
+"""The same where the network of the start told which errors it expects; the normal's own and their mean come last."""
 LIGHT = (5.172, 0.636, -0.477, -0.014, 0.147, 0.072)
 """Of log degrees per light: constant, misfit, images, the lights' spread, residual of its image, how far it has moved.
 """
@@ -49,33 +52,36 @@ class Trust(NamedTuple):
     doubt: str
 
 
-def trust(found: Refined, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, *, given: bool = False) -> Trust:
+def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = False) -> Trust:
     """Return the errors to expect of what refinement found.
 
     Args:
         found: What it found.
         mask: (H, W) bool.
-        normals: (H, W, 3) unit, its start.
-        lights: (L, 3) unit, its start.
-        given: The light directions were given: four fifths of the error are expected of normals, none of lights, and
-            the start is kept for no error that is expected.
+        start: Its start, with normals (H, W, 3), lights (L, 3) and, if a network tells it, `expected_error` (H, W),
+            degrees, among the diagnostics.
+        given: The light directions were given: less is expected to be off, of lights nothing, and the start is kept for
+            no error that is expected.
     """
-    of_normals, of_lights, moved = features(found, mask, normals, lights)
+    of_normals, of_lights, moved = features(found, mask, start)
     expected = np.zeros(mask.shape, np.float32)
-    share = _GIVEN if given else 1.0
-    expected[mask] = share * np.exp(of_normals @ NORMAL)
-    start = float(np.exp(moved @ START))
-    doubt = _doubt(mask, normals, lights)
-    if not doubt and not given and (mean := float(expected[mask].mean())) > start:
-        doubt = f"the model does not explain the photographs: {mean:.1f} degrees expected, {start:.1f} without it"
-    of_light = np.zeros(len(lights)) if given else np.exp(of_lights @ LIGHT)
-    return Trust(expected, of_light.astype(np.float32), start, doubt)
+    told = of_normals.shape[1] > len(NORMAL)
+    expected[mask] = (_GIVEN if given and not told else 1.0) * np.exp(of_normals @ (NORMAL_TOLD if told else NORMAL))
+    of_start = float(np.exp(moved @ START))
+    doubt = _doubt(mask, start.normals, start.light_directions)
+    # What a network tells raises both sides, so it is left out here.
+    mean = float(np.exp(of_normals[:, : len(NORMAL)] @ NORMAL).mean())
+    if not doubt and not given and mean > of_start:
+        doubt = f"the model does not explain the photographs: {mean:.1f} degrees expected, {of_start:.1f} without it"
+    of_light = np.zeros(len(of_lights)) if given else np.exp(of_lights @ LIGHT)
+    return Trust(expected, of_light.astype(np.float32), of_start, doubt)
 
 
-def features(
-    found: Refined, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what `NORMAL` (P, 7), `LIGHT` (L, 6) and `START` (3,) are multiplied with; arguments as of `trust`."""
+def features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `NORMAL` (P, 7) or `NORMAL_TOLD` (P, 9), `LIGHT` (L, 6) and `START` (3,) are multiplied with;
+    arguments as of `trust`.
+    """
+    normals, lights = start.normals, start.light_directions
     pixels, images = int(mask.sum()), len(lights)
     residual = float(found.pixel_residual[mask].mean())
     misfit, count = np.log(max(residual - _BEST, _LEAST)), np.log(images)
@@ -83,17 +89,19 @@ def features(
     share = ndimage.uniform_filter(mask.astype(np.float32), _WINDOW)[mask]
     around = ndimage.uniform_filter(np.where(mask, found.pixel_residual, 0.0), _WINDOW)[mask] / share
     turned = angle_degrees(found.normals[mask], normals[mask])
-    of_normals = np.stack([
+    of_normals = [
         np.ones(pixels), np.full(pixels, misfit), np.full(pixels, count), np.full(pixels, spread),
         np.log((around + _FAINT) / residual), np.log(np.maximum(found.normals[mask][:, 2], _UPRIGHT)),
         np.log(turned + _STILL),
-    ], axis=1)  # fmt: skip
+    ]  # fmt: skip
     shifted = angle_degrees(found.light_directions, lights)
     of_lights = np.stack([
         np.ones(images), np.full(images, misfit), np.full(images, count), np.full(images, spread),
         np.log(found.image_residual / residual), np.log(shifted + _STILL),
     ], axis=1)  # fmt: skip
-    return of_normals, of_lights, np.array([1.0, misfit, np.log(turned.mean() + _STILL)])
+    if (own := start.diagnostics.get("expected_error")) is not None:
+        of_normals += [np.log(own[mask] + _STILL), np.full(pixels, np.log(own[mask].mean() + _STILL))]
+    return np.stack(of_normals, axis=1), of_lights, np.array([1.0, misfit, np.log(turned.mean() + _STILL)])
 
 
 def _doubt(mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> str:

@@ -13,7 +13,7 @@ from sdps.methods.parse import parse
 from sdps.methods.runner import Runner
 from sdps.refinement import refine as refining
 from sdps.refinement.refined import Refined
-from sdps.refinement.trust import FEWEST_IMAGES, trust
+from sdps.refinement.trust import FEWEST_IMAGES, Trust, trust
 
 SIDE, COUNT = 24, 40
 
@@ -48,15 +48,38 @@ def found(residual: float, lights: np.ndarray) -> Refined:
     )  # fmt: skip
 
 
+def begun(normals: np.ndarray, lights: np.ndarray, **told: np.ndarray) -> Estimate:
+    return Estimate(normals, lights, np.ones(len(lights), np.float32), told)
+
+
 def test_more_is_expected_of_a_model_that_fits_and_of_more_images() -> None:
     normals, mask = dome()
     start, lights = tilted(normals, 5.0) * mask[..., None], around()
-    good, bad = (trust(found(residual, lights), mask, start, tilted(lights, 5.0)) for residual in (0.015, 0.1))
+    good, bad = (trust(found(residual, lights), mask, begun(start, tilted(lights, 5.0))) for residual in (0.015, 0.1))
     assert good.normals[mask].mean() < 0.5 * bad.normals[mask].mean() and good.lights.mean() < 0.5 * bad.lights.mean()
     assert not good.normals[~mask].any() and good.normals.shape == mask.shape and good.lights.shape == (COUNT,)
     few = around(10)
-    assert trust(found(0.015, few), mask, start, tilted(few, 5.0)).normals.max() > good.normals.max()
+    assert trust(found(0.015, few), mask, begun(start, tilted(few, 5.0))).normals.max() > good.normals.max()
     assert good.doubt == "" and 2.0 < good.start < 10.0
+
+
+def test_what_the_network_expects_to_be_off_counts() -> None:
+    normals, mask = dome()
+    lights, start = around(), tilted(normals, 3.0) * mask[..., None]
+    sure, unsure = np.full(mask.shape, 2.0, np.float32), np.full(mask.shape, 2.0, np.float32)
+    unsure[: SIDE // 2] = 8.0
+
+    def expected(own: np.ndarray, given: bool = False) -> Trust:
+        told = begun(start, tilted(lights, 3.0), expected_error=own)
+        return trust(found(0.02, lights), mask, told, given=given)
+
+    of_sure, of_unsure, given = expected(sure), expected(unsure), expected(sure, given=True)
+    raised = of_unsure.normals[mask] / of_sure.normals[mask]  # everywhere, and most where the network is not sure
+    assert (raised > 1.3).all() and (raised[unsure[mask] > 2.0] > 1.5 * raised[unsure[mask] == 2.0].max()).all()
+    # It does not decide whether the start is kept, and under lights that are given it already counts that they are.
+    assert of_sure.start == of_unsure.start and not expected(20.0 * sure).doubt
+    assert not given.lights.any()
+    np.testing.assert_array_equal(given.normals, of_sure.normals)
 
 
 @pytest.mark.parametrize(
@@ -72,9 +95,9 @@ def test_more_is_expected_of_a_model_that_fits_and_of_more_images() -> None:
 def test_what_cannot_be_trusted_is_doubted(normals: str, lights: np.ndarray, residual: float, doubt: str) -> None:
     curved, mask = dome()
     lights = lights / np.linalg.norm(lights, axis=1, keepdims=True)
-    begun = curved if normals == "dome" else np.where(mask[..., None], np.array([0.0, 0.0, 1.0], np.float32), 0.0)
-    start = tilted(begun, 1.0) * mask[..., None]
-    said = trust(found(residual, lights), mask, start, lights).doubt
+    flat_or_not = curved if normals == "dome" else np.where(mask[..., None], np.array([0.0, 0.0, 1.0], np.float32), 0.0)
+    start = tilted(flat_or_not, 1.0) * mask[..., None]
+    said = trust(found(residual, lights), mask, begun(start, lights)).doubt
     assert doubt in said and "\n" not in said
 
 
