@@ -43,7 +43,7 @@ def integers(values: Any) -> "mi.UInt32":
 
 def packets(values: Any) -> "mi.Float":
     """Return a flat float32 array of `values` for `packet`."""
-    return upload(mi.Float, np.asarray(values, np.float32).ravel())
+    return upload(mi.Float, np.asarray(values, np.float32))
 
 
 def packet(source: "mi.Float", entry: "mi.UInt32", width: int, active: "mi.Bool | bool" = True) -> Any:

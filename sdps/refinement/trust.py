@@ -64,13 +64,15 @@ def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = Fa
             no error that is expected.
     """
     of_normals, of_lights, moved = features(found, mask, start)
+    plain = np.exp(of_normals[:, : len(NORMAL)] @ NORMAL)
     expected = np.zeros(mask.shape, np.float32)
-    told = of_normals.shape[1] > len(NORMAL)
-    expected[mask] = (_GIVEN if given and not told else 1.0) * np.exp(of_normals @ (NORMAL_TOLD if told else NORMAL))
-    of_start = float(np.exp(moved @ START))
+    if "expected_error" in start.diagnostics:
+        expected[mask] = np.exp(of_normals @ NORMAL_TOLD)
+    else:
+        expected[mask] = _GIVEN * plain if given else plain
+    of_start, mean = float(np.exp(moved @ START)), float(plain.mean())
     doubt = _doubt(mask, start.normals, start.light_directions)
     # What a network tells raises both sides, so it is left out here.
-    mean = float(np.exp(of_normals[:, : len(NORMAL)] @ NORMAL).mean())
     if not doubt and not given and mean > of_start:
         doubt = f"the model does not explain the photographs: {mean:.1f} degrees expected, {of_start:.1f} without it"
     of_light = np.zeros(len(of_lights)) if given else np.exp(of_lights @ LIGHT)

@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from render.records.manifest import SceneSpec, View, write_manifest
 from render.records.shards import Shard, to_half, write_shard
+from sdps.data.dataset import SampleKey, SceneDataset, collate
+from sdps.training.stages import Stage
 
 
 def sphere_normals(size: int, radius: float = 0.85) -> tuple[np.ndarray, np.ndarray]:
@@ -67,3 +70,11 @@ def write_data(
         scenes.append(scene)
     write_manifest(folder, scenes)
     return scenes
+
+
+def errors(stage: Stage, folder: Path) -> dict[str, float]:
+    """Return the stage's metrics on its own training scenes, under augmentation it has not seen."""
+    dataset = SceneDataset(folder, "train", stage.validation_options())
+    stage.network.eval()
+    with torch.no_grad():
+        return stage.metrics(collate([dataset.sample(SampleKey(index, 999, index)) for index in range(len(dataset))]))

@@ -1,5 +1,6 @@
 """RGL `.bsdf` files: reading with its errors, writing any BRDF for Mitsuba's `measured`, evaluation in kernels."""
 
+import re
 from functools import partial
 
 import numpy as np
@@ -227,17 +228,19 @@ def test_exchanging_files_compiles_nothing_again(tmp_path, packed):
         dr.eval(dr.while_loop(state, lambda k, _: k < count, lambda k, v: (k + 1, v + family.eval(k, wi, wo))))
 
     total(packed)
-    hashes, sets = set(), [["nickel", "nylon"], ["brass", "teflon", "pvc"], ["steel", "delrin"]] * 4
+    hashes, pieces, sets = set(), set(), [["nickel", "nylon"], ["brass", "teflon", "pvc"], ["steel", "delrin"]] * 4
     for number, names in enumerate(sets):
         folder = tmp_path / str(number)
         family = rgl_bsdf.PackedRgl([rgl.write(folder / f"{name}.bsdf", brdf(name)) for name in names])
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             total(family)
-            hashes |= {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        hashes |= {kernel["hash"] for kernel in kernels}
+        pieces.update(*(re.findall(r"define fastcc .*@(func_\w+)", kernel["ir"].getvalue()) for kernel in kernels))
     # Mitsuba leaves `m_reduction` of isotropic files unset, so each is one of three pieces of code: below 2, 4, others.
     # A kernel that switches among files holds one, two or all three of them.
-    assert len(hashes) <= 2**3 - 1 < len(sets)
+    assert 1 <= len(pieces) <= 3 and len(hashes) <= 2 ** len(pieces) - 1 < len(sets)
 
 
 @pytest.mark.parametrize(("number", "incidence"), [(0, 30), (1, 75), (2, 45)])

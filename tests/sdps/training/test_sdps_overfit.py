@@ -5,19 +5,18 @@ from typing import Any
 
 import pytest
 import torch
-from sdps_scenes import write_data
+from sdps_scenes import errors, write_data
 
 from render.shared.config import build
 from render.shared.config import to_plain as plain
 from sdps.data.augment import Augmentation
-from sdps.data.dataset import SampleKey, SceneDataset, collate
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.registry import MODELS, create, entry
 from sdps.training import recipes
 from sdps.training.stage_factory import create_stage
-from sdps.training.stages import Stage, lighting_options
+from sdps.training.stages import LightingStage, Stage, lighting_options
 from sdps.training.trainer import train
-from sdps.training.training_config import JointTraining
+from sdps.training.training_config import JointTraining, LightingTraining
 
 COMMON = {
     "schedule": "cosine", "warmup": 0.05, "optimiser": "adamw", "workers": 0, "validation_scenes": 0,
@@ -53,14 +52,6 @@ def stage_of(name: str, role: str) -> Stage:
     run = recipes.run(name, {}, {name: settings})
     first = {"lighting": fresh("lcnet"), "normals": fresh("nenet")} if role == "second" else {}
     return create_stage(name, name, run.config, first)
-
-
-def errors(stage: Stage, folder: Path) -> dict[str, float]:
-    """Return the stage's metrics on its own training scenes, under augmentation it has not seen."""
-    dataset = SceneDataset(folder, "train", stage.validation_options())
-    stage.network.eval()
-    with torch.no_grad():
-        return stage.metrics(collate([dataset.sample(SampleKey(index, 999, index)) for index in range(len(dataset))]))
 
 
 CASES = [
@@ -100,3 +91,27 @@ def test_a_pair_is_learned_together(tmp_path: Path) -> None:
     after = errors(stage, tmp_path)
     assert after["direction_mae"] < 4.0, after
     assert after["normal_mae"] < 6.0, after
+
+
+def overfit_lcnet(folder: Path, steps: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the metrics before and after training on three scenes of six lights."""
+    write_data(folder, ("train",) * 3, lights=6, size=128)
+    stage = LightingStage(build(LightingTraining, COMMON | LIGHTING | {"steps": steps}))
+    before = errors(stage, folder)
+    train(stage, folder, folder / "run")
+    return before, errors(stage, folder)
+
+
+def test_lcnet_learns_the_light_directions_of_a_few_scenes(tmp_path: Path) -> None:
+    before, after = overfit_lcnet(tmp_path, 100)
+    assert before["direction_mae"] > 20.0
+    assert after["direction_mae"] < 5.0
+
+
+@pytest.mark.slow
+def test_lcnet_learns_the_light_intensities_of_a_few_scenes(tmp_path: Path) -> None:
+    # Intensities are drawn anew on every access, so these are learned rather than remembered, which takes longer.
+    before, after = overfit_lcnet(tmp_path, 600)
+    assert before["intensity_error"] > 0.25
+    assert after["intensity_error"] < 0.15
+    assert after["direction_mae"] < 3.0

@@ -1,4 +1,4 @@
-"""The trainer: exact resume, refusals, signals, metrics on disk, and both networks learning for real."""
+"""The trainer: exact resume, refusals, signals, metrics on disk, weights. What networks learn: test_sdps_overfit.py."""
 
 import json
 import os
@@ -11,21 +11,20 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from sdps_scenes import write_data
+from sdps_scenes import errors, write_data
 
 from pipelines.cli import main
 from render.records import mirror
 from render.records.mirror import opened
 from render.shared.config import build
 from render.shared.errors import InputError
-from sdps.data.augment import Augmentation
 from sdps.data.dataset import SampleKey, SceneDataset, collate
 from sdps.models.checkpoint import TrainedModel, load_state, load_weights, save_state, save_weights
 from sdps.models.registry import MODELS, create
 from sdps.training import recipes
 from sdps.training.joint import JointStage
 from sdps.training.stage_factory import create_stage
-from sdps.training.stages import LightingStage, NormalStage, Stage
+from sdps.training.stages import LightingStage, NormalStage
 from sdps.training.trainer import CHECKPOINT, METRICS, TrainingResult, train
 from sdps.training.training_config import JointTraining, LightingTraining, NormalTraining
 
@@ -133,7 +132,7 @@ def test_lights_that_are_given_have_no_errors(folder: Path, uninterrupted: tuple
     assert set(validated) == {"step", "val_loss", "val_normal_mae"}
     lighting = TrainedModel("lcnet", create("lcnet").eval(), {}, {"config": {"augmentation": {}}})
     stage = NormalStage(replace(QUICK, lights="lcnet"), lighting)
-    assert {"direction_mae", "intensity_error"} <= set(evaluate(stage, folder))
+    assert {"direction_mae", "intensity_error"} <= set(errors(stage, folder))
 
 
 def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, uninterrupted: tuple, tmp_path: Path) -> None:
@@ -452,50 +451,6 @@ def test_schedules_of_the_paper() -> None:
 def test_configuration_is_checked(values: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         build(LightingTraining, values, "training")
-
-
-def evaluate(stage: Stage, folder: Path) -> dict[str, float]:
-    """Return the stage's metrics on its own training scenes under augmentation it has not seen."""
-    dataset = SceneDataset(folder, "train", stage.validation_options())
-    stage.network.eval()
-    with torch.no_grad():
-        return stage.metrics(collate([dataset.sample(SampleKey(index, 999, index)) for index in range(len(dataset))]))
-
-
-OVERFIT = {
-    "schedule": "cosine",
-    "warmup": 0.05,
-    "workers": 0,
-    "validation_scenes": 0,
-    "augmentation": Augmentation(noise=0.02),
-}
-
-
-def overfit_lcnet(folder: Path, steps: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the metrics before and after training on three scenes of six lights."""
-    write_data(folder, ("train",) * 3, lights=6, size=128)
-    config = LightingTraining(
-        steps=steps, batch_scenes=3, images=6, learning_rate=1e-3, optimiser="adamw", clip_gradient=5.0, **OVERFIT
-    )
-    stage = LightingStage(config)
-    before = evaluate(stage, folder)
-    train(stage, folder, folder / "run")
-    return before, evaluate(stage, folder)
-
-
-def test_lcnet_learns_the_light_directions_of_a_few_scenes(tmp_path: Path) -> None:
-    before, after = overfit_lcnet(tmp_path, 100)
-    assert before["direction_mae"] > 20.0
-    assert after["direction_mae"] < 5.0
-
-
-@pytest.mark.slow
-def test_lcnet_learns_the_light_intensities_of_a_few_scenes(tmp_path: Path) -> None:
-    # Intensities are drawn anew on every access, so these are learned rather than remembered, which takes longer.
-    before, after = overfit_lcnet(tmp_path, 600)
-    assert before["intensity_error"] > 0.25
-    assert after["intensity_error"] < 0.15
-    assert after["direction_mae"] < 3.0
 
 
 def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:

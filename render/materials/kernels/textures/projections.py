@@ -48,7 +48,7 @@ class Pictures:
         slopes = np.zeros((height, width, 0), np.float32) if maps.slopes is None else maps.slopes
         values = np.concatenate([maps.values, slopes], -1)
         self._channels = values.shape[-1]
-        self._values = opaque(mi.Float(np.ascontiguousarray(values).ravel()))
+        self._values = table(values)
         self._size = opaque(mi.Vector2u(width, height))
         self.aspect = opaque(mi.Float(width / height))
 
