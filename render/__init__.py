@@ -9,7 +9,7 @@ neither mitsuba nor torch; what needs mitsuba loads it when it is first called.
 
 from typing import TYPE_CHECKING
 
-from render.shared.lazy import lazy_names
+from render.shared import lazy_names
 
 if TYPE_CHECKING:
     from render.api import fit_material, lights, material, render_plan, render_view, render_views, shape

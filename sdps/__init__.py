@@ -9,7 +9,7 @@ load torch; what needs torch loads it when it is first used.
 
 from typing import TYPE_CHECKING
 
-from render.shared.lazy import lazy_names
+from render.shared import lazy_names
 
 if TYPE_CHECKING:
     from render.shared.errors import InputError

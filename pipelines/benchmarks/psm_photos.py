@@ -9,6 +9,7 @@ sphere; the grey sphere sides with the chrome one (2.0 degrees on average agains
 """
 
 import io
+from glob import escape
 from pathlib import Path
 
 import numpy as np
@@ -139,7 +140,7 @@ def chrome_lights(images: np.ndarray, mask: np.ndarray, where: str = "chrome") -
 def _read_set(folder: Path, name: str) -> tuple[Images, np.ndarray]:
     """Return the images of a folder and its mask (H, W)."""
     mask = _read(folder / name / f"{name}.mask.tga").max(-1) > 0.5
-    middles = [path.name.split(".")[-2] for path in (folder / name).glob(f"{name}.*.tga")]
+    middles = [path.name.split(".")[-2] for path in (folder / name).glob(f"{escape(name)}.*.tga")]
     numbers = sorted(int(middle) for middle in middles if middle.isdecimal())
     if len(numbers) < 3 or numbers != list(range(len(numbers))):
         raise InputError(f"{folder / name}: want {name}.0.tga, {name}.1.tga ... without gaps, three at least")

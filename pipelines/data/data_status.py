@@ -52,7 +52,8 @@ def status(folder: Path, *, verify: bool = False) -> dict[str, Any]:
         done = ledger.survey(folder, read_manifest(folder), verify=True).done
     else:
         done = frozenset(id for id in ids if id in sizes and lines.get(id, {}).get("bytes", sizes[id]) == sizes[id])
-    failed = {id: rows for id, rows in failures.items() if id in set(ids) - done}
+    planned = set(ids)
+    failed = {id: rows for id, rows in failures.items() if id in planned and id not in done}
     left = len(ids) - len(done) - len(failed)
     used = sum(sizes[id] for id in done)
     rates = scene_rates(runs)

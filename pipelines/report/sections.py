@@ -16,6 +16,7 @@ from PIL import Image
 from render.shared.config import build, to_plain
 from render.shared.errors import InputError
 from render.shared.files import atomic_folder, is_plain_name, read_json, write_json
+from render.shared.temporary import tidy
 
 FOLDER = "report"
 _FILE = "section.json"
@@ -166,6 +167,7 @@ def read_sections(out: Path) -> list[tuple[Path, Section]]:
     Raises:
         InputError: a section that is damaged.
     """
+    tidy(out / FOLDER)  # a run may have been killed while it replaced a section
     found = [(path.parent, _read(path)) for path in sorted((out / FOLDER).glob(f"*/{_FILE}"))]
     return sorted(found, key=lambda item: (item[1].order, item[1].name))
 

@@ -1,20 +1,25 @@
-"""Fetching a libLLVM that works, where the machine has none."""
+"""Fetching a libLLVM that works, where the machine has none: into the user's cache folder, without root."""
 
 import os
+import re
 import shutil
 import subprocess
 import tempfile
 from pathlib import Path
 
-from render.backend.variant import KNOWN_GOOD, REMEDY, find_llvm, works
+from render.backend.variant import KNOWN_GOOD, OLDEST, REMEDY, find_llvm, unpacked, works
 from render.shared.errors import InputError
-from render.shared.files import cache_folder
+from render.shared.files import atomic_folder
 
-PACKAGE = f"libllvm{KNOWN_GOOD}"
+_PACKAGE = re.compile(r"libllvm(\d+)(?:t64)?")
+_TRIED = 3  # versions, at most
+_OF_THE_SYSTEM = ("libc6_", "gcc-")  # packages that every machine has, and no other copy may stand in for
 
 
 def fetch() -> str:
-    """Install Debian's libLLVM 19: with apt-get as root, else unpacked into the cache folder.
+    """Download a libLLVM and what it needs from the distribution, as Debian packages, and unpack them.
+
+    Nothing is installed and the system stays as it is, whoever runs this: apt works on lists of its own.
 
     Returns:
         What was done, in words.
@@ -22,30 +27,70 @@ def fetch() -> str:
     Raises:
         InputError: no apt, no network or no such package; the message says what to install.
     """
-    if shutil.which("apt-get") is None:
-        raise InputError(f"this machine has no apt-get; {REMEDY}")
-    if hasattr(os, "geteuid") and os.geteuid() == 0:
-        # The lists of a fresh container are empty; an update that fails may still leave usable old lists.
-        subprocess.run(["apt-get", "update", "-qq"], capture_output=True, check=False)
-        _run(["apt-get", "install", "-y", "-qq", "--no-install-recommends", PACKAGE])
-        done = f"installed the Debian package {PACKAGE}"
-    else:
-        target = cache_folder() / "llvm"
-        with tempfile.TemporaryDirectory() as folder:
-            _run(["apt-get", "download", "-qq", PACKAGE], cwd=folder)
-            target.mkdir(parents=True, exist_ok=True)
-            for package in Path(folder).glob("*.deb"):
-                _run(["dpkg", "-x", str(package), str(target)])
-        done = f"unpacked the Debian package {PACKAGE} into the cache folder"
-    found = [path for version, path in find_llvm() if version == KNOWN_GOOD]
-    if not found or not works("llvm_ad_rgb", found[0]):
-        raise InputError(f"{done}, but {'it does not work' if found else 'no library was found in it'}; {REMEDY}")
-    return done
+    if shutil.which("apt-get") is None or shutil.which("dpkg-deb") is None:
+        raise InputError(f"libLLVM cannot be fetched (this machine has no apt-get); {REMEDY}")
+    target = unpacked()[0]
+    with tempfile.TemporaryDirectory() as folder:
+        settings = _prepare(Path(folder))
+        said = _run(["apt-get", *settings, "update"], fail=False)
+        names = _packages(_run(["apt-cache", *settings, "pkgnames", "libllvm"], fail=False))
+        if not names:
+            raise InputError(f"libLLVM cannot be fetched (apt lists none from {OLDEST} on: {_last(said)}); {REMEDY}")
+        for name in names[:_TRIED]:
+            _unpack(name, target, Path(folder) / "cache" / "archives", settings)
+            found = [path for _, path in find_llvm() if path.is_relative_to(target)]
+            if found and works("llvm_ad_rgb", found[0]):
+                return f"unpacked the package {name} and what it needs into {target}; nothing was installed"
+    shutil.rmtree(target, ignore_errors=True)
+    raise InputError(f"fetched {', '.join(names[:_TRIED])}, but no test render passed; {REMEDY}")
 
 
-def _run(command: list[str], cwd: str | None = None) -> None:
-    """Run a command, turning its failure into one line."""
-    result = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
-    if result.returncode:
-        lines = (result.stderr or result.stdout).strip().splitlines()
-        raise InputError(f"{' '.join(command[:3])} failed ({lines[-1] if lines else 'no message'}); {REMEDY}")
+def _prepare(folder: Path) -> list[str]:
+    """Return the options of an apt that has its lists and packages below a folder, and no package installed.
+
+    So it downloads all that a package needs, whatever the system has, and takes no lock of the system's.
+    """
+    for place in ("state/lists/partial", "cache/archives/partial"):
+        (folder / place).mkdir(parents=True)
+    (folder / "status").touch()
+    options = {
+        "Dir::State": folder / "state", "Dir::State::status": folder / "status", "Dir::Cache": folder / "cache",
+        "Debug::NoLocking": "true", "APT::Sandbox::User": "root", "APT::Update::Post-Invoke": "",
+    }  # fmt: skip
+    return ["-qq", *(word for key, value in options.items() for word in ("-o", f"{key}={value}"))]
+
+
+def _packages(listed: str) -> list[str]:
+    """Return the packages of a libLLVM that may work, best first, from all their names."""
+    found = [(int(match[1]), match[0]) for name in listed.split() if (match := _PACKAGE.fullmatch(name))]
+    found = [(version, name) for version, name in found if version >= OLDEST]
+    return [name for _, name in sorted(found, key=lambda item: (item[0] != KNOWN_GOOD, -item[0]))]
+
+
+def _unpack(name: str, target: Path, archives: Path, settings: list[str]) -> None:
+    """Download a package and all it needs, and unpack them in place of what was unpacked before."""
+    for old in archives.glob("*.deb"):
+        old.unlink()
+    _run(["apt-get", *settings, "install", "--download-only", "-y", "--no-install-recommends", name])
+    with atomic_folder(target) as folder:
+        for package in sorted(archives.glob("*.deb")):
+            if not package.name.startswith(_OF_THE_SYSTEM):
+                _run(["dpkg-deb", "-x", str(package), str(folder)])
+
+
+def _run(command: list[str], *, fail: bool = True) -> str:
+    """Run a command and return what it said; with `fail`, turn its failure into one line."""
+    environment = os.environ | {"LC_ALL": "C", "DEBIAN_FRONTEND": "noninteractive"}
+    result = subprocess.run(
+        command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
+    )
+    said = result.stdout + result.stderr
+    if result.returncode and fail:
+        words = [word for word in command if word[:1] != "-" and "=" not in word]
+        raise InputError(f"libLLVM cannot be fetched ({' '.join(words[:2])}: {_last(said)}); {REMEDY}")
+    return said
+
+
+def _last(said: str) -> str:
+    """Return the last line of what a command said."""
+    return (said.strip().splitlines() or ["no message"])[-1]

@@ -16,11 +16,14 @@ from pathlib import Path
 from types import ModuleType
 
 from render.shared.errors import InputError
-from render.shared.files import cache_folder
+from render.shared.files import cache_folder, users_cache_folder
 
 KNOWN_GOOD = 19
 OLDEST = 17
-REMEDY = "install libLLVM 19 (Debian/Ubuntu: apt-get install libllvm19) or set DRJIT_LIBLLVM_PATH to its .so file"
+REMEDY = (
+    "install libLLVM 19 (Debian, Ubuntu: sudo apt-get install libllvm19; Fedora: sudo dnf install llvm-libs; "
+    "macOS: brew install llvm@19) or set DRJIT_LIBLLVM_PATH to its .so file"
+)
 _SEARCH = (
     "/usr/lib/*-linux-gnu/libLLVM*.so*",
     "/usr/lib/llvm-*/lib/libLLVM*.so*",
@@ -29,13 +32,17 @@ _SEARCH = (
     "/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
 )
 _PROBE = """
-import mitsuba as mi, drjit as dr, sys
+import ctypes, sys
+for path in sys.argv[2:]:
+    ctypes.CDLL(path)
+import mitsuba as mi, drjit as dr
 mi.set_variant(sys.argv[1])
 scene = mi.load_dict({"type": "scene", "s": {"type": "sphere"}})
 x = dr.arange(mi.Float, 64) / 64
 ray = mi.Ray3f(mi.Point3f(x, dr.minimum(x, 0.5), 5), mi.Vector3f(0, 0, -1))
 assert dr.count(scene.ray_test(ray))[0] > 0
 """
+_MISSING = re.compile(r"(\S+\.so[.\d]*): cannot open shared object file")
 
 
 @dataclass(frozen=True)
@@ -56,12 +63,20 @@ def llvm_version(path: Path) -> int | None:
     return None
 
 
+def unpacked() -> list[Path]:
+    """Return the folders that may hold a libLLVM unpacked by `render.backend.llvm`, the one it unpacks into first.
+
+    A run with a cache of its own uses what was fetched into the user's.
+    """
+    return list(dict.fromkeys(folder / "llvm" for folder in (cache_folder(), users_cache_folder())))
+
+
 def find_llvm() -> list[tuple[int, Path]]:
     """Return the (major version, path) of every libLLVM found, each library once, best candidate first."""
-    patterns = [*(str(cache_folder() / "llvm" / pattern.lstrip("/")) for pattern in _SEARCH), *_SEARCH]
+    places = [(root, pattern.lstrip("/")) for root in (*unpacked(), Path("/")) for pattern in _SEARCH]
     found: dict[Path, tuple[int, Path]] = {}
-    for pattern in patterns:
-        for path in sorted(Path("/").glob(pattern.lstrip("/"))):
+    for root, pattern in places:
+        for path in sorted(root.glob(pattern)):
             version = llvm_version(path)
             if version and path.is_file():
                 found.setdefault(path.resolve(), (version, path))
@@ -73,11 +88,36 @@ def works(variant: str, llvm: Path | None = None) -> bool:
     environment = dict(os.environ)
     if llvm:
         environment["DRJIT_LIBLLVM_PATH"] = str(llvm)
-    command = [sys.executable, "-c", _PROBE, variant]
+    others = map(str, load_companions(llvm) if llvm else ())
+    command = [sys.executable, "-c", _PROBE, variant, *others]
     try:
         return subprocess.run(command, env=environment, capture_output=True, timeout=120, check=False).returncode == 0
     except subprocess.TimeoutExpired:
         return False
+
+
+def load_companions(llvm: Path) -> list[Path]:
+    """Load the libraries that an unpacked libLLVM needs and the system lacks; return their files, in order.
+
+    The system looks for them in its own folders only, but takes those that are loaded. Any other libLLVM has none.
+    """
+    root = next((root for root in unpacked() if llvm.resolve().is_relative_to(root.resolve())), None)
+    if root is None:
+        return []
+    loaded, wanted = [], [llvm]
+    while wanted:
+        try:
+            ctypes.CDLL(str(wanted[-1]))
+        except OSError as error:
+            missing = _MISSING.search(str(error))
+            files = sorted(root.rglob(missing[1])) if missing else []
+            found = next((path for path in files if path.is_file()), None)
+            if found is None or found in wanted:
+                break  # Dr.Jit tells
+            wanted.append(found)
+        else:
+            loaded.append(wanted.pop())
+    return [path for path in loaded if path != llvm]
 
 
 def has_cuda_driver() -> bool:
@@ -130,7 +170,10 @@ def _choose_llvm(why: str) -> Choice:
         if version >= OLDEST and works("llvm_ad_rgb", path):
             return Choice("llvm_ad_rgb", path, f"{why}; libLLVM {version} passed a test render")
     seen = ", ".join(str(version) for version, _ in candidates) or "none"
-    raise InputError(f"no working libLLVM (found: {seen}; versions before {OLDEST} abort); {REMEDY}")
+    raise InputError(
+        f"no working libLLVM (found: {seen}; versions before {OLDEST} abort); run `sdps doctor --fix`, which fetches "
+        f"one without root, {REMEDY}"
+    )
 
 
 @functools.cache
@@ -143,6 +186,7 @@ def load() -> ModuleType:
     choice = choose()
     if choice.llvm:
         os.environ["DRJIT_LIBLLVM_PATH"] = str(choice.llvm)
+        load_companions(choice.llvm)
     import drjit as dr
 
     # Takes the lock that Dr.Jit's own start-up thread holds, and so waits for its end.

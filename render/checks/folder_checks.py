@@ -13,6 +13,7 @@ from render.records.manifest import MANIFEST, SceneSpec
 from render.records.mirror import CHECKSUMS
 from render.records.shards import file_hash
 from render.shared.files import read_text
+from render.shared.temporary import is_temporary
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
@@ -53,7 +54,7 @@ def check_folder(
     findings += [Finding("unplanned", name, "no manifest line") for name in unplanned]
     for place in (folder, folder / SHARDS):
         if place.is_dir():
-            names = sorted(entry.name for entry in os.scandir(place) if _is_temporary(entry.name))
+            names = sorted(entry.name for entry in os.scandir(place) if is_temporary(entry.name))
             findings += [Finding("temporary", str((place / name).relative_to(folder)), "left behind") for name in names]
     return findings
 
@@ -63,11 +64,6 @@ def _kind(scene: SceneSpec) -> tuple[Hashable, ...]:
     imported = scene.id if family(scene.shape) == IMPORTED else ""
     lights = (scene.lights, scene.light_distances)
     return scene.shape, scene.material, scene.view, lights, scene.size, imported
-
-
-def _is_temporary(name: str) -> bool:
-    """Tell the names `render.shared.files.atomic_path` gives to files that are being written."""
-    return name.startswith(".") and ".tmp" in name
 
 
 def _groups(items: Sequence[Any]) -> dict[Any, list[int]]:

@@ -7,8 +7,7 @@ readers skip. Every run writes a ledger of its own; several machines may fill on
 import json
 import math
 import os
-import socket
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -20,6 +19,7 @@ from render.records.manifest import FAILED, SceneSpec, read_events, read_failed
 from render.records.mirror import LOG, SHARDS, Damaged, mirror_of, shard_path
 from render.records.shards import is_whole
 from render.shared.errors import InputError
+from render.shared.temporary import host, tidy
 
 
 def now() -> str:
@@ -39,9 +39,8 @@ class Ledger:
 
     def __init__(self, folder: Path) -> None:
         start = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")
-        host = socket.gethostname().split(".")[0] or "host"
         self.folder = folder
-        self.path = folder / LOG / f"done-{host}-{os.getpid()}-{start}.jsonl"
+        self.path = folder / LOG / f"done-{host() or 'host'}-{os.getpid()}-{start}.jsonl"
         self._handle: TextIO | None = None
 
     @property
@@ -169,12 +168,6 @@ def _is_whole(folder: Path, scene: SceneSpec) -> bool:
         return False
 
 
-def sweep(folder: Path, pids: Collection[int | None] = (), older_than: float = 3600.0) -> None:
-    """Remove half-written shards: those of the given processes, and those that are older than any write takes."""
-    limit = datetime.now().timestamp() - older_than
-    for path in (folder / SHARDS).glob(".*.tmp.exr"):
-        try:
-            if int(path.name.split(".")[-3]) in pids or path.stat().st_mtime < limit:
-                path.unlink()
-        except (OSError, ValueError):
-            continue  # finished or removed meanwhile
+def sweep(folder: Path) -> None:
+    """Remove half-written shards that nobody is writing: see `render.shared.temporary`."""
+    tidy(folder / SHARDS)

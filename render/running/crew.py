@@ -135,7 +135,7 @@ class LocalCrew:
             worker.process.terminate()
         for worker in self.workers:
             worker.close()
-        sweep(self.folder, [worker.process.pid for worker in self.workers])
+        sweep(self.folder)
         self.workers, self.queue = [], deque()
 
     def _hand_out(self) -> None:
@@ -205,7 +205,7 @@ class LocalCrew:
         worker.process.join()
         tail = worker.stderr_tail()
         self.workers.remove(worker)
-        sweep(self.folder, [worker.process.pid])
+        sweep(self.folder)
         if not worker.ready:
             said = f": {tail.splitlines()[-1]}" if tail else ""
             return [Fatal(f"a rendering process did not start ({reason}){said}; run `sdps doctor`")]

@@ -152,10 +152,9 @@ class Station:
 
     def __init__(self, folder: Path, memory: int = 0) -> None:
         self.folder, self.memory = folder, memory
-        self.idle: list[LocalCrew] = []
+        self.idle: dict[LocalCrew, threading.Timer] = {}
         self.lock, self.gpu = threading.Lock(), threading.Lock()
         self.stopped: set[str] = set()
-        self.timer: threading.Timer | None = None
 
     def render(self, task: Task) -> Rendered:
         """Render a chunk, if its run was not stopped.
@@ -199,17 +198,16 @@ class Station:
     def dismiss(self) -> None:
         """End the idle processes."""
         with self.lock:
-            crews, self.idle = self.idle, []
-        for crew in crews:
+            idle, self.idle = self.idle, {}
+        for crew, timer in idle.items():
+            timer.cancel()
             self._remove(crew)
 
     def _borrow(self, task: Task) -> LocalCrew:
         with self.lock:
-            if self.timer is not None:
-                self.timer.cancel()
             for crew in self.idle:
                 if crew.serve is task.serve and crew.commit == task.commit:
-                    self.idle.remove(crew)
+                    self.idle.pop(crew).cancel()
                     crew.timeout = task.timeout
                     return crew
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -220,11 +218,19 @@ class Station:
         )  # fmt: skip
 
     def _give_back(self, crew: LocalCrew) -> None:
+        timer = threading.Timer(IDLE, self._expire, [crew])
+        timer.daemon = True
         with self.lock:
-            self.idle.append(crew)
-            self.timer = threading.Timer(IDLE, self.dismiss)
-            self.timer.daemon = True
-            self.timer.start()
+            self.idle[crew] = timer
+        timer.start()
+
+    def _expire(self, crew: LocalCrew) -> None:
+        """End a process whose timer ran out, unless it has worked meanwhile: it has another timer, or none, then."""
+        with self.lock:
+            if self.idle.get(crew) is not threading.current_thread():
+                return
+            del self.idle[crew]
+        self._remove(crew)
 
     @staticmethod
     def _collect(crew: LocalCrew, done: Done) -> bytes:

@@ -24,6 +24,7 @@ _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 200, 200
 """Spells values of files in messages; references within YAML can make a short file spell terabytes."""
 
+_MOST_VALUES = 1_000_000  # in a YAML file with references
 T = TypeVar("T", bound="DataclassInstance")
 _BOUNDS = {
     "positive": ("be positive", lambda value: value > 0),
@@ -66,7 +67,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """Parse YAML of plain values; no tag of it makes an object.
+    """Parse YAML of plain values; no tag of it makes an object, and no two places of it share one.
 
     Args:
         text: The YAML.
@@ -77,7 +78,8 @@ def parse_yaml(text: str, where: str) -> Any:
     """
     try:
         check_digits(text)
-        return yaml.safe_load(text)
+        value = yaml.safe_load(text)
+        return _unshared(value, [_MOST_VALUES]) if "&" in text else value
     # The library lets through what its conversions raise: ValueError of dates, KeyError of `!!bool maybe`, and
     # RecursionError of lists in lists.
     except Exception as error:
@@ -85,6 +87,21 @@ def parse_yaml(text: str, where: str) -> Any:
         line = f" line {mark.line + 1}" if mark else ""
         reason = getattr(error, "problem", None) or str(error) or type(error).__name__
         raise InputError(f"{where}:{line} is not valid YAML ({reason}); correct it there") from error
+
+
+def _unshared(value: Any, left: list[int]) -> Any:
+    """Copy what references within YAML share, so that a change in one place is none in another; `left` counts down."""
+    if not isinstance(value, dict | list | tuple):
+        return value
+    left[0] -= len(value)
+    if left[0] < 0:
+        raise ValueError(f"references within it make more than {_MOST_VALUES:,} values of it")
+    try:
+        if isinstance(value, dict):
+            return {key: _unshared(item, left) for key, item in value.items()}
+        return type(value)(_unshared(item, left) for item in value)
+    except RecursionError:
+        raise ValueError("nested too deeply, or a reference to what holds it") from None
 
 
 def build(cls: type[T], values: Mapping[str, Any], where: str = "") -> T:

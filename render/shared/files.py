@@ -4,17 +4,19 @@ import hashlib
 import json
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from render.shared.errors import InputError
+from render.shared.temporary import discard, temporary_path, tidy
 
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _DIGITS = re.compile(r"[0-9a-fA-F_:]+")
 _LONG_NUMBER = re.compile(r"[0-9a-fA-F_:]{256}")
+_TRIES = 9  # to put a folder in place, while other processes put theirs
 _PLAIN_NAME = re.compile(r"(?!\.)[^/\\\0-\x1f\x7f]{1,200}")
 
 
@@ -24,10 +26,13 @@ def is_plain_name(name: str) -> bool:
 
 
 def cache_folder() -> Path:
-    """Return the per-user folder for things fetched once: $SDPS_CACHE, else `sdps` in the user's cache folder."""
+    """Return the per-user folder for things fetched once: $SDPS_CACHE, else `users_cache_folder`."""
     chosen = os.environ.get("SDPS_CACHE")
-    if chosen:
-        return Path(chosen)
+    return Path(chosen) if chosen else users_cache_folder()
+
+
+def users_cache_folder() -> Path:
+    """Return `sdps` in the user's cache folder, whatever $SDPS_CACHE says."""
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
     return (Path(base) if base else Path.home() / ".cache") / "sdps"
 
@@ -42,13 +47,15 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         InputError: the disk is full or the folder cannot be written; nothing is left behind.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    temporary = temporary_path(path, suffix=True)
     try:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+            _tidy_once(path.parent)
             yield temporary
             _flush(temporary)
             os.replace(temporary, path)
+            _flush_folder(path.parent)
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -58,33 +65,84 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Yield an empty folder beside `path` and rename it to `path` on success, in place of what is there.
 
+    Whenever it ends, the old folder or the new one stands at `path`; after a kill between two renamings the old one
+    lies beside it, and comes back with the next call for any folder of the same parent, or with `tidy`.
+
     Raises:
         InputError: the disk is full or the parent cannot be written; nothing new is left behind.
     """
     path = Path(path)
-    temporary, old = (path.with_name(f".{path.name}.{os.getpid()}.{kind}") for kind in ("tmp", "old"))
+    temporary = temporary_path(path)
     try:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            for stale in path.parent.glob(f".{path.name}.*.tmp"):  # of a run that was killed
-                shutil.rmtree(stale, ignore_errors=True)
+            tidy(path.parent, path.name)
             temporary.mkdir()
             yield temporary
-            for file in temporary.rglob("*"):
-                if file.is_file():
-                    _flush(file)
-            if path.exists():
-                os.replace(path, old)
-            os.replace(temporary, path)
+            for below in temporary.rglob("*"):
+                if below.is_file():
+                    _flush(below)
+                elif below.is_dir():
+                    _flush_folder(below)
+            _flush_folder(temporary)
+            _put_in_place(temporary, path)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
+        discard(temporary)
+
+
+@lru_cache(maxsize=1000)
+def _tidy_once(folder: Path) -> None:
+    """Remove what killed processes left in a folder, before this one first writes there."""
+    tidy(folder)
+
+
+def _put_in_place(new: Path, path: Path) -> None:
+    """Rename a folder to `path`. What was there is moved aside, and removed only once the new one stands there."""
+    aside = []
+    try:
+        for left in reversed(range(_TRIES)):
+            if os.path.lexists(path):
+                aside.append(temporary_path(path, "old"))
+                with suppress(FileNotFoundError):  # another process was faster
+                    os.replace(path, aside[-1])
+            try:
+                os.replace(new, path)
+                break
+            except OSError:  # another process has put one there
+                if not left or not os.path.lexists(path):
+                    raise
+        _flush_folder(path.parent)
+    finally:
+        for old in reversed(aside):
+            if not os.path.lexists(path):
+                with suppress(OSError):
+                    os.rename(old, path)
+            else:
+                discard(old)
 
 
 def _flush(path: Path) -> None:
     """Bring a file to the disk, or a loss of power after the renaming could leave an empty one under its name."""
-    with open(path, "rb") as handle:
+    try:
+        handle = open(path, "r+b")  # noqa: SIM115 - Windows flushes only what may be written
+    except PermissionError:
+        if os.name == "nt":
+            return
+        handle = open(path, "rb")  # noqa: SIM115 - a file that may only be read
+    with handle:
         os.fsync(handle.fileno())
+
+
+def _flush_folder(path: Path) -> None:
+    """Bring the names in a folder to the disk, where the system can; without, they may change later than told."""
+    if os.name == "nt":
+        return  # has no such call
+    with suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 @contextmanager

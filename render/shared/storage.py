@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from render.shared.errors import InputError
 from render.shared.files import cache_folder
+from render.shared.temporary import is_temporary, temporary_path
 
 WAIT = 900.0  # seconds that an operation is tried again for; $SDPS_STORAGE_WAIT
 TOGETHER = 8  # objects sent or fetched at once
@@ -106,7 +107,11 @@ class Store:
         driver.invalidate_cache()
         found = self._patiently("list", "", lambda: driver.find(root, detail=True))
         prefix = len(root.rstrip("/")) + 1
-        return {name[prefix:]: _stored(info) for name, info in found.items() if len(name) > prefix}
+        return {
+            name[prefix:]: _stored(info)
+            for name, info in found.items()
+            if len(name) > prefix and not is_temporary(name.rpartition("/")[2])  # being written, in a folder
+        }
 
     def look(self, names: Sequence[str]) -> dict[str, Stored]:
         """Return those of the named objects that are there, at one request each."""
@@ -188,9 +193,8 @@ def _put(driver: Any, path: str, data: bytes, **mode: str) -> None:
     if "file" not in driver.protocol:
         driver.pipe_file(path, data, **mode)
         return
-    folder, _, name = path.rpartition("/")
-    part = f"{folder}/.{name}.{os.getpid()}.part"
-    driver.makedirs(folder, exist_ok=True)
+    part = str(temporary_path(Path(path)))
+    driver.makedirs(path.rpartition("/")[0], exist_ok=True)
     try:
         driver.pipe_file(part, data)
         (os.link if mode else os.replace)(part, path)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from functools import partial
+from glob import escape
 from importlib import resources
 from pathlib import Path
 
@@ -50,7 +51,7 @@ def is_run(name: str) -> bool:
 def trained_file(out: Path, name: str) -> Path:
     """Return where the weights of a run lie, or would lie, in the folder of the runs."""
     own = out / MODELS_FOLDER / name / f"{name}{_SUFFIX}"
-    others = sorted((out / MODELS_FOLDER).glob(f"*/{name}{_SUFFIX}"))  # one run may make several
+    others = sorted((out / MODELS_FOLDER).glob(f"*/{escape(name)}{_SUFFIX}"))  # one run may make several
     return own if own.is_file() or not others else others[0]
 
 

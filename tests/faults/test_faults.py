@@ -14,10 +14,12 @@ from fault_run import FAULTS, ROOT, digests, disturbed, finished, left_over
 
 from pipelines.cli import main
 from pipelines.rendering.render_data import write_preview
+from pipelines.report.sections import FOLDER, Section, SectionWriter, read_sections
 from render.records.shards import read_shard, write_shard
 from render.shared import files
 from render.shared.errors import InputError
 from render.shared.images import write_png
+from render.shared.temporary import temporary_path
 from sdps.models.checkpoint import load_state, save_state
 
 
@@ -81,6 +83,85 @@ def test_no_file_gets_its_name_before_its_bytes_are_on_the_disk(name: str, tmp_p
     WRITERS[name](target)
     WRITERS[name](target)
     assert disk.safe and not disk.torn
+
+
+STRUCK = """
+import os, signal, sys
+from pathlib import Path
+from render.shared import files
+
+strike, out = sys.argv[1], Path(sys.argv[2])
+
+def write(text, moment=0):
+    steps = 0
+
+    def struck(real):
+        def step(*words, **options):
+            nonlocal steps
+            steps += 1
+            if steps == moment:
+                strike_now()
+            result = real(*words, **options)
+            steps += 1
+            if steps == moment:
+                strike_now()
+            return result
+        return step
+
+    def strike_now():
+        if strike == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        raise KeyboardInterrupt
+
+    for name in ("replace", "rename", "rmdir", "unlink", "fsync") if moment else ():
+        setattr(os, name, struck(getattr(os, name)))
+    with files.atomic_folder(out / "a[1]") as folder:
+        for name in ("one", "two"):
+            (folder / name).write_text(text)
+
+for moment in range(1, 999):
+    write("old")
+    child = os.fork()
+    if child == 0:
+        try:
+            write("new", moment)
+        except KeyboardInterrupt:
+            os._exit(130)
+        os._exit(0)
+    ended = os.waitpid(child, 0)[1]
+    before = sorted(path.name for path in out.iterdir())
+    if moment % 2:
+        files.tidy(out)
+    else:
+        with files.atomic_folder(out / "b"):
+            pass
+        (out / "b").rmdir()
+    texts = sorted(path.read_text() for path in (out / "a[1]").iterdir())
+    left = [path.name for path in out.iterdir() if path.name != "a[1]"]
+    print(ended, "a[1]" in before, *texts, *left, sep="|", flush=True)
+    if ended == 0:
+        break
+"""
+
+
+@pytest.mark.parametrize("strike", ["kill", "Ctrl-C"])
+def test_a_folder_replaced_is_the_old_one_or_the_new_one_whenever_the_writer_ends(strike: str, tmp_path: Path) -> None:
+    """Struck before and after every renaming, removal and flush; what a kill moved aside comes back to the next run."""
+    words = [sys.executable, "-c", STRUCK, strike, str(tmp_path)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    rows = [line.split("|") for line in done.stdout.splitlines()]
+    kinds = [row[2:] for row in rows]
+    assert len(rows) > 20 and rows[-1][0] == "0" and kinds.count(["old"] * 2) > 5 and kinds.count(["new"] * 2) > 5
+    assert kinds == sorted(kinds, reverse=True) and {*map(tuple, kinds)} == {("old", "old"), ("new", "new")}
+    gone = [row for row in rows if row[1] == "False"]
+    assert (len(gone) > 0) == (strike == "kill")  # between the renamings; Ctrl-C has its chance to put the old one back
+
+
+def test_a_report_shows_the_section_that_a_killed_run_moved_aside(tmp_path: Path) -> None:
+    SectionWriter(Section(name="a", title="old", text="")).write(tmp_path)
+    place = tmp_path / FOLDER / "a"
+    place.rename(temporary_path(place, "old"))
+    assert [section.title for _, section in read_sections(tmp_path)] == ["old"] and not left_over(tmp_path)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])

@@ -65,7 +65,9 @@ def stock(folders: list[Path], kind: str = "scalar_rgb", seeds: int = REPEATS) -
     """Render saved scenes in a process of its own; return per folder (lights, seeds, H, W, 3)."""
     environment = dict(os.environ)
     if kind.startswith("llvm"):
-        environment["DRJIT_LIBLLVM_PATH"] = str(variant.choose().llvm)
+        library = variant.choose().llvm
+        environment["DRJIT_LIBLLVM_PATH"] = str(library)
+        environment["LD_PRELOAD"] = ":".join(map(str, variant.load_companions(library)))
     command = [sys.executable, "-c", STOCK, kind, str(seeds), *map(str, folders)]
     subprocess.run(command, env=environment, cwd=folders[0], check=True, capture_output=True, timeout=600)
     return [np.load(folder / "images.npy") for folder in folders]

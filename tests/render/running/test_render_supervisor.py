@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import threading
+import time
 from dataclasses import replace
 from multiprocessing import active_children
 from pathlib import Path
@@ -22,7 +23,9 @@ from render.records.manifest import SceneSpec, View
 from render.records.shards import file_hash
 from render.running.crew import LocalCrew
 from render.running.supervisor import RunOptions, render_supervised
+from render.shared import temporary
 from render.shared.errors import InputError
+from render.shared.temporary import temporary_path
 
 LIGHTS = ((0.0, 0.0, 1.0), (0.6, 0.0, 0.8))
 
@@ -233,14 +236,35 @@ def test_resume_trusts_the_ledger_only_where_size_and_line_agree(tmp_path):
     assert scenes[3].id not in ledger.survey(tmp_path, scenes).done
 
 
-def test_half_written_shards_are_swept(tmp_path):
-    (tmp_path / "shards").mkdir()
-    mine, fresh, old = (tmp_path / "shards" / f".s.{pid}.tmp.exr" for pid in (11, 12, 13))
-    for path in (mine, fresh, old):
+def test_half_written_shards_are_swept_unless_somebody_may_be_writing_them(tmp_path):
+    """Those of dead processes of this machine are; of another machine's, and of no known one, those a day old."""
+    place = tmp_path / "shards"
+    place.mkdir()
+    shard = place / "s.exr"
+    mine = temporary_path(shard, suffix=True)
+    dead = mine.with_name(mine.name.replace(f"-{os.getpid()}-", "-999999999-"))
+    elsewhere = mine.with_name(mine.name.replace(f"-{temporary._machine()}-", "-00000000-"))
+    nameless = place / f".s.{os.getpid()}.tmp.exr"  # of an earlier version, which named no machine
+    for path in (mine, dead, elsewhere, nameless):
         path.write_text("")
-    os.utime(old, (0, 0))
-    ledger.sweep(tmp_path, [11])
-    assert not mine.exists() and fresh.exists() and not old.exists()
+    ledger.sweep(tmp_path)
+    assert set(place.iterdir()) == {mine, elsewhere, nameless}
+    assert not ledger.shard_sizes(tmp_path)
+
+
+def test_another_machines_half_written_shards_go_by_the_clock_of_the_file_server(tmp_path, monkeypatch):
+    place = tmp_path / "shards"
+    place.mkdir()
+    path = temporary_path(place / "s.exr", suffix=True)
+    path = path.with_name(path.name.replace(f"-{temporary._machine()}-", "-00000000-"))
+    path.write_text("")
+    os.utime(path, (0, 0))  # a copy may bear the date of what it is made of
+    monkeypatch.setattr(time, "time", lambda: 1e12)  # this machine's clock is wrong
+    ledger.sweep(tmp_path)
+    assert path.exists()
+    monkeypatch.setattr(temporary, "server_time", lambda folder: path.stat().st_ctime + temporary.AGE + 1)
+    ledger.sweep(tmp_path)
+    assert not path.exists()
 
 
 # ---- The real renderer -----------------------------------------------------------------------------
