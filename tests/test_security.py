@@ -5,6 +5,7 @@ import json
 import re
 import tomllib
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,31 @@ def test_numbers_that_no_float_holds_are_refused_where_they_are_read(text: str) 
         parse_yaml(f"{' ' * 70}{text}" if ":" not in text else text, "x.yaml")
     with pytest.raises(ValueError):
         parse_json(text)
+
+
+_TENFOLD = "".join(f"{after}: &{after} [{', '.join(['*' + name] * 10)}]\n" for name, after in pairwise("abcdefgh"))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (f"a: &a [1, 2]\n{_TENFOLD}", "references within it make more than 100,000 values of it"),
+        ("a: &a {b: *a}", "nested too deeply, or a reference to what holds it"),
+        ("&a [1, [*a]]", "nested too deeply, or a reference to what holds it"),
+    ],
+)
+def test_references_within_yaml_neither_fill_the_memory_nor_go_round(text: str, reason: str) -> None:
+    with pytest.raises(InputError, match=rf"x\.yaml: is not valid YAML \({reason}\)"):
+        parse_yaml(text, "x.yaml")
+
+
+def test_no_two_places_of_yaml_share_a_value() -> None:
+    read = parse_yaml("a: &a {x: [1, &b {y: 2}]}\nc: *a\nd: [*b, {<<: *a, z: 3}]\ne: &e text\nf: *e", "x.yaml")
+    assert read == {"a": {"x": [1, {"y": 2}]}, "c": {"x": [1, {"y": 2}]}, "e": "text", "f": "text",
+                    "d": [{"y": 2}, {"x": [1, {"y": 2}], "z": 3}]}  # fmt: skip
+    read["a"]["x"][1]["y"] = 5
+    read["d"][1]["x"].append(7)
+    assert read["c"] == {"x": [1, {"y": 2}]} and read["d"][0] == {"y": 2} and read["a"]["x"] == [1, {"y": 5}]
 
 
 def test_half_a_surrogate_pair_is_no_text() -> None:

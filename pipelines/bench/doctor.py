@@ -24,8 +24,9 @@ CUDA_TESTED = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps doctor`."""
     parser.add_argument(
-        "--fix", action="store_true",
-        help="fetch what is missing into your cache folder, without root: a libLLVM that works, the bunny mesh"
+        "--fix",
+        action="store_true",
+        help="fetch what is missing into your cache folder, without root: a libLLVM that works, the bunny mesh",
     )
 
 

@@ -24,7 +24,7 @@ _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 200, 200
 """Spells values of files in messages; references within YAML can make a short file spell terabytes."""
 
-_MOST_VALUES = 1_000_000  # in a YAML file with references
+_MOST_VALUES = 100_000  # in a YAML file with references
 T = TypeVar("T", bound="DataclassInstance")
 _BOUNDS = {
     "positive": ("be positive", lambda value: value > 0),

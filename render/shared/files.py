@@ -123,13 +123,10 @@ def _put_in_place(new: Path, path: Path) -> None:
 
 def _flush(path: Path) -> None:
     """Bring a file to the disk, or a loss of power after the renaming could leave an empty one under its name."""
-    try:
-        handle = open(path, "r+b")  # noqa: SIM115 - Windows flushes only what may be written
-    except PermissionError:
-        if os.name == "nt":
-            return
-        handle = open(path, "rb")  # noqa: SIM115 - a file that may only be read
-    with handle:
+    writable = os.access(path, os.W_OK)
+    if os.name == "nt" and not writable:
+        return  # Windows flushes only what was opened for writing
+    with open(path, "r+b" if writable else "rb") as handle:
         os.fsync(handle.fileno())
 
 

@@ -135,7 +135,7 @@ def _shortened(base: str, room: int) -> str:
 
 
 def _touched(path: Path) -> float:
-    """Return when a file, or anything in a folder, was last changed; what is copied or unpacked may bear an old date."""
+    """Return when a file, or anything in a folder, was last changed; copies may bear an older date."""
     states = [path.lstat(), *(below.lstat() for below in (path.rglob("*") if path.is_dir() else ()))]
     return max(max(state.st_mtime, state.st_ctime) for state in states)
 

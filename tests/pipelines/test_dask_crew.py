@@ -297,6 +297,39 @@ def test_a_worker_with_a_gpu_renders_on_it_one_chunk_at_a_time(tmp_path, monkeyp
     assert [list(each.shards.values()) for each in rendered] == [[b"cuda_ad_rgb"]] * 2
 
 
+class Idler:
+    """Stands for a process that a station keeps."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.closed, self.serve, self.commit = folder, threading.Event(), pretend, station._commit()
+
+    def close(self) -> None:
+        self.closed.set()
+
+
+def test_every_idle_process_ends_when_its_own_time_is_over(tmp_path, monkeypatch):
+    """Neither earlier, by the timer of another one or of its own last rest, nor never."""
+    monkeypatch.setattr(station, "IDLE", 0.4)
+    here, (chunk,) = station.Station(tmp_path), chunks.cut(planned([["ok"]]), {"s0-m0"})
+    task = station.task_of("run", chunk, 60.0, pretend)
+    first, second = Idler(tmp_path / "1"), Idler(tmp_path / "2")
+    here._give_back(first)
+    time.sleep(0.25)
+    here._give_back(second)
+    assert here._borrow(task) is first  # its timer, and only its, stops
+    time.sleep(0.25)
+    assert not first.closed.is_set() and not second.closed.is_set()
+    assert second.closed.wait(5)  # although the first one never came back
+    here._give_back(first)
+    before = here.idle[first]
+    assert here._borrow(task) is first
+    here._give_back(first)
+    before.function(*before.args)  # a timer that ran out at the moment of the borrowing
+    assert not first.closed.is_set() and list(here.idle) == [first]
+    here.dismiss()
+    assert first.closed.is_set() and not here.idle
+
+
 def test_chunks_of_a_cluster_are_bounded_in_bytes():
     scenes = [replace(scene, shape="sphere", size=512) for scene in planned([["ok"]] * 64)]
     whole, bounded = (chunks.cut(scenes, {scene.id for scene in scenes}, 1, limit) for limit in (0, 20_000_000))

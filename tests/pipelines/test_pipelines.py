@@ -52,6 +52,22 @@ def test_paper_preset_has_the_published_composition_and_schedule():
     assert (psfcn.epochs, psfcn.batch_scenes, psfcn.crop, psfcn.learning_rate_at(0.2)) == (30, 32, 32, 5e-4)
 
 
+def test_an_override_changes_one_run_and_not_those_that_share_its_settings(tmp_path):
+    """YAML's references, merged or not, are a short way to write settings, no bond between them."""
+    (tmp_path / "own.yaml").write_text(
+        "name: own\ndescription: runs that share settings\n"
+        "normals: &normals {augmentation: &noise {noise: 0.01}}\njoint: *normals\nruns:\n"
+        "  a: &a {base: nenet, seed: 3, augmentation: *noise}\n  b: *a\n  c: {<<: *a, seed: 4}\n"
+    )
+    ways = ["runs.a.seed=7", "runs.a.augmentation.noise=0.5"]
+    for overrides in (ways, ways[::-1]):
+        preset = presets.load(str(tmp_path / "own.yaml"), overrides)
+        configs = [preset.run(name).config for name in "abc"]
+        assert [config.seed for config in configs] == [7, 3, 4]
+        assert [config.augmentation.noise for config in configs] == [0.5, 0.01, 0.01]
+        assert preset.normals == preset.joint == {"augmentation": {"noise": 0.01}}
+
+
 def test_overrides_reach_any_field_and_convert_types():
     preset = presets.load("smoke", ["data.size=32", "lighting.learning_rate=1e-3", "test.materials=[chrome]",
                                     "data.families.blobby=1", "lighting.augmentation.noise=0"])  # fmt: skip
@@ -147,6 +163,18 @@ def test_doctor_passes_on_a_small_disk_and_says_so(capsys, monkeypatch):
     monkeypatch.setattr("pipelines.bench.doctor.free_bytes", lambda folder: 3_200_000_000)
     assert main(["doctor"]) == 0
     assert "3.2 GB; the demo takes about 5.0 GB, choose another --out" in capsys.readouterr().out
+
+
+def test_doctor_that_cannot_fetch_says_so_and_goes_on(capsys, monkeypatch):
+    def fails(*_: object) -> None:
+        raise InputError("no network; sudo apt-get install libllvm19")
+
+    monkeypatch.setattr("render.backend.variant.choose", fails)
+    monkeypatch.setattr("render.backend.llvm.fetch", fails)
+    assert main(["doctor", "--fix"]) == 1
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "not fetched: no network; sudo apt-get install libllvm19"
+    assert any(line.startswith("bunny mesh ") for line in said) and said[-1].startswith("missing: Mitsuba variant:")
 
 
 def test_list_flags_take_commas_and_repetition():

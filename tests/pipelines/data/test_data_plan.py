@@ -129,6 +129,23 @@ def test_machines_side_by_side_count_once():
     assert data_status.scene_rates([]) == {"recent_per_hour": None, "overall_per_hour": None}
 
 
+def test_status_looks_at_every_scene_a_few_times_however_many_failed(tmp_path, monkeypatch):
+    class Counted(list):
+        looks = 0
+
+        def __iter__(self):
+            Counted.looks += 1
+            return super().__iter__()
+
+    ids = Counted(f"s{number}" for number in range(300))
+    monkeypatch.setattr(data_status, "scene_ids", lambda folder: ids)
+    monkeypatch.setattr(data_status, "read_failed", lambda folder: {id: [{"reason": "x"}] for id in list(ids)[:200]})
+    monkeypatch.setattr(data_status.budget, "disk_bytes", lambda scenes: 0)
+    monkeypatch.setattr(data_status, "read_manifest", lambda folder: [])
+    assert data_status.status(tmp_path)["failed"] == 200
+    assert Counted.looks < 10
+
+
 def test_status_reads_ids_in_any_form_and_tells_what_is_no_data_folder(capsys, tmp_path):
     scenes = plan(DataConfig(families={"blobby": 1}, views=1, light_count=1, validation=0))
     from render.records.manifest import write_manifest

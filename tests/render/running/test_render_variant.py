@@ -1,6 +1,7 @@
 """Which variant and libLLVM are chosen, and what is said when there is none."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,8 @@ import pytest
 
 from render.backend import llvm, variant
 from render.shared.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture
@@ -135,36 +138,101 @@ def test_a_gpu_without_optix_falls_back_to_the_cpu(clean):
 # --- fetching a libLLVM ---
 
 
+class Distribution:
+    """Pretends to be apt-get, apt-cache and dpkg-deb; `knows`: packages it lists, `broken`: it cannot send."""
+
+    def __init__(self, monkeypatch, cache, knows, broken=()):
+        self.knows, self.broken, self.commands, self.tried = knows, broken, [], []
+        monkeypatch.setenv("SDPS_CACHE", str(cache))
+        monkeypatch.setattr(llvm.shutil, "which", lambda name: f"/usr/bin/{name}")
+        monkeypatch.setattr(llvm.subprocess, "run", self.run)
+
+    def run(self, command, **options):
+        self.commands.append(command)
+        said, code = "", 0
+        if "pkgnames" in command:
+            said = "\n".join(self.knows)
+        elif "install" in command and command[-1] in self.broken:
+            said, code = "reading lists\nE: Failed to fetch it\n", 100
+        elif "install" in command:
+            (cache,) = (word.partition("=")[2] for word in command if word.startswith("Dir::Cache="))
+            for name in (command[-1], "libc6"):
+                (Path(cache) / "archives" / f"{name}_1.deb").write_text("")
+        elif command[0] == "dpkg-deb":
+            name = Path(command[2]).name.partition("_")[0]
+            library = Path(command[-1]) / f"usr/lib/x86_64-linux-gnu/libLLVM.so.{name[7:9]}.1"
+            library.parent.mkdir(parents=True, exist_ok=True)
+            library.write_text("")
+        return subprocess.CompletedProcess(command, code, stdout="" if code else said, stderr=said if code else "")
+
+
 def test_fetch_without_apt_says_what_to_install(monkeypatch):
     monkeypatch.setattr(llvm.shutil, "which", lambda name: None)
-    with pytest.raises(InputError, match="install libLLVM 19"):
+    with pytest.raises(InputError, match=r"sudo apt-get install libllvm19; Fedora: sudo dnf .*brew install"):
         llvm.fetch()
 
 
-def test_fetch_reports_the_failing_command_in_one_line(monkeypatch):
-    failed = subprocess.CompletedProcess([], 100, stdout="", stderr="reading lists\nE: no such package\n")
-    monkeypatch.setattr(llvm.shutil, "which", lambda name: "/usr/bin/apt-get")
-    monkeypatch.setattr(llvm.subprocess, "run", lambda *args, **options: failed)
-    with pytest.raises(InputError, match="no such package") as caught:
+def test_fetch_reports_the_failing_command_in_one_line(monkeypatch, tmp_path):
+    Distribution(monkeypatch, tmp_path, ["libllvm19"], broken=["libllvm19"])
+    with pytest.raises(InputError, match=r"apt-get install: E: Failed to fetch it") as caught:
         llvm.fetch()
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
+    Distribution(monkeypatch, tmp_path, ["libllvm14", "libllvm-19-ocaml-dev"])
+    with pytest.raises(InputError, match=r"apt lists none from 17 on"):
+        llvm.fetch()
 
 
-def test_fetch_unpacks_into_the_cache_without_root(monkeypatch, tmp_path):
-    def run(command, **options):
+@pytest.mark.parametrize("user", [0, 1000])
+@pytest.mark.parametrize("folder", ["cache", "cache [1]"])
+def test_fetch_unpacks_into_the_cache_and_installs_nothing_even_as_root(user, folder, monkeypatch, tmp_path):
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    apt = Distribution(monkeypatch, tmp_path / folder, ["libllvm16", "libllvm22", "libllvm17t64", "libllvm19"])
+    monkeypatch.setattr(llvm, "works", lambda name, path: apt.tried.append(path) or True)
+    assert "nothing was installed" in llvm.fetch()
+    assert apt.tried == [tmp_path / folder / "llvm/usr/lib/x86_64-linux-gnu/libLLVM.so.19.1"]
+    assert [path.name for path in (tmp_path / folder).iterdir()] == ["llvm"]
+    for command in apt.commands:
         if command[0] == "apt-get":
-            (Path(options["cwd"]) / "libllvm19.deb").write_text("")
-        else:
-            library = Path(command[-1]) / "usr/lib/x86_64-linux-gnu/libLLVM.so.19.1"
-            library.parent.mkdir(parents=True)
-            library.write_text("")
-        return subprocess.CompletedProcess(command, 0, stdout="", stderr="")
+            own = {word.partition("=")[0] for word in command if word.startswith("Dir::")}
+            assert own == {"Dir::State", "Dir::State::status", "Dir::Cache"}
+            assert "update" in command or "--download-only" in command
+        assert command[0] in ("apt-get", "apt-cache", "dpkg-deb") and "libc6_1.deb" not in command[2]
 
+
+def test_fetch_goes_on_to_the_next_version_and_leaves_none_that_does_not_work(monkeypatch, tmp_path):
+    apt = Distribution(monkeypatch, tmp_path, ["libllvm17t64", "libllvm18", "libllvm20"])
+    monkeypatch.setattr(llvm, "works", lambda name, path: apt.tried.append(path.name) or "18" in path.name)
+    assert "libllvm18" in llvm.fetch() and apt.tried == ["libLLVM.so.20.1", "libLLVM.so.18.1"]
+    monkeypatch.setattr(llvm, "works", lambda name, path: False)
+    with pytest.raises(InputError, match="fetched libllvm20, libllvm18, libllvm17t64, but no test render passed"):
+        llvm.fetch()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_cache_of_ones_own_does_without_a_library_of_its_own(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "users [1]"))
+    monkeypatch.setenv("SDPS_CACHE", str(tmp_path / "own"))
+    library = tmp_path / "users [1]/sdps/llvm/usr/lib/x86_64-linux-gnu/libLLVM.so.19.1"
+    library.parent.mkdir(parents=True)
+    library.write_text("")
+    assert variant.find_llvm()[0] == (19, library)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_what_an_unpacked_library_needs_is_loaded_from_beside_it(monkeypatch, tmp_path):
+    """In a process of its own: of three libraries each needs the next, and the system knows none."""
+    place = tmp_path / "llvm/usr/lib/x86_64-linux-gnu"
+    place.mkdir(parents=True)
+    before = []
+    for name in ("libsdpsthird.so.1", "libsdpssecond.so.1", "libLLVM.so.19.1"):
+        words = ["cc", "-shared", "-fPIC", "-x", "c", "/dev/null", "-o", str(place / name), f"-Wl,-soname,{name}"]
+        subprocess.run([*words, "-x", "none", "-Wl,--no-as-needed", *before], check=True)
+        before = [str(place / name)]
+    code = (
+        "import ctypes, sys, pathlib\nfrom render.backend import variant\npath = pathlib.Path(sys.argv[1])\n"
+        "print(*(found.name for found in variant.load_companions(path)))\nctypes.CDLL(str(path))\n"
+    )
     monkeypatch.setenv("SDPS_CACHE", str(tmp_path))
-    monkeypatch.setattr(llvm.os, "geteuid", lambda: 1000)
-    monkeypatch.setattr(llvm.shutil, "which", lambda name: "/usr/bin/apt-get")
-    monkeypatch.setattr(llvm.subprocess, "run", run)
-    tried = []
-    monkeypatch.setattr(llvm, "works", lambda name, path: tried.append(path) or True)
-    assert "unpacked" in llvm.fetch()
-    assert tried == [tmp_path / "llvm/usr/lib/x86_64-linux-gnu/libLLVM.so.19.1"]
+    done = subprocess.run([sys.executable, "-c", code, before[0]], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["libsdpsthird.so.1", "libsdpssecond.so.1"]
+    assert variant.load_companions(tmp_path / "libLLVM.so.19.1") == []
