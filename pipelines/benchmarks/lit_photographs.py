@@ -141,7 +141,7 @@ def object_folders(root: Path, pattern: str, want: str) -> list[Path]:
         raise InputError(f"{root}: no such folder; {want}")
     if (root / "objects.txt").is_file():
         return [root / name for name in read_names(root / "objects.txt")]
-    folders = sorted({path.parent for path in root.glob(f"*/{pattern}")}, key=lambda path: natural_key(path.name))
+    folders = sorted({path.parent for path in root.glob(f"[!.]*/{pattern}")}, key=lambda path: natural_key(path.name))
     if not folders:
         raise InputError(f"{root}: no object's folder with {pattern}; {want}")
     return folders

@@ -168,7 +168,7 @@ def read_sections(out: Path) -> list[tuple[Path, Section]]:
         InputError: a section that is damaged.
     """
     tidy(out / FOLDER)  # a run may have been killed while it replaced a section
-    found = [(path.parent, _read(path)) for path in sorted((out / FOLDER).glob(f"*/{_FILE}"))]
+    found = [(path.parent, _read(path)) for path in sorted((out / FOLDER).glob(f"[!.]*/{_FILE}"))]
     return sorted(found, key=lambda item: (item[1].order, item[1].name))
 
 

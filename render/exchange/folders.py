@@ -5,6 +5,7 @@ from typing import Any
 
 from render.shared.errors import InputError
 from render.shared.files import read_json, write_json
+from render.shared.temporary import is_empty
 
 RECORD = "export.json"
 MARKER = "scene.json"
@@ -16,7 +17,7 @@ def claim(root: Path, record: dict[str, Any]) -> None:
     if root.exists() and not root.is_dir():
         raise InputError(f"{root}: is a file; choose another --out")
     if not path.exists():
-        if root.is_dir() and any(root.iterdir()):
+        if root.is_dir() and not is_empty(root):
             raise InputError(f"{root}: has files but no {RECORD}, so it is not ours to write to; choose another --out")
         write_json(path, record | {"scenes": {}})
         return

@@ -24,6 +24,7 @@ from render.shared.config import to_plain
 from render.shared.errors import InputError, unknown
 from render.shared.files import write_json
 from render.shared.progress import progress_bar
+from render.shared.temporary import is_empty
 
 RECORD = "import.json"
 READERS: Mapping[str, Callable[[Path], list[Source]]] = {"psfcn": psfcn_sources, "diligent": diligent_sources}
@@ -199,7 +200,7 @@ def _claim(out: Path, scenes: Sequence[SceneSpec]) -> None:
     if (out / MANIFEST).is_file():
         if read_manifest(out) != list(scenes):
             raise InputError(f"{out / MANIFEST}: holds other scenes; remove the folder or choose another --out")
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+    elif out.exists() and (not out.is_dir() or not is_empty(out)):
         raise InputError(f"{out}: is not empty and has no {MANIFEST}; choose another --out")
     else:
         write_manifest(out, scenes)

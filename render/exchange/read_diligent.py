@@ -41,7 +41,7 @@ def diligent_sources(tree: str | Path, note: Note | None = None) -> list[Source]
     if (root / "objects.txt").is_file():
         folders = [root / name for name in read_names(root / "objects.txt")]
     else:
-        found = {path.parent for path in root.glob("*/light_directions.txt")}
+        found = {path.parent for path in root.glob("[!.]*/light_directions.txt")}
         folders = sorted(found, key=lambda path: natural_key(path.name))
     if not folders:
         refuse_several(root, "*/*/light_directions.txt", 2)

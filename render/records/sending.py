@@ -19,6 +19,7 @@ from render.records.manifest import read_events
 from render.records.mirror import Mirror, mirror_of
 from render.shared.files import write_text
 from render.shared.storage import TOGETHER
+from render.shared.temporary import is_temporary
 
 WAITING = ".waiting.jsonl"
 BATCH = 64  # shards of one ledger object, at most
@@ -49,7 +50,7 @@ def send_leftovers(folder: Path) -> int:
             ledger.send(line)
     waiting.unlink(missing_ok=True)
     for path in (folder / SHARDS).glob("*.exr"):
-        if f"{SHARDS}/{path.name}" not in mirror.objects:
+        if f"{SHARDS}/{path.name}" not in mirror.objects and not is_temporary(path.name):
             path.unlink()
     return len(lines)
 

@@ -55,7 +55,6 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             yield temporary
             _flush(temporary)
             os.replace(temporary, path)
-            _flush_folder(path.parent)
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -111,7 +110,7 @@ def _put_in_place(new: Path, path: Path) -> None:
             except OSError:  # another process has put one there
                 if not left or not os.path.lexists(path):
                     raise
-        _flush_folder(path.parent)
+        _flush_folder(path.parent)  # before the old one is removed
     finally:
         for old in reversed(aside):
             if not os.path.lexists(path):

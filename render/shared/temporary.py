@@ -44,6 +44,11 @@ def is_temporary(name: str) -> bool:
     return _NAME.fullmatch(name) is not None
 
 
+def is_empty(folder: Path) -> bool:
+    """Tell whether a folder holds nothing, or only what is being written or was when its writer was killed."""
+    return all(is_temporary(path.name) for path in folder.iterdir())
+
+
 def may_be_alive(path: Path, clock: Callable[[], float | None]) -> bool:
     """Tell whether the process that gave a temporary name may still be at work.
 

@@ -28,7 +28,7 @@ def shipped_folder() -> Path:
 
 def shipped() -> list[str]:
     """Return the names of the shipped weights."""
-    return sorted(path.stem for path in shipped_folder().glob(f"*{_SUFFIX}"))
+    return sorted(path.stem for path in shipped_folder().glob(f"[!.]*{_SUFFIX}"))  # no file being written
 
 
 def terms(files: Iterable[Path]) -> str:
@@ -39,7 +39,7 @@ def terms(files: Iterable[Path]) -> str:
 
 def trained(out: Path | None) -> list[str]:
     """Return the names of the runs whose last weights lie in a folder; none where it is None."""
-    files = sorted((out / MODELS_FOLDER).glob(f"*/*{_SUFFIX}")) if out is not None else []
+    files = sorted((out / MODELS_FOLDER).glob(f"*/[!.]*{_SUFFIX}")) if out is not None else []
     return [path.stem for path in files if not path.stem.endswith("-best")]
 
 

@@ -3,6 +3,7 @@
 import builtins
 import errno
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,14 +13,17 @@ import pytest
 from data_folders import good_folder, scene_of, sphere_shard
 from fault_run import FAULTS, ROOT, digests, disturbed, finished, left_over
 
+from pipelines.benchmarks.lit_photographs import object_folders
 from pipelines.cli import main
 from pipelines.rendering.render_data import write_preview
 from pipelines.report.sections import FOLDER, Section, SectionWriter, read_sections
+from render.exchange.folders import claim
 from render.records.shards import read_shard, write_shard
 from render.shared import files
 from render.shared.errors import InputError
 from render.shared.images import write_png
 from render.shared.temporary import temporary_path
+from sdps.methods import pretrained
 from sdps.models.checkpoint import load_state, save_state
 
 
@@ -157,11 +161,31 @@ def test_a_folder_replaced_is_the_old_one_or_the_new_one_whenever_the_writer_end
     assert (len(gone) > 0) == (strike == "kill")  # between the renamings; Ctrl-C has its chance to put the old one back
 
 
-def test_a_report_shows_the_section_that_a_killed_run_moved_aside(tmp_path: Path) -> None:
+def test_a_report_shows_what_a_killed_run_moved_aside_and_nothing_half_written(tmp_path: Path) -> None:
     SectionWriter(Section(name="a", title="old", text="")).write(tmp_path)
     place = tmp_path / FOLDER / "a"
     place.rename(temporary_path(place, "old"))
-    assert [section.title for _, section in read_sections(tmp_path)] == ["old"] and not left_over(tmp_path)
+    shown = [section.title for _, section in read_sections(tmp_path)]
+    assert shown == ["old"] and not left_over(tmp_path)
+    shutil.copytree(place, temporary_path(place))  # by another process, so far
+    assert [section.title for _, section in read_sections(tmp_path)] == ["old"]
+
+
+def test_what_is_half_written_is_neither_trained_nor_an_object_nor_in_the_way(tmp_path: Path) -> None:
+    """What a run that was killed, or one on another machine, left: weights, an object's folder, the first file."""
+    half = tmp_path / "models" / "nenet" / "nenet.safetensors"
+    half.parent.mkdir(parents=True)
+    temporary_path(half, suffix=True).touch()
+    assert pretrained.trained(tmp_path) == []
+    for folder in (tmp_path / "cat", temporary_path(tmp_path / "dog")):
+        folder.mkdir()
+        (folder / "light_directions.txt").touch()
+    assert object_folders(tmp_path, "light_directions.txt", "") == [tmp_path / "cat"]
+    tree = tmp_path / "tree"
+    tree.mkdir()
+    temporary_path(tree / "export.json", suffix=True).touch()
+    claim(tree, {"layout": "psfcn"})
+    assert (tree / "export.json").is_file()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
