@@ -1,12 +1,13 @@
 """Text files of other layouts: lists of names, tables of numbers, and the order their loaders read them in."""
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from render.shared.errors import InputError
+from render.shared.errors import InputError, listed
 from render.shared.files import read_text
 
 UNIT_TOLERANCE = 0.01
@@ -32,6 +33,14 @@ def lines_text(lines: Sequence[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
+def numbered_lines(text: str) -> list[tuple[int, str]]:
+    """Return the lines of a text with their numbers from 1, as an editor counts them, blank ones included.
+
+    `str.splitlines` breaks lines at characters where no editor does.
+    """
+    return list(enumerate(re.split(r"\r\n|\n|\r", text), start=1))
+
+
 def read_names(path: str | Path) -> list[str]:
     """Read one name per line, in the file's order.
 
@@ -39,15 +48,16 @@ def read_names(path: str | Path) -> list[str]:
         InputError: missing or empty file, a '#' (NumPy, which several loaders parse with, takes it for a comment),
             or a name twice.
     """
-    names = [line.strip() for line in read_text(path).splitlines() if line.strip()]
+    names = [line.strip() for _, line in numbered_lines(read_text(path)) if line.strip()]
     if not names:
         raise InputError(f"{path}: no name in it; write one per line")
     for name in names:
         if "#" in name:
             raise InputError(f"{path}: {name!r} has a '#', which loaders take for a comment; rename it")
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{path}: {twice!r} is listed twice; remove one of the lines")
+        twice = [name for name, count in Counter(names).items() if count > 1]
+        be = "is" if len(twice) == 1 else "are"
+        raise InputError(f"{path}: {listed(list(map(repr, twice)))} {be} listed twice; remove one of the lines")
     return names
 
 
