@@ -68,8 +68,7 @@ def read_numbers(path: str | Path, columns: int, rows: int | None = None, what: 
         InputError: missing file, another number of rows or columns, or something that is no finite number.
     """
     table = []
-    lines = [(number, line.split()) for number, line in enumerate(read_text(path).splitlines(), start=1)]
-    for number, fields in lines:
+    for number, fields in ((number, line.split()) for number, line in numbered_lines(read_text(path))):
         if not fields:
             continue
         if len(fields) != columns:
@@ -79,6 +78,15 @@ def read_numbers(path: str | Path, columns: int, rows: int | None = None, what: 
     if rows is not None and len(table) != rows:
         raise InputError(f"{path}: {len(table)} rows for {rows} {what}s; give one row per {what}")
     return np.asarray(table, np.float64).reshape(-1, columns)
+
+
+def line_of_row(path: str | Path, row: int) -> int:
+    """Return the number of the line that row `row`, from 0, of a table stands in, for messages; blank ones count.
+
+    Raises:
+        InputError: missing file.
+    """
+    return [number for number, line in numbered_lines(read_text(path)) if line.strip()][row]
 
 
 def read_light_list(path: str | Path) -> tuple[list[str], np.ndarray]:
@@ -109,25 +117,40 @@ def read_light_list(path: str | Path) -> tuple[list[str], np.ndarray]:
         raise InputError(f"{path}: lines have from {min(widths)} to {max(widths)} fields; give all the same number")
     if len(set(names)) < len(names):
         raise InputError(f"{path}: an image is listed twice; give each light an image of its own")
-    return names, check_directions(np.asarray(directions), path)
+    return names, check_directions(np.asarray(directions), path, names)
 
 
-def check_directions(directions: np.ndarray, path: str | Path) -> np.ndarray:
+def check_directions(directions: np.ndarray, path: str | Path, names: Sequence[str] = ()) -> np.ndarray:
     """Return `directions` (L, 3) if they are unit vectors of the upper hemisphere.
 
+    Args:
+        directions: What was read.
+        path: The file, for messages.
+        names: (L,) what to call the lights; () for their numbers from 1.
+
     Raises:
-        InputError: one of another length, or below the horizon, named by its number.
+        InputError: some of another length, or below the horizon; all are named.
     """
-    for number, direction in enumerate(directions, start=1):
-        length = float(np.linalg.norm(direction))
-        if abs(length - 1.0) > UNIT_TOLERANCE:
-            raise InputError(f"{path}: light {number} has length {length:.4f}; give unit vectors towards the light")
-        if direction[2] < 0:
-            raise InputError(
-                f"{path}: light {number} is behind the object (z = {direction[2]:g}); give vectors towards the light, "
-                "z to the camera"
-            )
+    called = list(names) or [f"light {number}" for number in range(1, len(directions) + 1)]
+    lengths = np.linalg.norm(directions, axis=1)
+    wrong = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE).tolist()
+    if wrong:
+        raise InputError(
+            f"{path}: {called[wrong[0]]} has length {lengths[wrong[0]]:.4f}; give unit vectors towards the light"
+            f"{_also(called, wrong)}"
+        )
+    behind = np.flatnonzero(directions[:, 2] < 0).tolist()
+    if behind:
+        raise InputError(
+            f"{path}: {called[behind[0]]} is behind the object (z = {directions[behind[0], 2]:g}); give vectors "
+            f"towards the light, z to the camera{_also(called, behind)}"
+        )
     return directions
+
+
+def _also(called: Sequence[str], places: Sequence[int]) -> str:
+    """Name all but the first."""
+    return f" (so for {listed([called[place] for place in places[1:]])})" if len(places) > 1 else ""
 
 
 def _floats(fields: Sequence[str], where: str) -> list[float]:

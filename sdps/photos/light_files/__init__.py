@@ -132,7 +132,7 @@ def _may_be_lights(path: Path) -> bool:
     name = path.name.lower()
     if path.suffix.lower() not in SUFFIXES or not path.is_file() or name.startswith("."):
         return False
-    return name.endswith((".lp", ".relight", ".dome")) or bool(re.match(r"lights?(?!_?intens)", name))
+    return name.endswith((".lp", ".relight", ".dome")) or bool(re.match(r"light(?!s?_?intens)", name))
 
 
 def write_lights(
