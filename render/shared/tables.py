@@ -116,7 +116,8 @@ def read_light_list(path: str | Path) -> tuple[list[str], np.ndarray]:
     if len(widths) > 1:
         raise InputError(f"{path}: lines have from {min(widths)} to {max(widths)} fields; give all the same number")
     if len(set(names)) < len(names):
-        raise InputError(f"{path}: an image is listed twice; give each light an image of its own")
+        twice = [name for name, count in Counter(names).items() if count > 1]
+        raise InputError(f"{path}: an image is listed twice ({listed(twice)}); give each light an image of its own")
     return names, check_directions(np.asarray(directions), path, names)
 
 
@@ -126,31 +127,32 @@ def check_directions(directions: np.ndarray, path: str | Path, names: Sequence[s
     Args:
         directions: What was read.
         path: The file, for messages.
-        names: (L,) what to call the lights; () for their numbers from 1.
+        names: (L,) names of the images, where the file has them.
 
     Raises:
         InputError: some of another length, or below the horizon; all are named.
     """
-    called = list(names) or [f"light {number}" for number in range(1, len(directions) + 1)]
     lengths = np.linalg.norm(directions, axis=1)
     wrong = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE).tolist()
     if wrong:
         raise InputError(
-            f"{path}: {called[wrong[0]]} has length {lengths[wrong[0]]:.4f}; give unit vectors towards the light"
-            f"{_also(called, wrong)}"
+            f"{path}: light {wrong[0] + 1} has length {lengths[wrong[0]]:.4f}; give unit vectors towards the light"
+            f"{_all(names, wrong)}"
         )
     behind = np.flatnonzero(directions[:, 2] < 0).tolist()
     if behind:
         raise InputError(
-            f"{path}: {called[behind[0]]} is behind the object (z = {directions[behind[0], 2]:g}); give vectors "
-            f"towards the light, z to the camera{_also(called, behind)}"
+            f"{path}: light {behind[0] + 1} is behind the object (z = {directions[behind[0], 2]:g}); give vectors "
+            f"towards the light, z to the camera{_all(names, behind)}"
         )
     return directions
 
 
-def _also(called: Sequence[str], places: Sequence[int]) -> str:
-    """Name all but the first."""
-    return f" (so for {listed([called[place] for place in places[1:]])})" if len(places) > 1 else ""
+def _all(names: Sequence[str], places: Sequence[int]) -> str:
+    """Name all lights at these places."""
+    if names:
+        return f" ({listed([names[place] for place in places])})"
+    return f" (lights {listed([str(place + 1) for place in places])})" if len(places) > 1 else ""
 
 
 def _floats(fields: Sequence[str], where: str) -> list[float]:

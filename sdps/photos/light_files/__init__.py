@@ -89,7 +89,8 @@ def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up", dou
         )
     directions = vectors / lengths[:, None]
     _refuse_behind(path, directions, files, frame, doubts)
-    notes = [f"lights are those of {path.name}, axes {frame}", *said]
+    axes = f", axes {frame}" if table.signs == (1, 1, 1) else f", turned by {frame}" if signs != table.signs else ""
+    notes = [f"lights are those of {path.name}{axes}", *said]
     if np.abs(lengths - 1).max() > _LENGTH:
         notes.append(f"light vectors had lengths from {lengths.min():.4g} to {lengths.max():.4g}; they were normalised")
     return Lights(directions.astype(np.float32), _intensities(path, strengths, files), tuple(notes))

@@ -15,13 +15,14 @@ AROUND, UP, DOWN = ("azimuth", "tilt"), ("elevation",), ("slant",)
 
 _WORDS = {
     "name": "name file filename image picture photo photograph path view img imagename",
-    "number": "# no nr num number index idx id n light lamp led",
+    "number": "# no nr num number index idx id n k light lamp led",
     "i": "i intensity intensitie strength brightness power gain", "r": "r red", "g": "g green", "b": "b blue",
     "azimuth": "azimuth azi az", "elevation": "elevation elev el altitude alt", "slant": "slant zenith", "tilt": "tilt",
     "ambiguous": "theta phi θ φ ϕ inclination polar angle pan lon lat longitude latitude",
 }  # fmt: skip
 _KINDS = {word: kind for kind, words in _WORDS.items() for word in words.split()}
 _AXIS = re.compile(r"(?:[lndvps]|dir|direction|light|lightdir|lightdirection|pos|position|vec|vector|source)?([xyz])")
+_CAPTION = re.compile(r"\blight(ing|s)?[ _](directions?|vectors?|sources?|positions?)\b:?(?=\s)", re.IGNORECASE)
 _FILLERS = {"deg", "degree", "degrees", "degs", "in", "and", "columns", "column", "rad", "radians", "°", "mm", "cm", ""}
 _PAIRS = [{around, other} for around in AROUND for other in (*UP, *DOWN)]
 
@@ -65,6 +66,7 @@ def read_heading(path: Path, line: str, want: Want) -> Heading | None:
     Raises:
         InputError: angles that mean different things to different people.
     """
+    line = _CAPTION.sub("", line)
     separator = next((sign for sign in ";\t," if sign in line), None)
     words = [word.strip(" \"'") for word in line.strip("[](){} \t").split(separator)]
     if separator is None:
@@ -74,6 +76,8 @@ def read_heading(path: Path, line: str, want: Want) -> Heading | None:
     kinds = [kind_of(word) for word in words]
     if separator is not None and words and not words[0]:
         kinds[0] = "number"  # the index that pandas writes
+    if words and words[0].lower() == "i" and want.lights:
+        kinds[0] = "number"  # an intensity stands after the direction
     named = {kind for kind in kinds if kind}
     enough = {"x", "y", "z"} <= named or any(pair <= named for pair in _PAIRS)
     if not want.lights:

@@ -75,6 +75,8 @@ def _rest_is_light(path: Path, table: Table) -> bool:
     for test in (are_unit, are_level):
         if test(before) != test(after):
             return test(after)
+    if np.ptp(after / np.linalg.norm(after, axis=1, keepdims=True).clip(1e-9), axis=0).max() < 1e-3:
+        return False  # then all lights were the same
     raise InputError(
         f"{path}: its rows may be 'number x y z' or 'x y z i'; write the pictures' names before them, or one of these "
         "two as first line"

@@ -12,7 +12,7 @@ from sdps.photos.light_files.light_json import read_json_table
 from sdps.photos.light_files.light_table import Table, Want
 from sdps.photos.light_files.light_text import read_text_table
 
-_LARGEST = 8 << 20  # bytes of a text
+_LARGEST = 2 << 20  # bytes of a text; 10,000 lights have half a MiB
 _HDF = b"\x89HDF\r\n\x1a\n"
 _SHEET = "is a spreadsheet; save the sheet as CSV"
 
@@ -79,7 +79,7 @@ def _text(path: Path) -> str:
     """Read a text as Windows, macOS and Linux write them: UTF-8 or UTF-16 with a mark, else Western European."""
     data = read_bytes(path)
     if len(data) > _LARGEST:
-        raise InputError(f"{path}: has {len(data) >> 20} MiB, too much for a file of lights; name another")
+        raise InputError(f"{path}: has {len(data) / 2**20:.1f} MiB, too much for a file of lights; name another")
     try:
         wide = data.startswith((b"\xff\xfe", b"\xfe\xff"))
         text = data.decode("utf-16" if wide else "utf-8-sig")

@@ -18,7 +18,7 @@ from render.shared.tables import numbered_lines
 from sdps.photos.light_files.light_columns import Heading, read_heading
 from sdps.photos.light_files.light_table import Table, Want
 
-_DIGITS = r"[-+]?(?:[0-9]+{point}?[0-9]*|{point}[0-9]+)(?:[eEdD][-+]?[0-9]+)?|[-+]?(?:nan|inf(?:inity)?)"
+_DIGITS = r"[-+]?(?:[0-9]+(?:{point}[0-9]*)?|{point}[0-9]+)(?:[eEdD][-+]?[0-9]+)?|[-+]?(?:nan|inf(?:inity)?)"
 _COMMENT = re.compile(r"(?:^|(?<=[\s,;]))(?:#|%|//(?![^\s/]+[/\\]))")
 _LOOSE_COMMENT = re.compile(r"#|%|//")
 _TYPE = re.compile(r",?\s*dtype=\w+\)*\s*$")
@@ -92,6 +92,13 @@ def _content(path: Path, text: str, want: Want) -> tuple[Heading | None, list[tu
         start = _COMMENT.search(raw)
         line, comment = (raw[: start.start()], raw[start.end() :]) if start else (raw, "")
         line = _TYPE.sub("", line.replace("\N{MINUS SIGN}", "-")).strip()
+        if (
+            line
+            and comment
+            and not _row(number, line, _COMMAS).values
+            and len(_row(number, raw, _POINTS).values) in want.widths
+        ):
+            line = raw.strip()  # a name with such a sign in it
         words = set(re.findall(r"[^\W\d_]+", line.lower()))
         if heading is None and (not lines or (len(lines) == 1 and lines[0][1].isdecimal())):
             if comment and not line:
