@@ -77,6 +77,8 @@ def _rest_is_light(path: Path, table: Table) -> bool:
             return test(after)
     if np.ptp(after / np.linalg.norm(after, axis=1, keepdims=True).clip(1e-9), axis=0).max() < 1e-3:
         return False  # then all lights were the same
+    if np.ptp(after[:, 0]) > 5 * np.ptp(before[:, 0]):
+        return True  # lamps whose x goes up by 1 are not that far from each other
     raise InputError(
         f"{path}: its rows may be 'number x y z' or 'x y z i'; write the pictures' names before them, or one of these "
         "two as first line"
@@ -158,8 +160,9 @@ def _by_name(path: Path, names: Sequence[str], files: Sequence[str]) -> tuple[li
     said = f"none of its names ({_span(names)}) is that of a picture, so its rows were taken"
     if numbers is not None and pictures is not None and set(numbers) == set(pictures):
         return [numbers.index(number) for number in pictures], f"{said} by the numbers in the names"
-    if sorted(names, key=natural_key) == list(names):
-        return list(range(len(files))), f"{said} in the order of the pictures, {_span(files)}"
+    order = sorted(range(len(names)), key=lambda place: natural_key(names[place]))
+    if order == list(range(len(names))) or (numbers is not None and counts(numbers)):
+        return list(order), f"{said} in the order of the pictures, {_span(files)}"
     return places, ""
 
 

@@ -91,6 +91,8 @@ TEXTS = {
     "folders": "8\n" + named("/home/rti #2/img_{n:02d}.tif {x} {y} {z}"),
     "a wrong count": "9\n" + named("{f} {x} {y} {z}"),
     "more rows than pictures": named("{f} {x} {y} {z}") + "\nimg_09.png 0 0 1\nimg_10.png 0 0 1",
+    "numbers, lengths that vary": "\n".join(
+        f"{k + 1} {' '.join(str(round(value * (900 + 90 * k))) for value in LIGHTS[k])}" for k in ORDER),
     "other names": named("DSC{n}.tif {x} {y} {z}", ALL).replace("DSC", "DSC10"),
     "an index of pandas": ",x,y,z\n" + "\n".join(f"{k},{ROWS[k].replace(' ', ',')}" for k in ALL),
     "an index by name": "i x y z\n" + named("{n} {x} {y} {z}"),
@@ -113,6 +115,13 @@ def test_text_in_the_ways_people_write_it(tmp_path: Path, name: str) -> None:
     read = read_lights(path, FILES)
     np.testing.assert_allclose(read.directions, LIGHTS, atol=1e-3)
     assert read.intensities is None
+
+
+def test_names_are_counted_where_no_number_fits(tmp_path: Path) -> None:
+    (tmp_path / "l.txt").write_text(named("pic{n}: ({X},{Y},{Z})"))
+    read = read_lights(tmp_path / "l.txt", [f"DSC_{4510 + number}.jpg" for number in range(COUNT)])
+    np.testing.assert_allclose(read.directions, LIGHTS, atol=1e-3)
+    assert any("in the order of the pictures, DSC_4510.jpg" in note for note in read.notes)
 
 
 @pytest.mark.parametrize("coding", ["utf-16", "cp1252", "utf-8"])
@@ -313,7 +322,7 @@ def test_a_square_table_that_may_be_either_is_refused(tmp_path: Path) -> None:
 
 
 def test_numbers_that_may_be_x_are_refused(tmp_path: Path) -> None:
-    rows = "\n".join(f"{k} {10 * k} {300 + 70 * k} {400 - 30 * k}" for k in range(1, COUNT + 1))
+    rows = "\n".join(f"{k} {3 * k} {300 + 70 * k} {400 - 30 * k}" for k in range(1, COUNT + 1))
     assert "may be 'number x y z' or 'x y z i'" in refusal(tmp_path / "l.txt", rows)
     (tmp_path / "l.txt").write_text(f"x y z i\n{rows}")
     assert read_lights(tmp_path / "l.txt", FILES).intensities is not None
