@@ -30,7 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="any model or classical method: sdps, lcnet+psfcn, pf14, ... (default: auto)")  # fmt: skip
     parser.add_argument("--models", type=Path, default=None, help="folder of trained runs (default: shipped weights)")
     parser.add_argument("--mask", default=None, help="picture, bright on the object (default: mask.*, else automatic)")
-    parser.add_argument("--lights", default=None, metavar="FILE|folder", help="known light directions")
+    parser.add_argument("--lights", default=None, metavar="FILE|folder",
+                        help="known light directions: rows x y z, .lp, .csv, .npy, .npz, .mat, lights.json, JSON of "
+                        "Meshroom or RelightLab; folder: the file of lights among the photographs")  # fmt: skip
     parser.add_argument("--intensities", default=None, metavar="FILE|folder", help="known light intensities")
     parser.add_argument("--frame", default="y-up", help="axes of the lights file: y-up, y-down, x-left, z-away")
     parser.add_argument("--gamma", default="auto", help="linear, srgb, or an exponent (default: by kind of file)")

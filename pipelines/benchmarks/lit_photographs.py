@@ -21,7 +21,7 @@ from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import read_text
 from render.shared.images import read_image, to_unit
-from render.shared.tables import natural_key, read_names, read_numbers
+from render.shared.tables import line_of_row, natural_key, read_names, read_numbers
 from sdps.photos.picture_file import decode
 
 _log = logging.getLogger(__name__)
@@ -160,7 +160,7 @@ def read_directions(path: Path, sign: float) -> tuple[np.ndarray, np.ndarray | N
     table, numbers = read_table(path)
     length = np.linalg.norm(table, axis=1, keepdims=True)
     if not (length > 0).all():
-        raise InputError(f"{path}: line {int(np.argmin(length)) + 1} is a zero vector; repair it")
+        raise InputError(f"{path}: line {line_of_row(path, int(np.argmin(length)))} is a zero vector; repair it")
     return sign * table / length, numbers
 
 
@@ -170,7 +170,9 @@ def read_intensities(path: Path, count: int) -> np.ndarray:  # (L, 3)
     if len(table) != count:
         raise InputError(f"{path}: {len(table)} rows for {count} lights; give one row per light")
     if not (table > 0).all():
-        raise InputError(f"{path}: line {int(np.argmin(table.min(1))) + 1} is not positive; repair it")
+        raise InputError(
+            f"{path}: line {line_of_row(path, int(np.argmin(table.min(1) > 0)))} is not positive; repair it"
+        )
     return table
 
 

@@ -20,7 +20,7 @@ from render.shared.decoding import check_unpacked, decoding
 from render.shared.errors import InputError
 from render.shared.files import read_text
 from render.shared.images import decode_normals, read_image
-from render.shared.tables import check_directions, natural_key, read_names, read_numbers
+from render.shared.tables import check_directions, line_of_row, natural_key, read_names, read_numbers
 
 
 def diligent_sources(tree: str | Path, note: Note | None = None) -> list[Source]:
@@ -67,7 +67,9 @@ def _diligent_source(folder: Path, root: Path) -> Source:
     path = folder / "light_intensities.txt"
     intensities = read_numbers(path, 3, len(names), "image")
     if not (intensities > 0).all():
-        raise InputError(f"{path}: line {int(np.argmin(intensities.min(1))) + 1} is not positive; repair it")
+        raise InputError(
+            f"{path}: line {line_of_row(path, int(np.argmin(intensities.min(1) > 0)))} is not positive; repair it"
+        )
     name = folder.name.removesuffix("PNG") or folder.name
     return Source(
         name=name, shape=name, material=name, split="test", folder=folder, where=folder.name, images=tuple(names),

@@ -4,6 +4,7 @@ A set is an (L, 3) float64 array of unit vectors from the surface to the light, 
 z to the camera), every z > 0.
 """
 
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from render.shared.config import read_yaml
 from render.shared.errors import InputError, unknown
 from render.shared.files import read_text
 from render.shared.seeds import generator
+from render.shared.tables import numbered_lines
 
 MAX_ANGLE = 88.0  # degrees; beyond it the image is black but for rim pixels
 BIASED_MIN_Y = -0.1
@@ -121,12 +123,18 @@ def load(name: str) -> np.ndarray:  # (L, 3)
         raise unknown("light set", name, known, "or give a file of directions")
     if path.suffix in (".yaml", ".yml"):
         return checked(read_yaml(path).get("directions"), name)
-    rows = [line.replace(",", " ").split() for line in read_text(path).splitlines() if line.strip()]
-    return checked(rows, name)
+    lines = [(number, line.partition("#")[0].strip()) for number, line in numbered_lines(read_text(path))]
+    lines = [(number, line) for number, line in lines if line]
+    return checked([line.replace(",", " ").split() for _, line in lines], name, [number for number, _ in lines])
 
 
-def checked(rows: object, name: str) -> np.ndarray:  # (L, 3)
+def checked(rows: object, name: str, lines: Sequence[int] = ()) -> np.ndarray:  # (L, 3)
     """Return rows of three numbers as unit vectors.
+
+    Args:
+        rows: What was read.
+        name: The file, for messages.
+        lines: The rows' lines in a text.
 
     Raises:
         InputError: no list, no row, or a row that is no light above the horizon (named by its number).
@@ -135,13 +143,16 @@ def checked(rows: object, name: str) -> np.ndarray:  # (L, 3)
         raise InputError(f"{name}: directions: expected a list of [x, y, z] rows")
     vectors = []
     for number, row in enumerate(rows, start=1):
+        where = f" (line {lines[number - 1]})" if lines else ""
         try:
             vector = np.array([float(value) for value in row])
         except (TypeError, ValueError):
             vector = np.zeros(0)
         if vector.shape != (3,) or not np.isfinite(vector).all() or not np.linalg.norm(vector) > 0:
-            raise InputError(f"{name}: light {number}: expected three numbers x y z, got {row}")
+            raise InputError(f"{name}: light {number}: expected three numbers x y z, got {row}{where}")
         if vector[2] <= 0:
-            raise InputError(f"{name}: light {number} is below the horizon (z = {vector[2]:g}); z must be above 0")
+            raise InputError(
+                f"{name}: light {number} is below the horizon (z = {vector[2]:g}); z must be above 0{where}"
+            )
         vectors.append(vector / np.linalg.norm(vector))
     return np.stack(vectors)

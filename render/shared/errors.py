@@ -6,7 +6,7 @@ else is a defect and keeps its traceback.
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 _BREAKS = re.compile(r"\s*[\n\v\f\r\x1c-\x1e\x85\u2028\u2029]\s*")
 _LONGEST = 1000
@@ -38,3 +38,10 @@ def unknown(kind: str, name: str, known: Iterable[str], remedy: str = "") -> Inp
     if near:
         hint = f"; did you mean {' or '.join(map(repr, near))}?"
     return InputError(f"unknown {kind} {name!r}{hint}{'; ' + remedy if remedy else ''}")
+
+
+def listed(names: Sequence[str], most: int = 10) -> str:
+    """Write names one after another; of many the first, and how many more there are."""
+    if len(names) <= most + 1:
+        return ", ".join(names)
+    return f"{', '.join(names[:most])} and {len(names) - most} more"

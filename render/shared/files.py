@@ -267,13 +267,13 @@ def read_whole_lines(path: Path) -> Iterator[Any]:
 
 
 def read_text(path: str | Path) -> str:
-    """Read a UTF-8 text file.
+    """Read a UTF-8 text file, without the mark that Windows' editors put at its beginning.
 
     Raises:
         InputError: the file is missing, unreadable or not text.
     """
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return Path(path).read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error
     except (OSError, ValueError) as error:  # of the text, or of a zero in the path

@@ -1,12 +1,13 @@
 """Text files of other layouts: lists of names, tables of numbers, and the order their loaders read them in."""
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from render.shared.errors import InputError
+from render.shared.errors import InputError, listed
 from render.shared.files import read_text
 
 UNIT_TOLERANCE = 0.01
@@ -32,6 +33,14 @@ def lines_text(lines: Sequence[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
+def numbered_lines(text: str) -> list[tuple[int, str]]:
+    """Return the lines of a text with their numbers from 1, as an editor counts them, blank ones included.
+
+    `str.splitlines` breaks lines at characters where no editor does.
+    """
+    return list(enumerate(re.split(r"\r\n|\n|\r", text), start=1))
+
+
 def read_names(path: str | Path) -> list[str]:
     """Read one name per line, in the file's order.
 
@@ -39,15 +48,16 @@ def read_names(path: str | Path) -> list[str]:
         InputError: missing or empty file, a '#' (NumPy, which several loaders parse with, takes it for a comment),
             or a name twice.
     """
-    names = [line.strip() for line in read_text(path).splitlines() if line.strip()]
+    names = [line.strip() for _, line in numbered_lines(read_text(path)) if line.strip()]
     if not names:
         raise InputError(f"{path}: no name in it; write one per line")
     for name in names:
         if "#" in name:
             raise InputError(f"{path}: {name!r} has a '#', which loaders take for a comment; rename it")
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{path}: {twice!r} is listed twice; remove one of the lines")
+        twice = [name for name, count in Counter(names).items() if count > 1]
+        be = "is" if len(twice) == 1 else "are"
+        raise InputError(f"{path}: {listed(list(map(repr, twice)))} {be} listed twice; remove one of the lines")
     return names
 
 
@@ -58,8 +68,7 @@ def read_numbers(path: str | Path, columns: int, rows: int | None = None, what: 
         InputError: missing file, another number of rows or columns, or something that is no finite number.
     """
     table = []
-    lines = [(number, line.split()) for number, line in enumerate(read_text(path).splitlines(), start=1)]
-    for number, fields in lines:
+    for number, fields in ((number, line.split()) for number, line in numbered_lines(read_text(path))):
         if not fields:
             continue
         if len(fields) != columns:
@@ -69,6 +78,15 @@ def read_numbers(path: str | Path, columns: int, rows: int | None = None, what: 
     if rows is not None and len(table) != rows:
         raise InputError(f"{path}: {len(table)} rows for {rows} {what}s; give one row per {what}")
     return np.asarray(table, np.float64).reshape(-1, columns)
+
+
+def line_of_row(path: str | Path, row: int) -> int:
+    """Return the number of the line that row `row`, from 0, of a table stands in, for messages; blank ones count.
+
+    Raises:
+        InputError: missing file.
+    """
+    return [number for number, line in numbered_lines(read_text(path)) if line.strip()][row]
 
 
 def read_light_list(path: str | Path) -> tuple[list[str], np.ndarray]:
@@ -98,26 +116,43 @@ def read_light_list(path: str | Path) -> tuple[list[str], np.ndarray]:
     if len(widths) > 1:
         raise InputError(f"{path}: lines have from {min(widths)} to {max(widths)} fields; give all the same number")
     if len(set(names)) < len(names):
-        raise InputError(f"{path}: an image is listed twice; give each light an image of its own")
-    return names, check_directions(np.asarray(directions), path)
+        twice = [name for name, count in Counter(names).items() if count > 1]
+        raise InputError(f"{path}: an image is listed twice ({listed(twice)}); give each light an image of its own")
+    return names, check_directions(np.asarray(directions), path, names)
 
 
-def check_directions(directions: np.ndarray, path: str | Path) -> np.ndarray:
+def check_directions(directions: np.ndarray, path: str | Path, names: Sequence[str] = ()) -> np.ndarray:
     """Return `directions` (L, 3) if they are unit vectors of the upper hemisphere.
 
+    Args:
+        directions: What was read.
+        path: The file, for messages.
+        names: (L,) names of the images, where the file has them.
+
     Raises:
-        InputError: one of another length, or below the horizon, named by its number.
+        InputError: some of another length, or below the horizon; all are named.
     """
-    for number, direction in enumerate(directions, start=1):
-        length = float(np.linalg.norm(direction))
-        if abs(length - 1.0) > UNIT_TOLERANCE:
-            raise InputError(f"{path}: light {number} has length {length:.4f}; give unit vectors towards the light")
-        if direction[2] < 0:
-            raise InputError(
-                f"{path}: light {number} is behind the object (z = {direction[2]:g}); give vectors towards the light, "
-                "z to the camera"
-            )
+    lengths = np.linalg.norm(directions, axis=1)
+    wrong = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE).tolist()
+    if wrong:
+        raise InputError(
+            f"{path}: light {wrong[0] + 1} has length {lengths[wrong[0]]:.4f}; give unit vectors towards the light"
+            f"{_all(names, wrong)}"
+        )
+    behind = np.flatnonzero(directions[:, 2] < 0).tolist()
+    if behind:
+        raise InputError(
+            f"{path}: light {behind[0] + 1} is behind the object (z = {directions[behind[0], 2]:g}); give vectors "
+            f"towards the light, z to the camera{_all(names, behind)}"
+        )
     return directions
+
+
+def _all(names: Sequence[str], places: Sequence[int]) -> str:
+    """Name all lights at these places."""
+    if names:
+        return f" ({listed([names[place] for place in places])})"
+    return f" (lights {listed([str(place + 1) for place in places])})" if len(places) > 1 else ""
 
 
 def _floats(fields: Sequence[str], where: str) -> list[float]:

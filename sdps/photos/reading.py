@@ -14,7 +14,7 @@ from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 from sdps.photos.doubts import Doubts
 from sdps.photos.gamma import resolve_gamma
-from sdps.photos.light_files import Lights, read_intensities, read_lights
+from sdps.photos.light_files import Lights, find_lights, read_intensities, read_lights
 from sdps.photos.listing import find_mask, list_pictures
 from sdps.photos.masks import Variation, automatic_mask, read_mask
 from sdps.photos.picture_file import Coding, Picture, decode, turned
@@ -103,7 +103,7 @@ def load(
     Args:
         folder: PNG, TIFF, JPEG or EXR files of one kind and size, and what may lie beside them.
         mask: A picture, bright where the object is; None for the folder's mask.* or, without one, an automatic mask.
-        lights: A lights file, or `folder` for its lights.json or light_directions.txt; None for unknown lights.
+        lights: A lights file (docs/guides/capture.md), or `folder` for that of the folder; None for unknown lights.
         intensities: A file of intensities, or `folder` for its light_intensities.txt; None for those of `lights`.
         frame: Axes of the lights file: y-up, y-down, x-left, z-away, several joined by commas.
         gamma: linear, srgb, the exponent of a power curve, or auto by kind of file and colour profile.
@@ -223,7 +223,8 @@ def _lights(
     """Read directions and intensities where asked for; frame flags without lights are checked all the same."""
     directions = strengths = None
     notes: tuple[str, ...] = ("lights are unknown and will be estimated, where the method can",)
-    path = _beside(folder, lights, ("lights.json", "light_directions.txt"))
+    asked = (find_lights(folder) or lights) if str(lights) == "folder" else lights
+    path = _beside(folder, asked, ("lights.json", "light_directions.txt"))
     if path is not None:
         read: Lights = read_lights(path, files, frame, doubts)
         directions, strengths, notes = read.directions, read.intensities, read.notes

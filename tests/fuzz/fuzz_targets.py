@@ -19,6 +19,7 @@ import data_folders
 import exchange_support
 import fuzz_app
 import numpy as np
+import scipy.io
 import tifffile
 import trimesh
 import yaml
@@ -124,6 +125,20 @@ def _light_files(folder: Path) -> None:
     (folder / "named.txt").write_text(
         "".join(f"{name} {x} {y} {z} 1.0\n" for name, (x, y, z) in zip(names, vectors, strict=True))
     )
+    rows = [(name, *vector) for name, vector in zip(names, np.round(vectors, 5).tolist(), strict=True)]
+    (folder / "paths.lp").write_text("6\n" + "".join("C:\\rti\\{} {} {} {}\n".format(*row) for row in rows))
+    (folder / "angles.csv").write_text("file;azimuth;elevation\n" + "".join(f"{name};30,5;45\n" for name in names))
+    np.save(folder / "lights.npy", vectors.T)
+    np.savez(folder / "lights.npz", L=vectors, light_intensities=np.ones(6), images=np.zeros((6, 4, 4)))
+    for name, packed in (("plain.mat", False), ("packed.mat", True)):
+        content = {"S": vectors, "images": np.zeros((4, 4, 6)), "about": {"a": "b"}}
+        scipy.io.savemat(folder / name, content, do_compression=packed)
+    meshroom = [{"viewId": str(number), "type": "SH", "intensity": ["1", "2", "1"],
+                 "direction": [str(value) for value in (*(row[1:] * np.array([1, -1, -1])), *[0.1] * 6)]}
+                for number, row in enumerate(map(np.array, [(0.0, *row[1:]) for row in rows]))]  # fmt: skip
+    (folder / "meshroom.json").write_text(json.dumps({"lights": meshroom}))
+    images = [{"filename": name, "direction": dict(zip("xyz", vector, strict=True))} for name, *vector in rows]
+    (folder / "project.relight").write_text(json.dumps({"images": images}))
 
 
 def _weights(folder: Path) -> None:
@@ -338,7 +353,7 @@ def _read_light_file(folder: Path, path: Path) -> None:
 
     files = [f"{number}.png" for number in range(1, 7)]
     read_lights(path, files)
-    if path.suffix == ".txt":
+    if path.suffix in (".txt", ".npz"):
         read_intensities(path, files)
 
 

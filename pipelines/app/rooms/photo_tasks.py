@@ -163,7 +163,13 @@ def _load(folder: Path, *, anyway: bool, gamma: str = "auto", frame: str = "y-up
 
 
 def _has_lights(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in ("lights.json", "light_directions.txt"))
+    """Tell whether there is a file of lights; of several, `_load` says so."""
+    from sdps.photos.light_files import find_lights
+
+    try:
+        return find_lights(folder) is not None
+    except InputError:
+        return True
 
 
 def _save(path: Path, picture: np.ndarray, side: int) -> None:

@@ -45,7 +45,7 @@ async function example() {
   $("example").disabled = false;
 }
 
-const USABLE = /\.(png|tiff?|jpe?g|exr|txt|json|zip)$/i;
+const USABLE = /\.(png|tiff?|jpe?g|exr|txt|json|lp|csv|np[yz]|mat|relight|dome|zip)$/i;
 const usable = (files) => [...files].filter((file) => USABLE.test(file.name) && !file.name.startsWith("."));
 
 async function dropped(transfer) {

@@ -14,7 +14,7 @@ from render.shared.errors import InputError
 from render.shared.files import parse_json
 
 PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".exr")
-_BESIDE = (".txt", ".json")
+_BESIDE = (".txt", ".json", ".lp", ".csv", ".npy", ".npz", ".mat", ".relight", ".dome")
 _NAME = re.compile(r"[^\w.,()+ -]+")
 _CHUNK = 2**20
 _EXR_HEADER = 2**16

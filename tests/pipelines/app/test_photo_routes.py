@@ -94,6 +94,20 @@ def test_bad_photographs_end_in_the_line_of_the_command(address: str, hills: Pat
     assert "/tmp" not in job["message"] and "\n" not in job["message"]
 
 
+def test_lights_of_other_programs_are_used(address: str, hills: Path) -> None:
+    client = Client(address)
+    names = sorted((path.name for path in hills.glob("[0-9]*.png")), key=lambda name: int(name[:-4]))
+    rows = "".join("C:\\rti\\{} {} {} {}\n".format(name, *row) for name, row in zip(names, LIGHTS, strict=True))
+    buffer = io.BytesIO()
+    np.save(buffer, LIGHTS.T)
+    for name, data in (("object.lp", rows.encode()), ("lights.npy", buffer.getvalue())):
+        path = client.new_set(hills)
+        assert client.send("PUT", f"{path}/uploads/{name}", data)[0] == 200
+        checked = client.wait(client.post(f"{path}/start/check", {"lights": True}))["result"]
+        assert checked["lights_there"] and checked["lit"]
+        assert f"lights are those of {name}, axes y-up" in checked["notes"]
+
+
 def test_uploads_are_limited(address: str, hills: Path) -> None:
     client = Client(address)
     path = client.new_set()

@@ -192,3 +192,11 @@ def test_bad_folders_are_one_line(apple, stage, tmp_path, dataset, harm):
 def test_bad_flags(stage, tmp_path, flags, message):
     with pytest.raises(InputError, match=message):
         folders.run("eval-lights", stage, "--dataset", "light-stage", "--out", tmp_path, *flags)
+
+
+def test_the_line_that_is_wrong_is_blamed(apple):
+    path = next(apple.rglob("light_intensities_refined.txt"))
+    rows = path.read_text().splitlines()
+    path.write_text("\n\n" + "\n\n".join([*rows[:2], "1 0 1", *rows[3:]]))
+    with pytest.raises(InputError, match=r"line 7 is not positive"):
+        gourd_apple_objects(apple)

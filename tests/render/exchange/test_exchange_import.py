@@ -221,6 +221,7 @@ def mat(**content: object):
         (lambda root: (root / OBJECT / "light_intensities.txt").unlink(), r"light_intensities\.txt: no such file"),
         (write(f"{OBJECT}/light_intensities.txt", "1\n" * LIGHTS), r"1 column\(s\) where 3 are needed; repeat"),
         (write(f"{OBJECT}/light_intensities.txt", "1 1 0\n" * LIGHTS), r"line 1 is not positive"),
+        (write(f"{OBJECT}/light_intensities.txt", "\n1 1 1\n\n" + "1 1 0\n" * (LIGHTS - 1)), r"line 4 is not positive"),
         (write(f"{OBJECT}/light_intensities.txt", "1 1 1e999\n" * LIGHTS), r"are not finite"),
         (write(f"{OBJECT}/light_directions.txt", "0 0 1\n" * 3), rf"3 rows for {LIGHTS} images; give one row"),
         (write(f"{OBJECT}/light_directions.txt", "0 0 2\n" * LIGHTS), r"light 1 has length 2\.0000; give unit vectors"),

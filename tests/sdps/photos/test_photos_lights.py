@@ -83,9 +83,9 @@ def refusal(path: Path, text: str, frame: str = "y-up") -> str:
         ("0 0 1\n0 0 1 2\n0 0 1\n", "line 2 has another layout than the first"),
         ("0 0 1\n0 0 0\n0 0 1\n", "the light of b.png is 0 0 0"),
         ("0 0 1\n0 1 -.1\n0 0 1\n", "the light of b.png has z = -0.0995, behind the object (1 of 3)"),
-        ("0 0 -1\n0 1 -.1\n0 0 -1\n", "as all others; if z points away from the camera there, add z-away"),
+        ("0 0 -1\n0 1 -.1\n0 0 -1\n", "3 of 3 lights have z <= 0, behind the object (a 1.png, b.png, c.png); so z"),
         ("0 0 1 1\n0 0 1 0\n0 0 1 1\n", "the intensity of b.png is not positive"),
-        ("a 1.png 0 0 1\nb 0 0 1\n", "no row for c.png (1 pictures lack one)"),
+        ("a 1.png 0 0 1\nb 0 0 1\n", "no row for c.png (1 of 3 pictures lack one)"),
         ("a 1.png 0 0 1\nb 0 0 1\nb 0 0 1\n", "b is there twice"),
     ],
 )
