@@ -1,15 +1,49 @@
-"""What the request handlers of all rooms share: queueing a job, files below a folder, numbers in a path."""
+"""What the request handlers of all rooms share: uploads, queueing a job, files below a folder, numbers in a path."""
 
+import asyncio
+import functools
 import re
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 
 from pipelines.app.work.refusals import Refused
+from render.shared.errors import InputError
 
 _NUMBER = re.compile(r"[0-9]{1,9}")
+_MOST_LEFT = 2**30
+_PATIENCE = 60.0
+Handler = Callable[[Request], Awaitable[Response]]
+
+
+def taking_uploads(handler: Handler) -> Handler:
+    """Return a handler that reads on to the end of a body it refuses; else the browser, which is still sending, would
+    show a connection that was reset in place of the reason.
+    """
+
+    @functools.wraps(handler)
+    async def patient(request: Request) -> Response:
+        try:
+            return await handler(request)
+        except InputError:
+            await _read_on(request)
+            raise
+
+    return patient
+
+
+async def _read_on(request: Request) -> None:
+    left = _MOST_LEFT
+    with suppress(ClientDisconnect, TimeoutError, RuntimeError):  # the last where all of it was read
+        async with asyncio.timeout(_PATIENCE):
+            async for chunk in request.stream():
+                left -= len(chunk)
+                if left < 0:
+                    return
 
 
 def queued(request: Request, task: str, **arguments: Any) -> Response:

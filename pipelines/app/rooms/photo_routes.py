@@ -13,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from pipelines.app.rooms.handling import file_inside, number, queued
+from pipelines.app.rooms.handling import file_inside, number, queued, taking_uploads
 from pipelines.app.work import uploads
 from pipelines.app.work.archives import unpack
 from pipelines.app.work.incoming import Incoming, incoming, names, off_loop, receive
@@ -44,6 +44,7 @@ async def new(request: Request) -> Response:
     return JSONResponse({"set": name})
 
 
+@taking_uploads
 async def upload(request: Request) -> Response:
     """Take one file, or a ZIP that is unpacked at once: all of its files or none."""
     session: Session = request.state.session
@@ -69,6 +70,7 @@ def _take_in(coming: Incoming, path: Path, folder: Path, limits: Limits) -> int:
     return coming.add([path], folder, limits.files)
 
 
+@taking_uploads
 async def paint(request: Request) -> Response:
     """Take a mask painted on the page, a PNG of the photographs' size; an empty body takes the painted one away."""
     session: Session = request.state.session

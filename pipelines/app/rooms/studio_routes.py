@@ -7,7 +7,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from pipelines.app.rooms.handling import queued
+from pipelines.app.rooms.handling import queued, taking_uploads
 from pipelines.app.work import uploads
 from pipelines.app.work.archives import unpack
 from pipelines.app.work.incoming import Incoming, incoming, off_loop, receive
@@ -40,6 +40,7 @@ async def start(request: Request) -> Response:
     return queued(request, task, **arguments)
 
 
+@taking_uploads
 async def upload(request: Request) -> Response:
     """Take a mesh, a material file, or a ZIP of PBR maps, which becomes a folder."""
     session: Session = request.state.session
