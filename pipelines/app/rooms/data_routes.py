@@ -40,13 +40,11 @@ def _folder(request: Request) -> Path:
         InputError: it does not, or is not there.
     """
     root = Path(request.app.state.folder).resolve()
-    try:
+    with suppress(OSError, ValueError):  # too long a name, or one with a zero
         folder = (root / request.query_params.get("folder", ".")).resolve()
-    except (OSError, ValueError) as error:  # too long a name, or one with a zero
-        raise InputError("no such folder") from error
-    if not folder.is_relative_to(root) or not folder.is_dir():
-        raise InputError("no such folder")
-    return folder
+        if folder.is_relative_to(root) and folder.is_dir():
+            return folder
+    raise InputError("no such folder")
 
 
 async def listing(request: Request) -> Response:
