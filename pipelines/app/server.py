@@ -76,6 +76,7 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
         exception_handlers={InputError: _told, ClientDisconnect: _left},
         lifespan=lifespan,
     )
+    app.state.reading = asyncio.Semaphore(2)  # scenes at a time
     app.state.jobs, app.state.sessions, app.state.limits, app.state.folder = jobs, sessions, limits, folder
 
     def close() -> None:

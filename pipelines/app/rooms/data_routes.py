@@ -30,7 +30,6 @@ _PLACE = "shard"
 _DEEP, _MOST = 4, 300
 _SIDE = 96
 _POINTS = 400  # of a learning curve
-_READING = asyncio.Semaphore(2)
 
 
 def _folder(request: Request) -> Path:
@@ -98,7 +97,7 @@ def _row(scene: SceneSpec, folder: Path, failures: list[dict[str, Any]] | None) 
 async def scene(request: Request) -> Response:
     """Send the strip of pictures and the mean radiance of one scene."""
     folder, name = _folder(request), request.query_params.get("id")
-    async with _READING:
+    async with request.app.state.reading:
         found = await asyncio.to_thread(_shown, folder, name)
     return JSONResponse(found)
 

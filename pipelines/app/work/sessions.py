@@ -16,6 +16,13 @@ from pathlib import Path
 from pipelines.app.work.refusals import Refused, spelled
 from render.shared.errors import InputError
 
+try:
+    import fcntl
+except ImportError:  # Windows, where what is left of a killed server stays
+    fcntl = None  # type: ignore[assignment]
+
+_PREFIX = "sdps-pages-"
+_NEW = 3600.0
 COOKIE = "sdps-session"
 _IDLE = 6 * 3600.0
 _MOST = 32  # sessions at once; of those that hold nothing, then of all, the one that was idle longest goes
@@ -120,8 +127,12 @@ class Session:
                 raise Refused("too many sets of photographs are in work; wait until one is done", 503)
             for name in free[: max(surplus, 0)]:
                 aside = self.folder / f".gone-{secrets.token_hex(8)}"
-                with suppress(FileNotFoundError):
+                try:
                     os.rename(self.folder / name, aside)
+                except FileNotFoundError:
+                    pass
+                except OSError:  # somebody reads there, which some systems do not allow; it goes the next time
+                    continue
                 del self._sets[name]
                 gone.append((name, aside))
         return gone
@@ -139,7 +150,9 @@ class Sessions:
     """All sessions of a server, below one temporary folder."""
 
     def __init__(self) -> None:
-        self.folder = Path(tempfile.mkdtemp(prefix="sdps-app-"))
+        self.folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
+        self._held = _hold(self.folder)
+        _remove_left(self.folder.parent)
         self._sessions: dict[str, Session] = {}
         self._lock = threading.Lock()
 
@@ -202,6 +215,9 @@ class Sessions:
     def close(self) -> None:
         """Remove everything."""
         shutil.rmtree(self.folder, ignore_errors=True)
+        if self._held is not None:
+            os.close(self._held)
+            self._held = None
 
 
 def _holds_something(folder: Path) -> bool:
@@ -210,3 +226,28 @@ def _holds_something(folder: Path) -> bool:
             return any(found)
     except OSError:  # it has just been removed
         return False
+
+
+def _hold(folder: Path) -> int | None:
+    """Lock a folder for as long as this process lives; return the handle, None where it is locked or cannot be."""
+    if fcntl is None:
+        return None
+    handle = None
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return handle
+    except OSError:
+        if handle is not None:
+            os.close(handle)
+        return None
+
+
+def _remove_left(parent: Path) -> None:
+    """Remove folders of servers that were killed: no process holds them. One that was made just now may yet be held."""
+    for folder in parent.glob(f"{_PREFIX}*"):
+        with suppress(OSError):
+            handle = _hold(folder) if time.time() - folder.stat().st_mtime > _NEW else None
+            if handle is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+                os.close(handle)

@@ -120,10 +120,10 @@ def test_what_may_be_uploaded_is_what_the_command_reads(client: Client) -> None:
 
 
 @pytest.mark.parametrize("suffix", sorted(SUFFIXES))
-@pytest.mark.parametrize("content", [".png", ".tif", ".jpg", ".exr", ".bmp", ".pgm", ".ppm", ".tga"])
+@pytest.mark.parametrize("content", [".png", ".tif", ".jpg", ".exr", ".bmp", ".pgm", ".ppm", ".tga", ".webp"])
 def test_the_size_is_that_of_the_content_whatever_the_name(tmp_path: Path, content: str, suffix: str) -> None:
     written = tmp_path / f"a{content}"
-    if content == ".tga":
+    if content in (".tga", ".webp"):
         Image.new("RGB", (50, 40)).save(written)
     else:
         folders.write(written, np.zeros((40, 50) if content == ".pgm" else (40, 50, 3)))
@@ -242,3 +242,24 @@ def test_jobs_end_before_the_files_of_their_session_go(tmp_path: Path) -> None:
     sessions.expire(idle=-1.0, ended=lambda token: there.append(session.folder.is_dir()))
     assert there == [True] and not session.folder.exists()
     sessions.close()
+
+
+def test_what_a_killed_server_left_is_removed_and_nothing_of_a_living_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("fcntl")
+    from pipelines.app.work import sessions as module
+
+    monkeypatch.setattr(module.tempfile, "tempdir", str(tmp_path))
+    living = module.Sessions()
+    names = {name: tmp_path / f"{module._PREFIX}{name}" for name in ("killed", "begins")}
+    for folder in (*names.values(), tmp_path / "other"):
+        (folder / "set").mkdir(parents=True)
+    for folder in (living.folder, names["killed"], tmp_path / "other"):
+        os.utime(folder, (0, 0))
+    second = module.Sessions()
+    there = {living.folder, second.folder, names["begins"], tmp_path / "other"}
+    assert {*tmp_path.iterdir()} == there
+    living.close()
+    second.close()
+    assert {*tmp_path.iterdir()} == there - {living.folder, second.folder}
