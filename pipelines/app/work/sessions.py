@@ -7,6 +7,7 @@ import shutil
 import tempfile
 import threading
 import time
+import weakref
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
@@ -151,7 +152,8 @@ class Sessions:
 
     def __init__(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
-        self._held = _hold(self.folder)
+        handle = _hold(self.folder)
+        self._release = weakref.finalize(self, os.close, handle) if handle is not None else lambda: None
         _remove_left(self.folder.parent)
         self._sessions: dict[str, Session] = {}
         self._lock = threading.Lock()
@@ -215,9 +217,7 @@ class Sessions:
     def close(self) -> None:
         """Remove everything."""
         shutil.rmtree(self.folder, ignore_errors=True)
-        if self._held is not None:
-            os.close(self._held)
-            self._held = None
+        self._release()
 
 
 def _holds_something(folder: Path) -> bool:

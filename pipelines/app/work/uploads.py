@@ -133,7 +133,7 @@ def _size(path: Path) -> tuple[int, int]:
 
 @cache
 def _formats() -> list[str]:
-    """Return what Pillow calls the kinds that are read, but TIFF; TGA last, since its files begin with nothing fixed."""
+    """Return what Pillow calls the kinds that are read, but TIFF; TGA last: its files begin with nothing fixed."""
     Image.init()
     known = {Image.registered_extensions().get(suffix) for suffix in PICTURES} & {*Image.OPEN} - {"TIFF"}
     return sorted(filter(None, known), key=lambda name: name == "TGA")
