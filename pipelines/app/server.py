@@ -12,15 +12,17 @@ from pathlib import Path
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.middleware.base import BaseHTTPMiddleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from pipelines.app.rooms import data_routes, photo_routes, studio_routes
+from pipelines.app.rooms.handling import number
 from pipelines.app.work.jobs import Jobs
+from pipelines.app.work.refusals import Refused
 from pipelines.app.work.sessions import COOKIE, Sessions
-from pipelines.app.work.uploads import Limits
+from pipelines.app.work.uploads import BESIDE, PICTURES, Limits, kinds
 from render.shared.errors import InputError
 from render.shared.templates import fill
 
@@ -59,8 +61,8 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
     routes = [
         Route("/", lambda _: RedirectResponse("/photographs")),
         Route("/{room:str}", _page),
-        Route("/jobs/{number:int}", _job),
-        Route("/jobs/{number:int}/cancel", _cancel, methods=["POST"]),
+        Route("/jobs/{number}", _job),
+        Route("/jobs/{number}/cancel", _cancel, methods=["POST"]),
         Mount("/photographs", routes=photo_routes.ROUTES),
         Mount("/studio", routes=studio_routes.ROUTES),
         Mount("/data", routes=data_routes.ROUTES),
@@ -71,9 +73,10 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
         middleware=[
             Middleware(BaseHTTPMiddleware, dispatch=_guard(host)),
         ],
-        exception_handlers={InputError: _told},
+        exception_handlers={InputError: _told, ClientDisconnect: _left},
         lifespan=lifespan,
     )
+    app.state.reading = asyncio.Semaphore(2)  # scenes at a time
     app.state.jobs, app.state.sessions, app.state.limits, app.state.folder = jobs, sessions, limits, folder
 
     def close() -> None:
@@ -85,11 +88,10 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
 
 
 async def _tidy(sessions: Sessions, jobs: Jobs) -> None:
-    """Remove sessions that nobody uses any more."""
+    """Remove sessions that nobody uses any more. Their jobs end first, or would write into folders that are gone."""
     while True:
         await asyncio.sleep(_TIDY)
-        for owner in await asyncio.to_thread(sessions.expire):
-            jobs.forget(owner)
+        await asyncio.to_thread(sessions.expire, ended=jobs.forget)
 
 
 def _guard(host: str) -> Callable[[Request, Callable[[Request], Awaitable[Response]]], Awaitable[Response]]:
@@ -101,7 +103,7 @@ def _guard(host: str) -> Callable[[Request, Callable[[Request], Awaitable[Respon
         name = named.rsplit(":", 1)[0] if not named.endswith("]") else named
         if name not in known and host not in _ANY:
             return JSONResponse({"message": "this name does not belong to this page"}, 403)
-        if request.method != "GET" and request.headers.get("origin") != f"{request.url.scheme}://{named}":
+        if request.method not in ("GET", "HEAD") and request.headers.get("origin") != f"{request.url.scheme}://{named}":
             return JSONResponse({"message": "requests must come from this page"}, 403)
         sessions: Sessions = request.app.state.sessions
         session = sessions.find(request.cookies.get(COOKIE))
@@ -126,24 +128,33 @@ async def _page(request: Request) -> Response:
     if room not in ROOMS:
         return HTMLResponse(fill(HERE / "templates" / "missing.html.j2", rooms=ROOMS, room=""), 404)
     limits: Limits = request.app.state.limits
-    return HTMLResponse(fill(HERE / "templates" / f"{room}.html.j2", rooms=ROOMS, room=room, limits=limits))
+    accepted = ",".join((*PICTURES, *BESIDE, ".zip"))
+    template = HERE / "templates" / f"{room}.html.j2"
+    return HTMLResponse(
+        fill(template, rooms=ROOMS, room=room, limits=limits, accepted=accepted, kinds=kinds()),
+    )  # fmt: skip
 
 
 async def _job(request: Request) -> Response:
     jobs: Jobs = request.app.state.jobs
-    job = jobs.get(request.state.session.token, request.path_params["number"])
+    job = jobs.get(request.state.session.token, number(request, "number"))
     return JSONResponse({"message": "no such job"}, 404) if job is None else JSONResponse(jobs.describe(job))
 
 
 async def _cancel(request: Request) -> Response:
     jobs: Jobs = request.app.state.jobs
-    job = jobs.get(request.state.session.token, request.path_params["number"])
+    job = jobs.get(request.state.session.token, number(request, "number"))
     if job is None:
         return JSONResponse({"message": "no such job"}, 404)
-    await asyncio.to_thread(jobs.cancel, job)
+    jobs.cancel(job)
     return JSONResponse(jobs.describe(job))
 
 
 async def _told(_: Request, error: Exception) -> Response:
-    """Answer a mistake of the user with its one line."""
-    return JSONResponse({"message": str(error)}, 400)
+    """Answer a mistake of the user, or what the server refuses, with its one line."""
+    return JSONResponse({"message": str(error)}, error.status if isinstance(error, Refused) else 400)
+
+
+async def _left(_: Request, error: Exception) -> Response:
+    """End the request of somebody who went away in the middle of it; nobody reads the answer."""
+    return Response(status_code=400)

@@ -184,6 +184,7 @@ class Page:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.app.state.sessions.close()
         self.temporary.cleanup()
 
     def photographs(self, source: Path | None) -> None:

@@ -1,13 +1,15 @@
 """A server of `sdps app` in a thread, and a plain client of it."""
 
+import http.client
 import http.cookiejar
 import json
+import os
 import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +46,37 @@ def application(folder: Path, **limits: int) -> Iterator[tuple[str, Any]]:
         assert not app.state.sessions.folder.exists()
 
 
+def eventually(holds: Callable[[], bool], seconds: float = 10.0) -> bool:
+    """Tell whether something comes true within a time."""
+    until = time.monotonic() + seconds
+    while not (now := holds()) and time.monotonic() < until:
+        time.sleep(0.01)
+    return now
+
+
+def contents(folder: Path) -> dict[str, int]:
+    """Return the files below a folder, by their paths, and their sizes; some may go meanwhile."""
+    found = {}
+    for place, _, names in os.walk(folder):
+        for path in (Path(place) / name for name in names):
+            with suppress(OSError):
+                found[str(path.relative_to(folder))] = path.lstat().st_size
+    return found
+
+
 class Client:
     """A browser's requests: it keeps its cookie and names its origin."""
 
     def __init__(self, address: str, room: str = "photographs") -> None:
         self.address, self.origin = address, address
-        jar = urllib.request.HTTPCookieProcessor(http.cookiejar.CookieJar())
-        self.opener = urllib.request.build_opener(jar)
+        self.cookies = http.cookiejar.CookieJar()
+        self.opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(self.cookies))
         self.get(f"/{room}")
+
+    @property
+    def token(self) -> str:
+        """The name of the session, as `Sessions.find` takes it."""
+        return next(iter(self.cookies)).value
 
     def send(self, method: str, path: str, body: bytes | None = None, **headers: str) -> tuple[int, bytes]:
         """Return status and body."""
@@ -81,6 +106,16 @@ class Client:
             status, body = self.send("PUT", f"{path}/uploads/{file.name}", file.read_bytes())
             assert status == 200, body
         return path
+
+    def begin(self, path: str, size: int) -> http.client.HTTPConnection:
+        """Send the head of an upload of `size` bytes; the caller sends the body, or goes away in the middle of it."""
+        connection = http.client.HTTPConnection(self.address.removeprefix("http://"), timeout=60)
+        connection.putrequest("PUT", path)
+        headers = {"Content-Length": str(size), "Origin": self.origin, "Cookie": f"sdps-session={self.token}"}
+        for key, value in headers.items():
+            connection.putheader(key, value)
+        connection.endheaders()
+        return connection
 
     def wait(self, job: dict[str, Any], seconds: float = 120.0) -> dict[str, Any]:
         """Return the last state of a job."""

@@ -2,8 +2,10 @@
 
 import asyncio
 import json
+import math
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,8 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
+from pipelines.app.rooms.handling import file_inside, queued
+from pipelines.app.work.jobs import finite
 from pipelines.report.sections import FOLDER as REPORT
 from pipelines.report.sections import read_sections
 from pipelines.shared import pictures
@@ -26,7 +30,6 @@ _PLACE = "shard"
 _DEEP, _MOST = 4, 300
 _SIDE = 96
 _POINTS = 400  # of a learning curve
-_READING = asyncio.Semaphore(2)
 
 
 def _folder(request: Request) -> Path:
@@ -36,27 +39,35 @@ def _folder(request: Request) -> Path:
         InputError: it does not, or is not there.
     """
     root = Path(request.app.state.folder).resolve()
-    folder = (root / request.query_params.get("folder", ".")).resolve()
-    if not folder.is_relative_to(root) or not folder.is_dir():
-        raise InputError("no such folder")
-    return folder
+    with suppress(OSError, ValueError):  # too long a name, or one with a zero
+        folder = (root / request.query_params.get("folder", ".")).resolve()
+        if folder.is_relative_to(root) and folder.is_dir():
+            return folder
+    raise InputError("no such folder")
 
 
 async def listing(request: Request) -> Response:
     """Send the data folders and runs there are, newest first."""
     root = Path(request.app.state.folder).resolve()
-    found = await asyncio.to_thread(lambda: sorted(_found(root), reverse=True)[:_MOST])
-    rows = [{"folder": str(path.relative_to(root)), "kind": kind} for _, kind, path in found]
+    rows = await asyncio.to_thread(_rows, root)
     return JSONResponse({"root": str(request.app.state.folder), "rows": rows})
+
+
+def _rows(root: Path) -> list[dict[str, str]]:
+    found = sorted(_found(root), reverse=True)[:_MOST]
+    return [{"folder": str(path.relative_to(root)), "kind": kind} for _, kind, path in found]
 
 
 def _found(root: Path) -> Iterator[tuple[float, str, Path]]:
     for place, folders, files in os.walk(root):
         path = Path(place)
-        if MANIFEST in files:
-            yield (path / MANIFEST).stat().st_mtime, "data", path
-        if REPORT in folders or any((path / "models").glob("*/metrics.jsonl")):
-            yield path.stat().st_mtime, "run", path
+        # Folders may go while they are looked at, and names that are no text cannot be sent.
+        with suppress(OSError, UnicodeEncodeError):
+            place.encode()
+            if MANIFEST in files:
+                yield (path / MANIFEST).stat().st_mtime, "data", path
+            if REPORT in folders or any((path / "models").glob("*/metrics.jsonl")):
+                yield path.stat().st_mtime, "run", path
         deep = len(path.relative_to(root).parts) >= _DEEP
         folders[:] = [] if deep else [name for name in folders if name not in ("shards", "models", REPORT, "log")]
 
@@ -85,43 +96,59 @@ def _row(scene: SceneSpec, folder: Path, failures: list[dict[str, Any]] | None) 
 
 async def scene(request: Request) -> Response:
     """Send the strip of pictures and the mean radiance of one scene."""
-    folder, chosen = _chosen(request)
-    async with _READING:
-        found = await asyncio.to_thread(_strip, folder / chosen.file, chosen)
+    folder, name = _folder(request), request.query_params.get("id")
+    async with request.app.state.reading:
+        found = await asyncio.to_thread(_shown, folder, name)
     return JSONResponse(found)
 
 
+def _shown(folder: Path, name: str | None) -> dict[str, Any]:
+    chosen = _chosen(folder, name)
+    path = folder / chosen.file
+    return _strip(path, chosen, _changed(path))
+
+
 @lru_cache(maxsize=1024)
-def _strip(path: Path, scene: SceneSpec) -> dict[str, Any]:
+def _strip(path: Path, scene: SceneSpec, _time: int) -> dict[str, Any]:
     shard = read_shard(path, scene)
     strip = pictures.fitted(pictures.preview_strip(shard, lights=3), _SIDE)
-    mean = float(shard.images[:, shard.mask].mean(dtype="float64"))
-    return {"picture": pictures.data_uri(strip, quality=82), "radiance": round(mean, 5)}
+    inside = shard.images[:, shard.mask]
+    mean = float(inside.mean(dtype="float64")) if inside.size else math.nan
+    return finite({"picture": pictures.data_uri(strip, quality=82), "radiance": round(mean, 5)})
 
 
-def _chosen(request: Request) -> tuple[Path, SceneSpec]:
-    folder, name = _folder(request), request.query_params.get("id")
-    chosen = next((item for item in _manifest(folder, (folder / MANIFEST).stat().st_mtime) if item.id == name), None)
+def _chosen(folder: Path, name: str | None) -> SceneSpec:
+    """Return a scene of a data folder; of a large one this takes seconds, so not on the event loop.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    chosen = _manifest(folder, _changed(folder / MANIFEST)).get(name or "")
     if chosen is None:
         raise InputError("no such scene")
-    return folder, chosen
+    return chosen
 
 
 @lru_cache(maxsize=4)
-def _manifest(folder: Path, _time: float) -> list[SceneSpec]:
-    return read_manifest(folder)
+def _manifest(folder: Path, _time: int) -> dict[str, SceneSpec]:
+    return {scene.id: scene for scene in read_manifest(folder)}
+
+
+def _changed(path: Path) -> int:
+    """Return when a file was changed, in nanoseconds; 0 where there is none, which its reader then says."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 async def start(request: Request) -> Response:
     """Queue the preparation of a scene for the lamp."""
-    session = request.state.session
-    folder, chosen = _chosen(request)
-    place = session.folder / _PLACE
+    folder = _folder(request)
+    chosen = await asyncio.to_thread(_chosen, folder, request.query_params.get("id"))
+    place = request.state.session.folder / _PLACE
     place.mkdir(exist_ok=True)
-    job = request.app.state.jobs.submit(session.token, "shard", place=str(place), shard=str(folder / chosen.file))
-    if job is None:
-        raise InputError("too many jobs wait; try again in a minute")
-    return JSONResponse(request.app.state.jobs.describe(job))
+    return queued(request, "shard", place=str(place), shard=str(folder / chosen.file))
 
 
 async def file(request: Request) -> Response:
@@ -164,15 +191,18 @@ def _thinned(values: list[list[float]]) -> list[list[float]]:
 async def sections(request: Request) -> Response:
     """Send what was evaluated: text, tables and the names of the pictures."""
     folder = _folder(request)
-    found = await asyncio.to_thread(lambda: [to_plain(section) for _, section in read_sections(folder)])
-    return Response(json.dumps(found), media_type="application/json")
+    return Response(await asyncio.to_thread(_sections, folder), media_type="application/json")
+
+
+def _sections(folder: Path) -> str:
+    return json.dumps(finite([to_plain(section) for _, section in read_sections(folder)]))
 
 
 async def picture(request: Request) -> Response:
     """Send a picture of a section."""
     report = _folder(request) / REPORT
-    path = (report / request.query_params.get("section", "") / request.query_params.get("file", "")).resolve()
-    if not path.is_relative_to(report) or path.suffix not in (".png", ".jpg") or not path.is_file():
+    path = file_inside(report, f"{request.query_params.get('section', '')}/{request.query_params.get('file', '')}")
+    if path is None or path.suffix not in (".png", ".jpg"):
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path)
 

@@ -1,8 +1,8 @@
 """The room "Photographs": uploads, masks, inferences and what they made."""
 
 import asyncio
-import os
-import shutil
+import io
+import threading
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,12 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
+from pipelines.app.rooms.handling import file_inside, number, queued, taking_uploads
 from pipelines.app.work import uploads
+from pipelines.app.work.archives import unpack
+from pipelines.app.work.incoming import Incoming, incoming, names, off_loop, receive
+from pipelines.app.work.jobs import finite
+from pipelines.app.work.refusals import Refused
 from pipelines.app.work.sessions import Session
 from pipelines.app.work.uploads import Limits
 from render.shared.decoding import decoding
@@ -26,91 +31,105 @@ _TASKS = ("example", "check", "infer")
 _MOST_MASK = 32 * 2**20
 _MOST_RUNS = 20
 _MOST_SETS = 12
+_PACKING = threading.Lock()
 
 
 async def new(request: Request) -> Response:
-    """Begin a set of photographs; the oldest above a dozen goes."""
+    """Begin a set of photographs; the one unused for longest goes where there are a dozen."""
     session: Session = request.state.session
-    for old in sorted(session.folder.iterdir(), key=lambda path: path.stat().st_mtime)[: -_MOST_SETS + 1]:
-        session.taken -= sum(path.stat().st_size for path in (old / PHOTOS).glob("*"))
-        await asyncio.to_thread(shutil.rmtree, old, True)
+    gone = session.set_aside(_MOST_SETS - 1, request.app.state.jobs.works_in)
     name = session.new_place()
     (session.folder / name / PHOTOS).mkdir()
+    await off_loop(session.clear, gone)
     return JSONResponse({"set": name})
 
 
+@taking_uploads
 async def upload(request: Request) -> Response:
-    """Take one file, or a ZIP that is unpacked at once."""
+    """Take one file, or a ZIP that is unpacked at once: all of its files or none."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
-    folder = session.place(request.path_params["set"]) / PHOTOS
-    given = request.path_params["name"]
-    room = limits.bytes - session.taken
-    if given.lower().endswith(".zip"):
-        archive = folder.parent / uploads.safe_name(given, (".zip",))
-        session.taken += await uploads.receive_archive(request.stream(), archive, folder, limits, room)
-    else:
-        if len(os.listdir(folder)) >= limits.files:
-            raise InputError(f"more than {limits.files} files; leave some out")
-        path = folder / uploads.safe_name(given)
-        session.taken += await uploads.receive(request.stream(), path, room)
-        try:
-            await asyncio.to_thread(uploads.check_pixels, path, limits)
-        except InputError:
-            path.unlink()
-            raise
-    return JSONResponse({"files": len(os.listdir(folder))})
+    name, given = request.path_params["set"], request.path_params["name"]
+    folder = session.place(name) / PHOTOS
+    zipped = given.lower().endswith(".zip")
+    given = uploads.safe_name(given, (".zip",)) if zipped else uploads.safe_name(given)
+    if len(names(folder)) >= limits.files:
+        raise InputError(f"more than {limits.files} files; leave some out")
+    async with incoming(session, limits.bytes, name) as coming:
+        path = coming.folder / given
+        await receive(request.stream(), path, coming, uploads.most_bytes(given))
+        there = await off_loop(_take_in, coming, path, folder, limits)
+    return JSONResponse({"files": there})
 
 
+def _take_in(coming: Incoming, path: Path, folder: Path, limits: Limits) -> int:
+    """Check what was uploaded, and move it into a set's folder; return how many files lie there then."""
+    if path.suffix.lower() == ".zip":
+        return coming.add(unpack(path, coming.folder / "unpacked", limits, coming), folder, limits.files)
+    uploads.check_pixels(path, limits)
+    return coming.add([path], folder, limits.files)
+
+
+@taking_uploads
 async def paint(request: Request) -> Response:
     """Take a mask painted on the page, a PNG of the photographs' size; an empty body takes the painted one away."""
+    session: Session = request.state.session
     limits: Limits = request.app.state.limits
-    folder = request.state.session.place(request.path_params["set"])
-    incoming = folder / "incoming.png"
-    incoming.unlink(missing_ok=True)
-    try:
-        if await uploads.receive(request.stream(), incoming, _MOST_MASK) == 0:
-            (folder / PAINTED).unlink(missing_ok=True)
-            return JSONResponse({})
-        uploads.check_pixels(incoming, limits)
-        await asyncio.to_thread(_keep_mask, incoming, folder / PAINTED)
-    finally:
-        incoming.unlink(missing_ok=True)
+    name = request.path_params["set"]
+    folder = session.place(name)
+    async with incoming(session, limits.bytes, f"{name}/{PAINTED}") as coming:
+        path = coming.folder / "mask.png"
+        if await receive(request.stream(), path, coming, _MOST_MASK):
+            await off_loop(_keep_mask, coming, path, folder / PAINTED, limits)
+        else:
+            coming.remove(folder / PAINTED)
     return JSONResponse({})
 
 
-def _keep_mask(source: Path, target: Path) -> None:
+def _keep_mask(coming: Incoming, source: Path, target: Path, limits: Limits) -> None:
+    uploads.check_pixels(source, limits)
     with decoding(source.name, "a PNG picture", "paint it again"), Image.open(source, formats=["PNG"]) as image:
         grey = np.asarray(image.convert("L")) > 127
     if not grey.any():
         raise InputError("the mask is empty; paint over the object")
-    with atomic_path(target) as temporary:
-        Image.fromarray(grey.astype(np.uint8) * 255).save(temporary)
+    written = io.BytesIO()
+    Image.fromarray(grey.astype(np.uint8) * 255).save(written, "png")
+    received, made = coming.size, coming.folder / target.name
+    coming.take(len(written.getbuffer()), "the mask: too large")
+    made.write_bytes(written.getbuffer())
+    source.unlink()
+    coming.give(received)
+    coming.put(made, target)
 
 
 async def start(request: Request) -> Response:
     """Queue a task on a set: the example, the checks or an inference."""
     session: Session = request.state.session
     name, task = request.path_params["set"], request.path_params["task"]
-    place = session.place(name)
     if task not in _TASKS:
         raise unknown("task", task, _TASKS)
     asked = await uploads.settings(request.stream()) if task != "example" else {}
+    place = session.place(name)  # looked for after the wait: it may have gone meanwhile
     arguments: dict[str, Any] = {"place": str(place)}
     if task != "example":
         arguments |= {"gamma": _one_of(asked, "gamma", _GAMMAS), "lights": asked.get("lights") is True}
         arguments["frame"] = str(asked.get("frame", "y-up"))[:40]
+    run = None
     if task == "infer":
-        number = max([int(path.name) for path in (place / "runs").glob("*")], default=0) + 1
-        if number > _MOST_RUNS:
+        runs = [int(path.name) for path in (place / "runs").glob("*")]
+        if len(runs) >= _MOST_RUNS:
             raise InputError(f"{_MOST_RUNS} runs on one set are enough here; load the photographs again")
-        (place / "runs" / str(number)).mkdir(parents=True)
-        arguments |= {"number": number, "method": str(asked.get("method", "auto"))[:80]}
+        latest = max(runs, default=0) + 1
+        run = place / "runs" / str(latest)
+        run.mkdir(parents=True)
+        arguments |= {"number": latest, "method": str(asked.get("method", "auto"))[:80]}
         arguments |= {key: asked.get(key) is True for key in ("refine", "anyway", "discontinuities")}
-    job = request.app.state.jobs.submit(session.token, task, **arguments)
-    if job is None:
-        raise InputError("too many jobs wait; try again in a minute")
-    return JSONResponse(request.app.state.jobs.describe(job))
+    try:
+        return queued(request, task, **arguments)
+    except Refused:
+        if run is not None:
+            run.rmdir()
+        raise
 
 
 def _one_of(asked: dict[str, Any], key: str, known: tuple[str, ...]) -> str:
@@ -122,9 +141,8 @@ def _one_of(asked: dict[str, Any], key: str, known: tuple[str, ...]) -> str:
 
 async def file(request: Request) -> Response:
     """Send a file that the session's set holds, and nothing outside it."""
-    folder = request.state.session.place(request.path_params["set"]).resolve()
-    path = (folder / request.path_params["path"]).resolve()
-    if not path.is_relative_to(folder) or not path.is_file():
+    path = file_inside(request.state.session.place(request.path_params["set"]), request.path_params["path"])
+    if path is None:
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path)
 
@@ -134,36 +152,42 @@ async def pixel(request: Request) -> Response:
     view = _run(request) / "view"
     try:
         row, column = (int(request.query_params[key]) for key in ("row", "column"))
-        found = {}
-        for name in ("observed", "model"):
-            if (view / f"{name}.npy").is_file():
-                values = np.load(view / f"{name}.npy", mmap_mode="r")
-                if not (0 <= row < values.shape[0] and 0 <= column < values.shape[1]):
-                    raise InputError("outside the picture")
-                found[name] = np.asarray(values[row, column], np.float64).round(5).tolist()
     except (KeyError, ValueError) as error:
         raise InputError("row and column must be numbers inside the picture") from error
-    return JSONResponse(found)
+    return JSONResponse(finite(await asyncio.to_thread(_measured, view, row, column)))
+
+
+def _measured(view: Path, row: int, column: int) -> dict[str, list[float]]:
+    found = {}
+    for name in ("observed", "model"):
+        if (view / f"{name}.npy").is_file():
+            values = np.load(view / f"{name}.npy", mmap_mode="r")
+            if not (0 <= row < values.shape[0] and 0 <= column < values.shape[1]):
+                raise InputError("outside the picture; row and column must be numbers inside it")
+            found[name] = np.asarray(values[row, column], np.float64).round(5).tolist()
+    return found
 
 
 async def download(request: Request) -> Response:
     """Send everything `sdps infer` wrote as one ZIP."""
     run = _run(request)
     archive = run / "sdps-infer.zip"
-    if not archive.is_file():
-        await asyncio.to_thread(_pack, run / "files", archive)
+    await off_loop(_pack, run / "files", archive)
     return FileResponse(archive, filename=archive.name)
 
 
 def _pack(folder: Path, archive: Path) -> None:
-    with atomic_path(archive) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as opened:
-        for path in sorted(folder.rglob("*")):
-            if path.is_file():
-                opened.write(path, path.relative_to(folder))
+    with _PACKING:  # two who ask for the same would write to the same
+        if archive.is_file():
+            return
+        with atomic_path(archive) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as opened:
+            for path in sorted(folder.rglob("*")):
+                if path.is_file():
+                    opened.write(path, path.relative_to(folder))
 
 
 def _run(request: Request) -> Path:
-    run = request.state.session.place(request.path_params["set"]) / "runs" / str(request.path_params["run"])
+    run = request.state.session.place(request.path_params["set"]) / "runs" / str(number(request, "run"))
     if not (run / "view" / "view.json").is_file():
         raise InputError("that run is no longer here; start it again")
     return run
@@ -175,6 +199,6 @@ ROUTES = [
     Route("/sets/{set}/mask", paint, methods=["PUT"]),
     Route("/sets/{set}/start/{task}", start, methods=["POST"]),
     Route("/sets/{set}/files/{path:path}", file),
-    Route("/sets/{set}/runs/{run:int}/pixel", pixel),
-    Route("/sets/{set}/runs/{run:int}/download", download),
+    Route("/sets/{set}/runs/{run}/pixel", pixel),
+    Route("/sets/{set}/runs/{run}/download", download),
 ]

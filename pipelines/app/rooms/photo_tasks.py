@@ -4,6 +4,7 @@ A set of photographs is a folder with `photos` (what was uploaded), `painted.png
 (thumbnails) and `runs/<number>`, each with `files` (what `sdps infer` writes) and `view`.
 """
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,7 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
 
     folder = Path(place)
     run = folder / "runs" / str(number)
+    _sweep(run)
     shares = _INFERRING | ({"refinement": 40.0} if refine or method.endswith("+refine") else {})
     with together(shares), _ShortPaths(folder):
         stage("reading")
@@ -140,6 +142,13 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
     shown |= {"number": number, "error": _error(folder, result.normals, photos.mask)}
     write_json(run / "view" / "view.json", shown)
     return shown
+
+
+def _sweep(run: Path) -> None:
+    """Remove what earlier runs left that failed or were cancelled; this one's number is above theirs."""
+    for old in run.parent.glob("*"):
+        if int(old.name) < int(run.name) and not (old / VIEW / "view.json").is_file():
+            shutil.rmtree(old, ignore_errors=True)
 
 
 def _error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float | None:

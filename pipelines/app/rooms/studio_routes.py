@@ -1,7 +1,5 @@
 """The room "Studio": scenes, uploads of meshes and materials, and files to keep."""
 
-import asyncio
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +7,13 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
+from pipelines.app.rooms.handling import queued, taking_uploads
 from pipelines.app.work import uploads
+from pipelines.app.work.archives import unpack
+from pipelines.app.work.incoming import Incoming, incoming, off_loop, receive
 from pipelines.app.work.sessions import Session
 from pipelines.app.work.uploads import Limits
-from render.shared.errors import InputError, unknown
+from render.shared.errors import unknown
 
 UPLOADS = "uploads"
 MESHES, MATERIALS = (".ply", ".obj", ".stl", ".off", ".glb"), (".yaml", ".yml", ".binary", ".bsdf", ".zip")
@@ -36,44 +37,31 @@ async def start(request: Request) -> Response:
         arguments = {"place": str(place)} | {name: asked[name] for name in _ASKED if name in asked}
         if task != "scene":
             arguments.pop("direct", None)
-    job = request.app.state.jobs.submit(session.token, task, **arguments)
-    if job is None:
-        raise InputError("too many jobs wait; try again in a minute")
-    return JSONResponse(request.app.state.jobs.describe(job))
+    return queued(request, task, **arguments)
 
 
+@taking_uploads
 async def upload(request: Request) -> Response:
     """Take a mesh, a material file, or a ZIP of PBR maps, which becomes a folder."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
     folder = session.folder / UPLOADS
     folder.mkdir(exist_ok=True)
-    name = uploads.safe_name(request.path_params["name"], MESHES + MATERIALS)
-    if len(list(folder.iterdir())) >= _MOST:
-        raise InputError(f"more than {_MOST} files; load the page anew")
-    room = limits.bytes - session.taken
-    if name.lower().endswith(".zip"):
-        name = Path(name).stem
-        place, incoming = folder / name, session.folder / f"{_PLACE}.zip"
-        for old in (place, incoming):
-            await asyncio.to_thread(_remove, old)
-        place.mkdir()
-        try:
-            session.taken += await uploads.receive_archive(request.stream(), incoming, place, limits, room)
-        except BaseException:
-            shutil.rmtree(place, ignore_errors=True)
-            raise
-    else:
-        await asyncio.to_thread(_remove, folder / name)
-        session.taken += await uploads.receive(request.stream(), folder / name, room)
+    given = uploads.safe_name(request.path_params["name"], MESHES + MATERIALS)
+    name = Path(given).stem if given.lower().endswith(".zip") else given
+    async with incoming(session, limits.bytes, f"{UPLOADS}/{name}") as coming:
+        path = coming.folder / given
+        await receive(request.stream(), path, coming, uploads.most_bytes(given))
+        await off_loop(_take_in, coming, path, folder / name, limits)
     return JSONResponse({"name": name})
 
 
-def _remove(path: Path) -> None:
-    """Remove a file, or a folder of maps, of an earlier upload."""
-    if path.is_dir():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
+def _take_in(coming: Incoming, path: Path, target: Path, limits: Limits) -> None:
+    """Put what was uploaded where the studio looks for it, in place of what had the same name."""
+    if path.suffix.lower() == ".zip":
+        archive, path = path, coming.folder / "maps"
+        unpack(archive, path, limits, coming)
+    coming.put(path, target, _MOST)
 
 
 async def file(request: Request) -> Response:

@@ -75,7 +75,7 @@ def scene(place: str, direct: bool = False, **asked: Any) -> dict[str, Any]:
     view = render.render_view(**_arguments(spec), spp=_SPP, bounces=0 if direct else spec["bounces"])
     if direct:
         stored = read_json(Path(place) / "view.json", "render the scene first")
-        (Path(place) / "direct.bin").write_bytes(_coded(view.images, stored["exposure"]))
+        _write(Path(place) / "direct.bin", _coded(view.images, stored["exposure"]))
         return {}
     exposure = pictures.auto_exposure(view.images, view.mask)
     about = write_basis(Path(place), view.images, view.light_directions, view.normals, view.depth, view.mask, exposure)
@@ -91,17 +91,23 @@ def write_basis(
     `basis.bin`: uint8 images (L, h, w, 3), round(255 sqrt(radiance * exposure / 4)), then `truth.bin`: int8 normals
     (h, w, 3), n * 127, and uint8 depth (h, w), 1 to 255 from far to near, 0 outside the mask.
     """
-    (folder / "basis.bin").write_bytes(_coded(images, exposure))
+    _write(folder / "basis.bin", _coded(images, exposure))
     inside = depth[mask]
     near = 1 + 254 * (depth - inside.min()) / max(float(np.ptp(inside)), 1e-9)
     parts = np.rint(normals * 127).astype(np.int8), np.where(mask, near, 0).astype(np.uint8)
-    (folder / "truth.bin").write_bytes(b"".join(part.tobytes() for part in parts))
+    _write(folder / "truth.bin", b"".join(part.tobytes() for part in parts))
     about = {
         "lights": np.round(lights.astype(float), 5).tolist(), "triangles": triangles(lights), "exposure": exposure,
         "headroom": _HEADROOM, "width": mask.shape[1], "height": mask.shape[0],
     }  # fmt: skip
     write_json(folder / "view.json", about)
     return about
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file at once, since the server may be sending the last scene's at this moment."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
 
 
 def triangles(lights: np.ndarray) -> list[list[int]]:

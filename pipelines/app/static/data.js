@@ -62,7 +62,7 @@ async function measure(row) {
 async function fill(row, figure) {
   await measure(row);
   if (row.picture) figure.querySelector("img").src = row.picture;
-  figure.querySelector(".note").textContent = row.radiance === undefined ? row.reason || row.state : `mean radiance ${row.radiance.toFixed(3)}`;
+  figure.querySelector(".note").textContent = (row.radiance ?? null) === null ? row.reason || row.state : `mean radiance ${row.radiance.toFixed(3)}`;
 }
 
 function tiles() {

@@ -45,8 +45,8 @@ async function example() {
   $("example").disabled = false;
 }
 
-const USABLE = /\.(png|tiff?|jpe?g|exr|txt|json|lp|csv|np[yz]|mat|relight|dome|zip)$/i;
-const usable = (files) => [...files].filter((file) => USABLE.test(file.name) && !file.name.startsWith("."));
+const USABLE = $("files").accept.split(",");
+const usable = (files) => [...files].filter(({ name }) => USABLE.some((suffix) => name.toLowerCase().endsWith(suffix)) && !name.startsWith("."));
 
 async function dropped(transfer) {
   const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);

@@ -5,18 +5,20 @@ running job is cancelled, when it dies, and when it holds more memory than allow
 """
 
 import itertools
+import math
 import multiprocessing
 import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import Any
 
 from pipelines.app.work.app_worker import serve
 
 QUEUED, RUNNING, DONE, FAILED, CANCELLED = "queued", "running", "done", "failed", "cancelled"
+_LIVE = (QUEUED, RUNNING)
 WAITING_LIMIT = 20
 _MEMORY_LIMIT = 4 * 2**30
 """Bytes the worker may hold after a job; above that a fresh one takes its place."""
@@ -53,8 +55,37 @@ class Job:
     began: float = field(default=0.0)
 
 
+class _Worker:
+    """A worker process and the pipe to it. One thread starts it, talks to it and ends it; others may `kill` it."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, other = context.Pipe()
+        self.process: BaseProcess = context.Process(target=serve, args=(other,), name="sdps-app-worker", daemon=True)
+        self.process.start()
+        other.close()
+        self.condemned = False
+
+    def usable(self) -> bool:
+        """Tell whether it can be given a job."""
+        return not self.condemned and self.process.is_alive()
+
+    def kill(self) -> None:
+        """End it without waiting for it."""
+        self.condemned = True
+        self.process.kill()
+
+    def end(self) -> None:
+        """End it and wait for it; the system may take seconds to take back the memory of a large process."""
+        self.kill()
+        self.process.join(5)
+        self.pipe.close()
+
+
 class Jobs:
-    """The queue and its worker. Thread-safe."""
+    """The queue and its worker. Thread-safe; but for `close`, no method waits for a process, so any may be called on
+    the event loop.
+    """
 
     def __init__(self, memory_limit: int = _MEMORY_LIMIT) -> None:
         self._memory_limit = memory_limit
@@ -63,8 +94,7 @@ class Jobs:
         self._waiting: deque[Job] = deque()
         self._changed = threading.Condition()
         self._closed = False
-        self._process: BaseProcess | None = None
-        self._pipe: Connection | None = None
+        self._worker: _Worker | None = None  # set by the thread alone
         self.worker_memory = 0
         """Bytes the worker held after its last job."""
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
@@ -77,7 +107,7 @@ class Jobs:
                 return None
             job = Job(next(self._numbers), owner, task, arguments)
             self._jobs[job.id] = job
-            for old in [key for key, item in self._jobs.items() if item.state not in (QUEUED, RUNNING)][:-_KEPT]:
+            for old in [key for key, item in self._jobs.items() if item.state not in _LIVE][:-_KEPT]:
                 del self._jobs[old]
             self._waiting.append(job)
             self._changed.notify_all()
@@ -87,6 +117,11 @@ class Jobs:
         """Return a job of an owner, None where there is none."""
         job = self._jobs.get(number)
         return job if job is not None and job.owner == owner else None
+
+    def works_in(self, place: Path) -> bool:
+        """Tell whether a job waits or runs that was given a folder as its place."""
+        with self._changed:
+            return any(job.state in _LIVE and job.arguments.get("place") == str(place) for job in self._jobs.values())
 
     def describe(self, job: Job) -> dict[str, Any]:
         """Return the state of a job, JSON ready; `left` is the time left in seconds, None while it is unknown."""
@@ -108,18 +143,22 @@ class Jobs:
                 job.state = CANCELLED
             elif job.state == RUNNING:
                 job.state = CANCELLED
-                self._stop_worker()
+                if self._worker is not None:
+                    self._worker.kill()
 
     def forget(self, owner: str) -> None:
-        """Cancel the jobs of an owner who is gone."""
-        for job in [job for job in self._jobs.values() if job.owner == owner]:
-            self.cancel(job)
+        """Cancel the jobs of an owner who is gone, and keep nothing of them."""
+        with self._changed:
+            for job in [job for job in self._jobs.values() if job.owner == owner]:
+                self.cancel(job)
+                del self._jobs[job.id]
 
     def close(self) -> None:
         """End the worker."""
         with self._changed:
             self._closed = True
-            self._stop_worker()
+            if self._worker is not None:
+                self._worker.kill()
             self._changed.notify_all()
         self._thread.join(10)
 
@@ -129,45 +168,62 @@ class Jobs:
     def _run(self) -> None:
         """Pass jobs to the worker, one after another; the worker starts before the first job, so that it is warm."""
         while True:
+            worker = self._ready()
             with self._changed:
-                if not self._closed and (self._process is None or not self._process.is_alive()):
-                    self._start_worker()
                 while not self._waiting and not self._closed:
                     self._changed.wait()
                 if self._closed:
-                    return
+                    break
+                if worker is None or not worker.usable():  # it may have died while there was nothing to do
+                    continue
                 job = self._waiting.popleft()
                 job.state, job.began = RUNNING, time.monotonic()
-                pipe, process = self._pipe, self._process
-            assert pipe is not None and process is not None
             try:
-                pipe.send((job.task, job.arguments))
-                self._follow(job, pipe, process)
+                worker.pipe.send((job.task, job.arguments))
+                self._follow(job, worker)
             except (EOFError, OSError):
                 self._end(job, FAILED, "the worker ended, perhaps for want of memory; try fewer or smaller pictures")
-            with self._changed:
-                if self.worker_memory > self._memory_limit:
-                    self._stop_worker()
+                worker.kill()
+            if self.worker_memory > self._memory_limit:
+                worker.kill()
+        if worker is not None:
+            worker.end()
 
-    def _follow(self, job: Job, pipe: Connection, process: BaseProcess) -> None:
+    def _ready(self) -> _Worker | None:
+        """Return a worker that can be given a job: the one there is, or a new one; None where none can be started."""
+        old = self._worker
+        if old is not None and old.usable():
+            return old
+        if old is not None:
+            old.end()
+        try:
+            worker = _Worker()
+        except OSError:  # the system has no room for a process now
+            time.sleep(_POLL)
+            return None
+        with self._changed:
+            self._worker, self.worker_memory = worker, 0
+        return worker
+
+    def _follow(self, job: Job, worker: _Worker) -> None:
         """Take in what the worker says of a job until it ends.
 
         Raises:
             EOFError: the worker died.
         """
         while job.state == RUNNING:
-            if not pipe.poll(_POLL):
-                if not process.is_alive():
+            if not worker.pipe.poll(_POLL):
+                if not worker.process.is_alive():
                     raise EOFError
                 continue
-            kind, *values = pipe.recv()
+            kind, *values = worker.pipe.recv()
             if kind == "stage":
                 job.stage, share = values
                 job.share = max(job.share, share)
             elif kind == "failed":
                 self._end(job, FAILED, values[0])
             else:
-                job.result, self.worker_memory = values
+                job.result, self.worker_memory = finite(values[0]), values[1]
                 self._end(job, DONE)
 
     def _end(self, job: Job, state: str, message: str = "") -> None:
@@ -176,18 +232,11 @@ class Jobs:
                 job.message, job.share = message, 1.0
                 job.state = state
 
-    def _start_worker(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, other = context.Pipe()
-        self._process = context.Process(target=serve, args=(other,), name="sdps-app-worker", daemon=True)
-        self._process.start()
-        other.close()
-        self.worker_memory = 0
 
-    def _stop_worker(self) -> None:
-        if self._process is not None and self._process.is_alive():
-            self._process.kill()
-            self._process.join(5)
-        if self._pipe is not None:
-            self._pipe.close()
-        self._process = None
+def finite(value: Any) -> Any:
+    """Return a result with None for numbers that JSON does not have; one of them would make all of it unreadable."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

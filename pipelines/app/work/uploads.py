@@ -1,24 +1,29 @@
-"""What may be uploaded: so many files, bytes and pixels, under harmless names, out of harmless archives."""
+"""What may be uploaded: so many files, bytes and pixels, of these kinds, under harmless names."""
 
-import asyncio
 import re
-import stat
 import struct
-import zipfile
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from render.shared.errors import InputError
 from render.shared.files import parse_json
+from sdps.photos.light_files import SUFFIXES as BESIDE
+from sdps.photos.picture_file import SUFFIXES
 
-PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".exr")
-_BESIDE = (".txt", ".json", ".lp", ".csv", ".npy", ".npz", ".mat", ".relight", ".dome")
+PICTURES = tuple(SUFFIXES)
+"""Suffixes of the pictures that `sdps infer` reads; so does the page."""
 _NAME = re.compile(r"[^\w.,()+ -]+")
-_CHUNK = 2**20
-_EXR_HEADER = 2**16
-_EXR_WINDOW = re.compile(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", re.DOTALL)
+_LONGEST = 200  # bytes of a name; file systems allow 255, and we put something before or after it
+_TEXTS = (*BESIDE, ".yaml", ".yml")
+_MOST_TEXT = 8 * 2**20
+_EXR, _EXR_HEADER = b"\x76\x2f\x31\x01", 2**16
+_EXR_WINDOW = re.compile(rb"(?:dataWindow|displayWindow)\0box2i\0\x10\0\0\0(.{16})", re.DOTALL)
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _MOST_SETTINGS = 64 << 10
 
 
@@ -37,56 +42,17 @@ class Limits:
     pixels: int = 25_000_000
 
 
-def safe_name(name: str, allowed: tuple[str, ...] = PICTURES + _BESIDE) -> str:
-    """Return the last part of a name without odd characters.
+def safe_name(name: str, allowed: tuple[str, ...] = PICTURES + BESIDE) -> str:
+    """Return the last part of a name without odd characters, at most 200 bytes of it.
 
     Raises:
         InputError: another suffix than those allowed, or nothing left.
     """
-    last = _NAME.sub("_", re.split(r"[/\\]", name)[-1]).strip(" .")[-120:].strip(" .")
+    last = _NAME.sub("_", re.split(r"[/\\]", name)[-1]).strip(" .")
+    last = last.encode("utf-8", "replace")[-_LONGEST:].decode("utf-8", "ignore").strip(" .")
     if Path(last).suffix.lower() not in allowed or not Path(last).stem:
         raise InputError(f"{last or 'file'}: cannot be used here; allowed are {', '.join(allowed)}")
     return last
-
-
-async def receive(stream: AsyncIterator[bytes], path: Path, room: int) -> int:
-    """Write a request's body into a new file, and return its bytes; a body above `room` leaves nothing.
-
-    Raises:
-        InputError: more bytes than `room`, or a name that is taken.
-    """
-    size = 0
-    try:
-        with path.open("xb") as handle:
-            async for chunk in stream:
-                size += len(chunk)
-                if size > room:
-                    raise InputError(f"{path.name}: too large; all uploads together may have {_spelled(room)} more")
-                handle.write(chunk)
-    except FileExistsError as error:
-        raise InputError(f"{path.name}: there are two files of this name; rename one") from error
-    except BaseException:
-        path.unlink(missing_ok=True)
-        raise
-    return size
-
-
-async def receive_archive(
-    stream: AsyncIterator[bytes], archive: Path, folder: Path, limits: Limits, room: int
-) -> int:  # fmt: skip
-    """Unpack a request's body, a ZIP, into a folder that is there, and return the bytes of its files.
-
-    Raises:
-        InputError: as `receive`, `unpack` and `check_pixels`.
-    """
-    try:
-        await receive(stream, archive, room)
-        size = await asyncio.to_thread(unpack, archive, folder, limits, room)
-        for path in folder.iterdir():
-            await asyncio.to_thread(check_pixels, path, limits)
-        return size
-    finally:
-        archive.unlink(missing_ok=True)
 
 
 async def settings(stream: AsyncIterator[bytes]) -> dict[str, Any]:
@@ -109,33 +75,15 @@ async def settings(stream: AsyncIterator[bytes]) -> dict[str, Any]:
     return asked
 
 
-def unpack(archive: Path, folder: Path, limits: Limits, room: int) -> int:
-    """Unpack the usable files of a ZIP, without their folders, and return their bytes.
+def most_bytes(name: str) -> int | None:
+    """Return the bytes that a file of this name may have, None for what the session may have: texts are read whole."""
+    return _MOST_TEXT if Path(name).suffix.lower() in _TEXTS else None
 
-    Sizes are counted while reading, since an archive may lie about them.
 
-    Raises:
-        InputError: not a ZIP, nothing usable in it, a name twice, a link, a password, too many files or bytes.
-    """
-    size = count = 0
-    try:
-        with zipfile.ZipFile(archive) as opened:
-            for item in opened.infolist():
-                if item.is_dir() or _hidden(item.filename) or _unusable(item.filename):
-                    continue
-                if stat.S_ISLNK(item.external_attr >> 16):
-                    raise InputError(f"{archive.name}: holds a link; put the files themselves in it")
-                count += 1
-                if count > limits.files:
-                    raise InputError(f"{archive.name}: more than {limits.files} files; leave some out")
-                size += _extract(opened, item, folder / safe_name(item.filename), room - size)
-    except InputError:
-        raise
-    except Exception as error:  # damaged archives end in errors of many kinds: zlib.error, OSError of a seek
-        raise InputError(f"{archive.name}: cannot be unpacked ({error}); make the ZIP again") from error
-    if not count:
-        raise InputError(f"{archive.name}: no pictures in it; put PNG, TIFF, JPEG or EXR files there")
-    return size
+def kinds() -> str:
+    """Return the kinds of pictures in words: PNG, TIFF, ... or EXR."""
+    *others, last = dict.fromkeys(SUFFIXES.values())
+    return f"{', '.join(others)} or {last}"
 
 
 def check_pixels(path: Path, limits: Limits) -> None:
@@ -146,68 +94,58 @@ def check_pixels(path: Path, limits: Limits) -> None:
     """
     if path.suffix.lower() not in PICTURES:
         return
-    width, height = _size(path)
+    try:
+        width, height = _size(path)
+    except Image.DecompressionBombError as error:
+        raise InputError(_too_large(path, "has more pixels than a photograph", limits)) from error
     if width * height > limits.pixels or min(width, height) < 1:
-        raise InputError(
-            f"{path.name}: is {width}x{height} pixels; at most {limits.pixels / 1e6:.0f} million are allowed here, "
-            "scale the pictures down or use `sdps infer`"
-        )
+        raise InputError(_too_large(path, f"is {width}x{height} pixels", limits))
+
+
+def _too_large(path: Path, what: str, limits: Limits) -> str:
+    return (
+        f"{path.name}: {what}; at most {limits.pixels / 1e6:.3g} million are allowed here, scale the pictures down or "
+        "use `sdps infer`"
+    )
 
 
 def _size(path: Path) -> tuple[int, int]:
-    """Return (width, height) that the header tells."""
+    """Return (width, height) that the header tells. The kind is that of the content, whatever the name says."""
     try:
-        if path.suffix.lower() == ".exr":
-            return _exr_size(path)
-        if path.suffix.lower() in (".tif", ".tiff"):
+        with path.open("rb") as opened:
+            head = opened.read(_EXR_HEADER)
+        if head.startswith(_EXR):
+            return _exr_size(head)
+        if head.startswith(_TIFF):
             import tifffile
 
-            with tifffile.TiffFile(path) as opened:
-                page = opened.pages[0]
+            with tifffile.TiffFile(path) as file:
+                page = file.pages[0]
                 return int(page.imagewidth), int(page.imagelength)  # type: ignore[union-attr]
-        from PIL import Image
-
-        with Image.open(path) as image:
+        with Image.open(path, formats=_formats()) as image:
             return image.size
+    except Image.DecompressionBombError:
+        raise
     except Exception as error:  # the libraries' errors on damaged files are of many kinds
         raise InputError(f"{path.name}: is no picture that can be read; save it again") from error
 
 
-def _exr_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of an OpenEXR file's first part, read by hand: its library could take the server down.
+@cache
+def _formats() -> list[str]:
+    """Return what Pillow calls the kinds that are read, but TIFF; TGA last: its files begin with nothing fixed."""
+    Image.init()
+    known = {Image.registered_extensions().get(suffix) for suffix in PICTURES} & {*Image.OPEN} - {"TIFF"}
+    return sorted(filter(None, known), key=lambda name: name == "TGA")
 
-    A header is a magic number and a version, then attributes: name, type, length, value.
+
+def _exr_size(head: bytes) -> tuple[int, int]:
+    """Return the largest (width, height) in an OpenEXR file's headers, read by hand: its library could take us down.
+
+    A header is a magic number and a version, then attributes: name, type, length, value. Each part of a file has one,
+    and pixels may be put into a display window that is larger than the data.
     """
-    with path.open("rb") as opened:
-        found = _EXR_WINDOW.search(opened.read(_EXR_HEADER))
-    if found is None or not found.string.startswith(b"\x76\x2f\x31\x01"):
-        raise ValueError("no dataWindow")
-    left, low, right, high = struct.unpack("<4i", found[1])
-    return right - left + 1, high - low + 1
-
-
-def _extract(opened: zipfile.ZipFile, item: zipfile.ZipInfo, path: Path, room: int) -> int:
-    """Write one file of an archive."""
-    size = 0
-    try:
-        with opened.open(item) as source, path.open("xb") as target:
-            while chunk := source.read(_CHUNK):
-                size += len(chunk)
-                if size > room:
-                    raise InputError(f"{opened.filename and Path(opened.filename).name}: unpacks to too many bytes")
-                target.write(chunk)
-    except FileExistsError as error:
-        raise InputError(f"{path.name}: is twice in the archive, in two folders; send one folder at a time") from error
-    return size
-
-
-def _hidden(name: str) -> bool:
-    return any(part.startswith((".", "__MACOSX")) for part in re.split(r"[/\\]", name) if part not in ("", ".", ".."))
-
-
-def _unusable(name: str) -> bool:
-    return Path(name).suffix.lower() not in PICTURES + _BESIDE
-
-
-def _spelled(size: int) -> str:
-    return f"{size / 2**20:.0f} MiB" if size < 2**30 else f"{size / 2**30:.1f} GiB"
+    windows = [struct.unpack("<4i", found[1]) for found in _EXR_WINDOW.finditer(head)]
+    sizes = [(right - left + 1, high - low + 1) for left, low, right, high in windows]
+    if not sizes or min(min(size) for size in sizes) < 1:
+        raise ValueError("no window")
+    return max(sizes, key=lambda size: size[0] * size[1])

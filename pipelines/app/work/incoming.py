@@ -1,0 +1,219 @@
+"""An upload under way: a folder of its own until all of it is there and checked, and the bytes it takes.
+
+What fails, is refused or is cut off leaves neither files nor bytes behind, and nobody meets half of an upload.
+"""
+
+import asyncio
+import os
+import secrets
+import shutil
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO, TypeVar
+
+from pipelines.app.work.refusals import Refused, full, spelled
+from pipelines.app.work.sessions import Session
+from render.shared.errors import InputError
+
+_BLOCK = 2**20  # bytes written at a time
+_STALLED = 120.0  # seconds without a byte
+_GONE = "that is no longer here; load it again"
+T = TypeVar("T")
+
+
+class Incoming:
+    """One upload. Its methods may be called from any thread.
+
+    Attributes:
+        folder: Of its own, empty at first.
+        size: Bytes that it takes of its session's.
+    """
+
+    def __init__(self, session: Session, most: int, place: str) -> None:
+        """Begin an upload into a place of a session whose uploads may have `most` bytes together."""
+        self.folder = session.folder / f".incoming-{secrets.token_hex(8)}"
+        self.size = 0
+        self._session, self._most, self._place = session, most, place
+
+    def take(self, size: int, what: str) -> None:
+        """Count bytes before they are written.
+
+        Raises:
+            InputError: there is no room for them; the message begins with `what`.
+        """
+        self._session.take(size, self._most, what)
+        self.size += size
+
+    def give(self, size: int) -> None:
+        """Stop counting bytes that were removed."""
+        self._session.give(size)
+        self.size -= size
+
+    def add(self, files: Sequence[Path], folder: Path, most: int) -> int:
+        """Move files into the place's folder, all of them or none, and return how many files lie there then.
+
+        Args:
+            files: Complete and checked.
+            folder: Of the place.
+            most: Files that may lie there.
+
+        Raises:
+            InputError: a name that is taken, too many files, or a place that is gone.
+        """
+        with self._session.lock:
+            there = names(folder)
+            for file in files:
+                if file.name in there:
+                    raise InputError(f"{file.name}: there are two files of this name; rename one")
+            if len(there) + len(files) > most:
+                raise InputError(f"more than {most} files; leave some out")
+            moved: list[Path] = []
+            try:
+                for file in files:
+                    os.rename(file, folder / file.name)
+                    moved.append(file)
+            except OSError:
+                for file in moved:
+                    os.rename(folder / file.name, file)
+                raise
+            self._session.keep(self._place, self.size)
+            self.size = 0
+            return len(there) + len(files)
+
+    def put(self, made: Path, path: Path, most: int | None = None) -> None:
+        """Move a file or a folder to a path, in place of what is there, which is removed with this upload's folder.
+
+        Args:
+            made: Complete and checked.
+            path: Where it comes to; nobody else writes there.
+            most: Entries that the path's folder may have.
+
+        Raises:
+            InputError: too many entries, or a place that is gone.
+        """
+        old = self.folder / f".old-{secrets.token_hex(8)}"
+        with self._session.lock:
+            there = names(path.parent)
+            if most is not None and path.name not in there and len(there) >= most:
+                raise InputError(f"more than {most} files; reuse a name, or restart `sdps app`")
+            if path.name in there:
+                os.rename(path, old)
+            try:
+                os.rename(made, path)
+            except OSError:
+                if old.exists():
+                    os.rename(old, path)
+                raise
+            self.size = self._session.keep(self._place, self.size, replace=True)
+
+    def remove(self, path: Path) -> None:
+        """Remove a file that was put there, if there is one, and stop counting its bytes."""
+        with self._session.lock:
+            path.unlink(missing_ok=True)
+            self.size += self._session.keep(self._place, 0, replace=True)
+
+
+@asynccontextmanager
+async def incoming(session: Session, most: int, place: str) -> AsyncIterator[Incoming]:
+    """Yield an upload; what it has not put in place when it ends is removed, and its bytes are given back.
+
+    Args:
+        session: Whose.
+        most: Bytes that the session's uploads may have together.
+        place: What the bytes are counted for: a set's name, or a path that begins with it.
+    """
+    coming = Incoming(session, most, place)
+    owner = place.split("/")[0]
+    with session.lock:
+        session.under_way[owner] += 1
+    try:
+        with suppress(FileNotFoundError):  # the session has ended; writing there says so
+            coming.folder.mkdir()
+        yield coming
+    except OSError as error:
+        if not session.folder.is_dir():
+            raise InputError(_GONE) from error
+        refusal = full("the upload", error)
+        if refusal is None:
+            raise
+        raise refusal from error
+    finally:
+        try:
+            await off_loop(shutil.rmtree, coming.folder, True)
+        finally:
+            coming.give(coming.size)
+            with session.lock:
+                session.under_way -= Counter([owner])  # which drops those that are zero
+
+
+async def receive(stream: AsyncIterator[bytes], path: Path, coming: Incoming, most: int | None = None) -> int:
+    """Write a request's body into a new file, and return its bytes. They are counted before they are kept anywhere.
+
+    Args:
+        stream: The body.
+        path: In the upload's folder.
+        coming: The upload.
+        most: Bytes that such a file may have.
+
+    Raises:
+        InputError: too many bytes.
+        Refused: no byte came for two minutes.
+    """
+    size, block = 0, bytearray()
+    try:
+        async with asyncio.timeout(_STALLED) as clock:
+            with path.open("xb") as handle:
+                async for chunk in stream:
+                    coming.take(len(chunk), f"{path.name}: too large")
+                    size += len(chunk)
+                    if most is not None and size > most:
+                        raise InputError(f"{path.name}: too large; such a file may have {spelled(most)} here")
+                    block += chunk
+                    if len(block) >= _BLOCK:
+                        await off_loop(_write, handle, bytes(block))
+                        block.clear()
+                    clock.reschedule(asyncio.get_running_loop().time() + _STALLED)
+                await off_loop(_write, handle, bytes(block))
+    except TimeoutError as error:
+        raise Refused(f"{path.name}: nothing came for {_STALLED:.0f} s; send it again", 408) from error
+    return size
+
+
+def _write(handle: BinaryIO, block: bytes) -> None:
+    handle.write(block)
+    handle.flush()
+
+
+def names(folder: Path) -> set[str]:
+    """Return what lies in a place's folder.
+
+    Raises:
+        InputError: the place is gone.
+    """
+    try:
+        return set(os.listdir(folder))
+    except FileNotFoundError as error:
+        raise InputError(_GONE) from error
+
+
+async def off_loop(function: Callable[..., T], *values: object) -> T:
+    """Call a function in a thread. One who is cancelled meanwhile goes on once it has ended, and not before.
+
+    Otherwise what is cleaned up after the call would be cleaned up under its hands.
+    """
+    running = asyncio.ensure_future(asyncio.to_thread(function, *values))
+    cancelled: asyncio.CancelledError | None = None
+    while not running.done():
+        try:
+            await asyncio.shield(running)
+        except asyncio.CancelledError as error:
+            cancelled = error
+        except Exception:  # it is that of the function
+            break
+    if cancelled is not None:
+        if not running.cancelled():
+            running.exception()  # looked at, so that nobody complains that it was not
+        raise cancelled
+    return running.result()
