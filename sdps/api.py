@@ -15,6 +15,7 @@ result.save("out")  # the files of `sdps infer`, but for its report
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,15 +26,18 @@ from tqdm import tqdm
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.core.estimate import Estimate
+from sdps.inference.estimator import check_lights
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
+from sdps.methods.light_witness import complete_intensities, question_lights, see_lights
 from sdps.methods.method import REFINE, Method
 from sdps.methods.parse import by_networks, parse, refined
 from sdps.methods.runner import Runner
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load
 from sdps.photos.doubts import ANYWAY
+from sdps.photos.light_files.light_advice import advise
 from sdps.refinement.trust import FEWEST_IMAGES
 from sdps.surface.inferred import Inference, check_out
 from sdps.training.trainer import TrainingResult
@@ -63,7 +67,8 @@ def infer(
     """Estimate normals and lights of photographs.
 
     Args:
-        photos: Of `load`. Lights they carry are used; intensities they do not carry are then taken as equal.
+        photos: Of `load`. Lights they carry are used, once a network has looked whether they are those of the
+            photographs; of lights without intensities it finds these.
         method: A combination (`sdps`), lights and normals (`lcnet+psfcn`), a normal model or a classical method;
             `auto` for the best there is: a pretrained network, or a classical method where there is none.
         models: Folder of trained runs (`out` of `train`) to take weights from before the pretrained ones.
@@ -82,14 +87,16 @@ def infer(
         InputError: photographs that cannot be used, or a method that is not there or cannot use them, in one line.
     """
     findings = tuple(check(photos)) if findings is None else findings
-    grave = next((finding for finding in findings if finding.level == "error"), None)
-    if grave is not None and not anyway:
-        raise InputError(f"{photos.folder}: {grave.text} ({ANYWAY})")
-    runner = _runner(method, photos.light_directions is not None, models, config, refine, len(photos))
+    _stop(photos, findings, anyway)
     began = time.perf_counter()
-    found = runner.estimate(
-        photos, photos.mask, photos.light_directions, photos.intensities, saturation=photos.saturation
-    )
+    intensities = photos.intensities
+    if photos.light_directions is not None:
+        intensities, more = _questioned(photos, models, config)
+        findings = (*findings, *more)
+        _stop(photos, findings, anyway)
+    known = photos.light_directions is not None, intensities is not None
+    runner = _runner(method, known, models, config, refine, len(photos))
+    found = runner.estimate(photos, photos.mask, photos.light_directions, intensities, saturation=photos.saturation)
     seconds = time.perf_counter() - began
     return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
 
@@ -113,7 +120,8 @@ def estimate(
         mask: (H, W) bool, the object's pixels.
         method: As for `infer`.
         light_directions: (L, 3) known directions from the surface to the light (x right, y up, z to the camera).
-        intensities: (L,) or (L, 3) known intensities, of any overall scale.
+        intensities: (L,) or (L, 3) known intensities, of any overall scale. Where only directions are known, a network
+            finds them.
         models: As for `infer`.
         config: As for `infer`.
         saturation: Radiance from which on a channel is clipped; refinement leaves such observations out.
@@ -126,7 +134,11 @@ def estimate(
         InputError: sizes that do not fit, values that are not finite, an empty mask, or a method that is not there or
             wants lights that are not given.
     """
-    runner = _runner(method, light_directions is not None, models, config)
+    runner = _runner(method, (light_directions is not None, intensities is not None), models, config)
+    if light_directions is not None and intensities is None:
+        check_lights(len(images), light_directions)
+        seen = see_lights(images, mask, _finder(models), config)
+        intensities = complete_intensities(images, mask, light_directions, seen)
     return runner.estimate(images, mask, light_directions, intensities, saturation=saturation)
 
 
@@ -211,40 +223,68 @@ def _finder(models: str | Path | None) -> Callable[[str], Path]:
     return partial(pretrained.require, out=None if models is None else Path(models))
 
 
+def _stop(photos: Photographs, findings: tuple[Finding, ...], anyway: bool) -> None:
+    """Stop at the first grave finding, unless told to go on."""
+    grave = next((finding for finding in findings if finding.level == "error"), None)
+    if grave is not None and not anyway:
+        raise InputError(f"{photos.folder}: {grave.text} ({ANYWAY})")
+
+
+def _questioned(
+    photos: Photographs, models: str | Path | None, config: InferenceConfig | None
+) -> tuple[np.ndarray, tuple[Finding, ...]]:
+    """Ask a network about lights that are given: return intensities, found where none are given, and what it says."""
+    assert photos.light_directions is not None
+    seen = see_lights(photos, photos.mask, _finder(models), config)
+    intensities, fit = question_lights(
+        photos, photos.mask, photos.files, photos.light_directions, photos.intensities, seen
+    )
+    if fit is None:
+        return intensities, ()
+    level, text = advise(fit, photos.files, photos.lights_name, photos.lights_frame)
+    return intensities, (Finding(level, text),)
+
+
 def _runner(
-    method: str, lit: bool, models: str | Path | None, config: InferenceConfig | None, refine: bool | None = False,
-    images: int = 0,
+    method: str, known: tuple[bool, bool], models: str | Path | None, config: InferenceConfig | None,
+    refine: bool | None = False, images: int = 0,
 ) -> Runner:  # fmt: skip
-    """Return the method of an expression with its networks; `lit`: the light directions are known."""
+    """Return the method of an expression with its networks; `known`: light directions, intensities."""
     find = _finder(models)
     plain = method.removesuffix(f"+{REFINE}")
-    chosen = _told(_automatic(lit, find) if plain == AUTO else plain, lit, find)
+    chosen = _adapted(_automatic(known[0], find) if plain == AUTO else plain, known, find)
     if refine is None:
         refine = by_networks(chosen) and images >= FEWEST_IMAGES
     return Runner(refined(chosen) if refine or plain != method else chosen, find, config)
 
 
-def _told(text: str, lit: bool, find: Callable[[str], Path]) -> Method:
-    """Return the method of an expression, told the lights where they are known."""
-    if not lit:
+def _adapted(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> Method:
+    """Return the method of an expression that uses what is known of the lights."""
+    directions, intensities = known
+    if not directions:
         method = parse(text, find)
         if TRUE_LIGHTS in (method.lights, method.intensities):
             raise InputError(
                 f"--method {text}: is told the lights; give them with --lights, or put a lighting model before it, "
                 f"as in lcnet+{text}"
             )
-        return method
+        if intensities and not by_networks(method):
+            _log.warning("%s finds the intensities itself; those given are not used", text)
+        return replace(method, intensities=TRUE_LIGHTS) if intensities and by_networks(method) else method
     if "+" not in text and text in classical.METHODS and not classical.METHODS[text].calibrated:
         _log.warning("%s finds the lights itself; those given are not used", text)
         return parse(text, find)
-    return parse(text if "+" in text else f"{TRUE_LIGHTS}+{text}", find)
+    method = parse(text if "+" in text else f"{TRUE_LIGHTS}+{text}", find)
+    if method.lights != TRUE_LIGHTS:
+        _log.warning("%s finds the lights itself; those given are not used", text)
+    return method
 
 
 def _automatic(lit: bool, find: Callable[[str], Path]) -> str:
     """Return the best method whose weights are there."""
     for name in _CALIBRATED if lit else _LEARNED:
         try:
-            _told(name, lit, find)
+            _adapted(name, (lit, False), find)
         except InputError:
             continue
         return name

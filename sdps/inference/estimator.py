@@ -169,7 +169,7 @@ class Estimator(InferenceConfig):
         self, images: ImageSource, mask: np.ndarray, lights: np.ndarray | None, intensities: np.ndarray | None
     ) -> tuple[ObjectImages, _Known, dict[str, Any]]:
         """Check the arguments of `estimate`; return the object's images, what is known, and the first diagnostics."""
-        _check_lights(len(images), lights, intensities)
+        check_lights(len(images), lights, intensities)
         scene = survey(images, mask, self.margin_of(mask.shape), stray=self.stray_light)
         precision = self.arithmetic.precision
         diagnostics: dict[str, Any] = {"precision": precision, "stray_light": scene.stray, "exposure": {}}
@@ -377,8 +377,17 @@ def _concluded(normals: np.ndarray, lights: Lights | _Known, began: float, diagn
     )
 
 
-def _check_lights(count: int, lights: np.ndarray | None, intensities: np.ndarray | None) -> None:
-    """Refuse lights that cannot be those of `count` images, in one line."""
+def check_lights(count: int, lights: np.ndarray | None, intensities: np.ndarray | None = None) -> None:
+    """Refuse lights that cannot be those of `count` images.
+
+    Args:
+        count: L.
+        lights: (L, 3) directions.
+        intensities: (L,) or (L, 3).
+
+    Raises:
+        InputError: another shape, a direction of no length, or an intensity that is not positive.
+    """
     if lights is not None and np.shape(lights) != (count, 3):
         raise InputError(f"{count} images need light directions of shape ({count}, 3), got {np.shape(lights)}")
     if lights is not None:

@@ -14,7 +14,7 @@ from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 from sdps.photos.doubts import Doubts
 from sdps.photos.gamma import resolve_gamma
-from sdps.photos.light_files import Lights, find_lights, read_intensities, read_lights
+from sdps.photos.light_files.light_choice import known_lights
 from sdps.photos.listing import find_mask, list_pictures
 from sdps.photos.masks import Variation, automatic_mask, read_mask
 from sdps.photos.picture_file import Coding, Picture, decode, turned
@@ -44,6 +44,8 @@ class Photographs:
         coding: Kind and depth of the files.
         orientation: EXIF orientation tag that all pictures were turned by.
         overridden: Faults that would have stopped `load`, but for `anyway`.
+        lights_name: Name of the file of the directions; empty without one.
+        lights_frame: The frame flag it was read with; empty where the file states its own frame.
     """
 
     folder: Path
@@ -59,6 +61,8 @@ class Photographs:
     coding: Coding
     orientation: int
     overridden: tuple[str, ...] = ()
+    lights_name: str = ""
+    lights_frame: str = ""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -104,8 +108,9 @@ def load(
         folder: PNG, TIFF, JPEG or EXR files of one kind and size, and what may lie beside them.
         mask: A picture, bright where the object is; None for the folder's mask.* or, without one, an automatic mask.
         lights: A lights file (docs/guides/capture.md), or `folder` for that of the folder; None for unknown lights.
-        intensities: A file of intensities, or `folder` for its light_intensities.txt; None for those of `lights`.
-        frame: Axes of the lights file: y-up, y-down, x-left, z-away, several joined by commas.
+        intensities: A file of intensities, `folder` for its light_intensities.txt, or `equal`; None for those of
+            `lights`, which are found from the photographs where it has none.
+        frame: Axes of the lights file: y-up, y-down, x-left, z-away, xy-swapped, several joined by commas.
         gamma: linear, srgb, the exponent of a power curve, or auto by kind of file and colour profile.
         names: Files or glob patterns to use, in this order; one that begins with `!` leaves files out.
         anyway: Go on where a check stops although one could: values that are not finite in the mask, pictures that
@@ -118,11 +123,12 @@ def load(
     files, notes = list_pictures(folder, names)
     doubts = Doubts(anyway)
     survey = _survey(folder, files, gamma, find_mask(folder) if mask is None else Path(mask), doubts)
-    directions, strengths, told = _lights(folder, files, lights, intensities, frame, doubts)
+    known = known_lights(folder, files, lights, intensities, frame, doubts)
     photos = Photographs(
         folder=folder, files=files, shape=survey.mask.shape, bits=survey.coding.bits, gamma=survey.gamma,
-        mask=survey.mask, mask_origin=survey.origin, light_directions=directions, intensities=strengths,
-        notes=(*notes, *survey.notes, *told), coding=survey.coding, orientation=survey.orientation,
+        mask=survey.mask, mask_origin=survey.origin, light_directions=known.directions, intensities=known.intensities,
+        lights_name=known.name, lights_frame=known.frame, notes=(*notes, *survey.notes, *known.notes),
+        coding=survey.coding, orientation=survey.orientation,
         overridden=tuple(doubts.overridden),
     )  # fmt: skip
     if photos.mask_origin == "automatic" and photos.mask.all():
@@ -210,40 +216,3 @@ def _orientation_note(first: int, turns: set[int]) -> list[str]:
             "the pictures' orientation tags differ, as happens when the camera looks down; all were turned as the first"
         ]
     return [] if first == 1 else ["all pictures were turned upright as their orientation tag says"]
-
-
-def _lights(
-    folder: Path,
-    files: tuple[str, ...],
-    lights: str | Path | None,
-    intensities: str | Path | None,
-    frame: str,
-    doubts: Doubts,
-) -> tuple[np.ndarray | None, np.ndarray | None, tuple[str, ...]]:
-    """Read directions and intensities where asked for; frame flags without lights are checked all the same."""
-    directions = strengths = None
-    notes: tuple[str, ...] = ("lights are unknown and will be estimated, where the method can",)
-    asked = (find_lights(folder) or lights) if str(lights) == "folder" else lights
-    path = _beside(folder, asked, ("lights.json", "light_directions.txt"))
-    if path is not None:
-        read: Lights = read_lights(path, files, frame, doubts)
-        directions, strengths, notes = read.directions, read.intensities, read.notes
-    second = _beside(folder, intensities, ("light_intensities.txt",))
-    if second is None and path is not None and path.name == "light_directions.txt" and str(lights) == "folder":
-        second = path.with_name("light_intensities.txt") if path.with_name("light_intensities.txt").is_file() else None
-    if second is not None:
-        if strengths is not None and path is not None:
-            raise InputError(f"{second}: {path.name} holds intensities as well; keep those of one file")
-        strengths = read_intensities(second, files)
-        notes = (*notes, f"intensities are those of {second.name}")
-    return directions, strengths, notes
-
-
-def _beside(folder: Path, asked: str | Path | None, known: tuple[str, ...]) -> Path | None:
-    """Resolve `folder` to the first known file of the folder."""
-    if asked is None or str(asked) != "folder":
-        return None if asked is None else Path(asked)
-    found = next((folder / name for name in known if (folder / name).is_file()), None)
-    if found is None:
-        raise InputError(f"{folder}: no {' or '.join(known)} in it; give the file's path")
-    return found

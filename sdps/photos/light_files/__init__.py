@@ -11,16 +11,14 @@ from typing import Protocol
 
 import numpy as np
 
-from render.shared.errors import InputError, listed, unknown
+from render.shared.errors import InputError, listed
 from render.shared.files import write_json
 from sdps.photos.light_files.light_columns import split_columns, upright
+from sdps.photos.light_files.light_frame import frame_matrix
 from sdps.photos.light_files.light_json import FRAME
 from sdps.photos.light_files.light_names import in_order, join_split_names, take_numbers
 from sdps.photos.light_files.light_reading import read_table
 from sdps.photos.light_files.light_table import INTENSITIES, LIGHTS, Table
-
-FLAGS = {"y-up": (1, 1, 1), "y-down": (1, -1, 1), "x-left": (-1, 1, 1), "z-away": (1, 1, -1)}
-"""Axes of a lights file that point another way than ours, and the signs that turn them."""
 
 SUFFIXES = (".txt", ".lp", ".csv", ".tsv", ".dat", ".npy", ".npz", ".mat", ".json", ".relight", ".dome")
 """Of files in a folder of photographs that may be lights; a file that is named may have any."""
@@ -45,11 +43,13 @@ class Lights:
         directions: (L, 3) float32.
         intensities: (L,) or (L, 3) float32; None where the file has none.
         notes: Plain sentences about what was done.
+        own_frame: The file states its axes, so that no flag may turn them.
     """
 
     directions: np.ndarray
     intensities: np.ndarray | None
     notes: tuple[str, ...]
+    own_frame: bool = False
 
 
 def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up", doubts: Stops | None = None) -> Lights:
@@ -60,8 +60,8 @@ def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up", dou
             the pictures' order, or the same transposed; angles in degrees under a heading `azimuth elevation` or
             `slant tilt`; .npy, .npz, .mat; lights.json, or JSON of Meshroom or RelightLab (docs/guides/capture.md).
         files: Names of the pictures, (L,).
-        frame: Axes of the file: y-up, y-down, x-left, z-away, several joined by commas. With Meshroom's JSON, how it
-            differs from Meshroom's axes.
+        frame: Axes of the file: y-up, y-down, x-left, z-away, xy-swapped, several joined by commas. With Meshroom's
+            JSON, how it differs from Meshroom's axes.
         doubts: What becomes of lights that are not above the horizon, or may not belong to their pictures; None
             refuses them.
 
@@ -70,15 +70,15 @@ def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up", dou
             intensity that is not positive, an unknown frame.
     """
     path = Path(path)
-    signs = parse_frame(frame)
+    turn = frame_matrix(frame)
     table, own = read_table(path, files, LIGHTS)
-    if own and signs != (1, 1, 1):
+    if own and (turn != np.eye(3)).any():
         raise InputError(f"{path}: lights.json states its own frame; leave the frame flag {frame!r} out")
-    signs = tuple(np.multiply(signs, table.signs).tolist())
+    axes = turn * table.signs  # the file's own axes first
     if table.doubt:
         _stop(doubts, table.doubt)
-    vectors, strengths, said = _ordered(path, table, files, signs)
-    vectors = vectors * signs
+    vectors, strengths, said = _ordered(path, table, files, axes.sum(axis=1).tolist())
+    vectors = vectors @ axes.T
     lengths = np.linalg.norm(vectors, axis=1)
     zero = [file for file, length in zip(files, lengths, strict=True) if length < 1e-9]
     if zero:
@@ -89,11 +89,12 @@ def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up", dou
         )
     directions = vectors / lengths[:, None]
     _refuse_behind(path, directions, files, frame, doubts)
-    axes = f", axes {frame}" if table.signs == (1, 1, 1) else f", turned by {frame}" if signs != table.signs else ""
-    notes = [f"lights are those of {path.name}{axes}", *said]
+    turned = f", turned by {frame}" if (turn != np.eye(3)).any() else ""
+    how = f", axes {frame}" if table.signs == (1, 1, 1) else turned
+    notes = [f"lights are those of {path.name}{how}", *said]
     if np.abs(lengths - 1).max() > _LENGTH:
         notes.append(f"light vectors had lengths from {lengths.min():.4g} to {lengths.max():.4g}; they were normalised")
-    return Lights(directions.astype(np.float32), _intensities(path, strengths, files), tuple(notes))
+    return Lights(directions.astype(np.float32), _intensities(path, strengths, files), tuple(notes), own)
 
 
 def read_intensities(path: str | Path, files: Sequence[str]) -> np.ndarray:
@@ -153,22 +154,6 @@ def write_lights(
         for name, direction, value in zip(names, np.asarray(directions, np.float64), values, strict=True)
     ]
     write_json(path, {"frame": FRAME, "images": rows})
-
-
-def parse_frame(frame: str) -> tuple[int, int, int]:
-    """Return the signs of x, y and z that turn vectors of a frame into ours.
-
-    Raises:
-        InputError: an unknown flag, or y-up with y-down.
-    """
-    flags = [flag.strip().lower() for flag in str(frame).split(",") if flag.strip()]
-    for flag in flags:
-        if flag not in FLAGS:
-            raise unknown("frame", flag, FLAGS)
-    if {"y-up", "y-down"} <= set(flags):
-        raise InputError(f"frame {frame!r} says both y-up and y-down; keep one")
-    x, y, z = np.prod([FLAGS[flag] for flag in {*flags}] or [(1, 1, 1)], axis=0).tolist()
-    return x, y, z
 
 
 def _ordered(

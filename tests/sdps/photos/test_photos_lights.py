@@ -9,7 +9,8 @@ import pytest
 
 from render.shared.errors import InputError
 from sdps import photos
-from sdps.photos.light_files import FRAME, parse_frame, read_intensities, read_lights
+from sdps.photos.light_files import FRAME, read_intensities, read_lights
+from sdps.photos.light_files.light_frame import frame_matrix, frame_name
 
 FILES = ("a 1.png", "b.png", "c.png")
 LIGHTS = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [0.0, -0.28, 0.96]])
@@ -58,7 +59,8 @@ def test_lights_json_comes_back_as_written(tmp_path: Path) -> None:
      ("x-left,y-up", (-1, 1, 1)), ("x-left,y-down,z-away", (-1, -1, -1)), ("y-down,y-down", (1, -1, 1))],
 )  # fmt: skip
 def test_frames(tmp_path: Path, frame: str, signs: tuple[int, int, int]) -> None:
-    assert parse_frame(frame) == signs
+    assert (frame_matrix(frame) == np.diag(signs)).all()
+    assert frame_matrix(frame_name(frame_matrix(frame))).tolist() == np.diag(signs).tolist()
     path = tmp_path / "lights.txt"
     np.savetxt(path, LIGHTS * signs)
     np.testing.assert_allclose(read_lights(path, FILES, frame).directions, LIGHTS, atol=1e-6)

@@ -1,0 +1,94 @@
+"""Asking a lighting network about photographs whose lights are given, in whole or in part."""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from render.shared.errors import InputError
+from sdps.core.estimate import Estimate
+from sdps.inference.image_source import ImageSource
+from sdps.inference.inference_config import InferenceConfig
+from sdps.methods.given_lights import LightFit, compare_lights, find_intensities, reduce_images
+from sdps.methods.method import Method
+from sdps.methods.runner import Runner
+from sdps.models.registry import COMBINATIONS
+
+_ASKED = ("sdps-frames", "sdps-plus", "sdps")
+"""Combinations whose lighting network is asked, the first whose weights are there."""
+_FEWEST = 3
+
+_log = logging.getLogger(__name__)
+
+
+def see_lights(
+    images: ImageSource, mask: np.ndarray, find: Callable[[str], Path], config: InferenceConfig | None = None
+) -> Estimate | None:
+    """Return the lights a network finds in images, as if none were given; None where no weights are there.
+
+    Args:
+        images: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time.
+        mask: (H, W) bool.
+        find: Gives the weights file of a name, or raises InputError.
+        config: How networks are used.
+    """
+    for name in _ASKED:
+        pair = COMBINATIONS[name]
+        try:
+            find(pair.lighting)
+        except InputError:
+            continue
+        method = Method(name=pair.lighting, lights=pair.lighting, light_views=pair.light_views)
+        return Runner(method, find, config).estimate(images, mask, None, None)
+    return None
+
+
+def complete_intensities(
+    images: ImageSource, mask: np.ndarray, directions: np.ndarray, seen: Estimate | None
+) -> np.ndarray:
+    """Return intensities (L,) float32 of lights of which only the directions (L, 3) are known.
+
+    Args:
+        images, mask: As for `see_lights`.
+        directions: Of any length but zero.
+        seen: What a network finds; equal intensities are the start without one.
+    """
+    start = np.ones(len(images)) if seen is None else seen.intensities
+    return find_intensities(reduce_images(images, mask), _unit(directions), start)
+
+
+def question_lights(
+    images: ImageSource,
+    mask: np.ndarray,
+    files: tuple[str, ...],
+    directions: np.ndarray,
+    intensities: np.ndarray | None,
+    seen: Estimate | None,
+) -> tuple[np.ndarray, LightFit | None]:
+    """Look whether given lights are those of the images, and find the intensities where these are not given.
+
+    Args:
+        images, mask: As for `see_lights`.
+        files: (L,) names of the images.
+        directions: (L, 3), as given.
+        intensities: (L,) or (L, 3), or None.
+        seen: What a network finds.
+
+    Returns:
+        The intensities, those given or those found, and how the lights fit; None where nothing can be said.
+    """
+    directions = _unit(directions)
+    reduced = reduce_images(images, mask)
+    if intensities is None:
+        start = np.ones(len(images)) if seen is None else seen.intensities
+        intensities = find_intensities(reduced, directions, start)
+    if seen is None or len(files) < _FEWEST:
+        return intensities, None
+    grey = np.asarray(intensities, np.float64).reshape(len(files), -1).mean(axis=1)
+    return intensities, compare_lights(reduced, files, directions, grey / grey.mean(), seen.light_directions)
+
+
+def _unit(directions: np.ndarray) -> np.ndarray:
+    vectors = np.asarray(directions, np.float64)
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
