@@ -8,7 +8,8 @@ import trimesh
 
 from render import shapes
 from render.shapes.geometry import mesh as mesh_module
-from render.shapes.geometry.mesh import TriangleMesh, load_mesh, vertex_normals
+from render.shapes.geometry.mesh import TriangleMesh, vertex_normals
+from render.shapes.geometry.mesh_file import load_mesh
 from render.shared.errors import InputError
 from render.shared.seeds import generator
 
