@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from render.shapes.files.mesh_file import load_mesh
 from render.shapes.geometry.mesh import TriangleMesh, unit
-from render.shapes.geometry.mesh_file import load_mesh
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, cache_folder
 

@@ -10,7 +10,7 @@ from render.materials import library
 from render.materials.kernels.textures import cover, projections
 from render.materials.textures import map_folder
 from render.materials.textures.map_folder import find, read
-from render.shapes.geometry.mesh_file import load_mesh
+from render.shapes.files.mesh_file import load_mesh
 from render.shared.errors import InputError
 
 

@@ -13,10 +13,11 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 
-from render.shapes.geometry import creases, gltf_file, obj_file
+from render.shapes.files import gltf_file, obj_file, off_file, ply_file, stl_file
+from render.shapes.files.corners import Corners
+from render.shapes.files.strips import from_strips
+from render.shapes.geometry import creases
 from render.shapes.geometry.mesh import TriangleMesh, vertex_normals, with_area, without_unused
-from render.shapes.geometry.obj_file import Corners
-from render.shapes.geometry.strips import from_strips
 from render.shapes.geometry.windings import outward
 from render.shared.decoding import decoding, largest_unpacked
 from render.shared.errors import InputError
@@ -24,6 +25,7 @@ from render.shared.errors import InputError
 _GRID_BITS = 20  # positions on the same point of a grid of 2^20 steps over the mesh are one vertex
 _FARTHEST = 10  # extents from the origin, beyond which float32 would coarsen the shape
 _SIZES = (1e-12, 1e12)  # extents that float32 arithmetic bears
+_READERS = {"obj": obj_file.read, "off": off_file.read, "ply": ply_file.read}  # the last only where it has to
 _DOUBLE_SIDED = 0.9  # share of triangles with a copy that is wound the other way
 
 
@@ -45,7 +47,7 @@ def load_mesh(path: str | Path, *, smooth: bool = False) -> TriangleMesh:
         raise InputError(f"{path}: no such mesh file")
     try:
         with decoding(path, "a mesh", "export it again"), _quiet():
-            return _mesh(_read(path), str(path), smooth)
+            return _mesh(_read(path, smooth), smooth)
     except InputError as error:
         message = str(error)
         if message.startswith(str(path)):
@@ -69,7 +71,10 @@ def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh") -> TriangleMesh:
         InputError: no triangles, or non-finite positions.
     """
     faces = np.asarray(mesh.faces, np.int64)
-    return _mesh(Corners(np.asarray(mesh.vertices, np.float64), faces, _corner_uv(mesh)), name, False)
+    try:
+        return _mesh(Corners(np.asarray(mesh.vertices, np.float64), faces, _corner_uv(mesh)), False)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
 
 
 @contextmanager
@@ -97,26 +102,29 @@ class _Beside(trimesh.resolvers.FilePathResolver):
             return super().get(unquote(name))
 
 
-def _read(path: Path) -> Corners:
+def _read(path: Path, smooth: bool) -> Corners:
     """Read a mesh file; one that is compressed by gzip, as in `bunny.ply.gz`, is unpacked in memory."""
     packed = path.suffix.lower() == ".gz"
     kind = Path(path.stem if packed else path.name).suffix[1:].lower()
-    data = None
+    if kind not in trimesh.available_formats():
+        named = f"a .{kind} file" if kind else "a file without an ending such as .glb"
+        raise InputError(f"is {named}, which is not read; export it as .glb, .obj, .ply or .stl")
     if packed:
         with gzip.open(path) as file:
             data = file.read(largest_unpacked(path) + 1)
         if len(data) > largest_unpacked(path):
-            raise InputError(f"{path}: unpacks to more than a file of this size can hold; unpack it by hand")
-    elif kind in ("obj", "gltf", "glb"):
-        data = path.read_bytes()
-    if kind == "obj" and data is not None:
-        return obj_file.read(data)
-    if kind in ("gltf", "glb") and data is not None:
-        gltf_file.check(data, None if packed else path.parent)
-    if packed:
-        scene = trimesh.load_scene(io.BytesIO(data or b""), file_type=kind, process=False)
+            raise InputError("unpacks to more than a file of this size can hold; unpack it by hand")
     else:
-        scene = trimesh.load_scene(path, process=False, resolver=_Beside(str(path)))
+        data = path.read_bytes()
+    if kind in ("gltf", "glb"):
+        gltf_file.check(data, None if packed else path.parent)
+    elif kind == "stl":
+        data = stl_file.checked(data)
+    found = None if smooth or kind not in _READERS else _READERS[kind](data)
+    if found is not None:
+        return found
+    beside = None if packed else _Beside(str(path))
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, resolver=beside)
     return _joined([_corners(part) for part in _placed(scene)])
 
 
@@ -169,21 +177,21 @@ def _joined(parts: list[Corners]) -> Corners:
     )
 
 
-def _mesh(found: Corners, name: str, smooth: bool) -> TriangleMesh:
+def _mesh(found: Corners, smooth: bool) -> TriangleMesh:
     """Weld, clean, wind and shade triangles."""
     if not len(found.faces):
-        raise InputError(f"{name}: contains no triangles; export it as a surface mesh")
+        raise InputError("contains no triangles; export it as a surface mesh")
     vertices, faces = without_unused(found.vertices, found.faces)
     if not np.isfinite(vertices).all():
         count = int((~np.isfinite(vertices)).any(1).sum())
-        raise InputError(f"{name}: {count} of {len(vertices)} vertices are not finite; repair the file")
+        raise InputError(f"{count} of {len(vertices)} vertices are not finite; repair the file")
     vertices = vertices if smooth else _within_float32(vertices)
     merged, faces = _merged(vertices, faces) if smooth else _welded(vertices, faces)
     kept = with_area(merged, faces)
     if not smooth:
         kept &= _first_of_copies(faces, kept)
     if not kept.any():
-        raise InputError(f"{name}: all of its {len(faces)} triangles are degenerate: they have no area")
+        raise InputError(f"all of its {len(faces)} triangles are degenerate: they have no area")
     merged, faces = without_unused(merged, faces[kept])
     wound = outward(merged, faces)
     moved = (wound[:, :, None] == faces[:, None, :]).argmax(2)[..., None]  # winding the other way moves corners

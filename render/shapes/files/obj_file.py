@@ -10,29 +10,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from render.shapes.geometry.polygons import triangles
+from render.shapes.files.corners import Corners, of_polygons
 from render.shared.errors import InputError
 
 _BLOCK = 1 << 16  # faces turned into numbers together
 _MISSING = ("/0/0", "/0", "")  # to be added to a corner with no, one or two slashes
 _CONTINUED = re.compile(r"^([ \t]*(?:v|vn|vt|f|fo)[ \t][^\n]*?)\\[ \t]*\n", re.M)
-
-
-@dataclass(frozen=True)
-class Corners:
-    """Triangles with what the file says of their corners.
-
-    Attributes:
-        vertices: (V, 3) float64.
-        faces: (F, 3) int64.
-        uv: (F, 3, 2) float64, v up; None where a face has none.
-        normals: (F, 3, 3) float64, NaN at corners without; None for a file without.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray | None = None
-    normals: np.ndarray | None = None
 
 
 @dataclass
@@ -61,12 +44,9 @@ def read(data: bytes) -> Corners:
         raise InputError(
             f"a face names vertex {table[bad, 0][0]}, but the file holds 1 to {len(vertices)}; repair the file"
         )
-    places = triangles(vertices[table[:, 0] - 1], counts)
-    index = table[places]
-    coordinates, normals = _numbers("vt", found.vt, 1), _numbers("vn", found.vn, 3)
-    return Corners(
-        vertices, index[..., 0] - 1, _looked_up(coordinates, index[..., 1], True), _looked_up(normals, index[..., 2])
-    )
+    uv = _looked_up(_numbers("vt", found.vt, 1), table[:, 1])
+    normals = _looked_up(_numbers("vn", found.vn, 3), table[:, 2])
+    return of_polygons(vertices, table[:, 0] - 1, counts, None if uv is None or np.isnan(uv).any() else uv, normals)
 
 
 def _statements(data: bytes) -> _Statements:
@@ -158,9 +138,7 @@ def _parsed(rows: list[str], dtype: type) -> np.ndarray | None:
             return None
 
 
-def _looked_up(values: np.ndarray, index: np.ndarray, whole: bool = False) -> np.ndarray | None:
-    """Return values by their number (F, 3), NaN where it is 0 or out of range; None for none, or when not `whole`."""
+def _looked_up(values: np.ndarray, index: np.ndarray) -> np.ndarray | None:
+    """Return values by their number (N,), NaN where it is 0 or out of range; None where all are."""
     there = (index >= 1) & (index <= len(values))
-    if not there.any() or (whole and not there.all()):
-        return None
-    return np.where(there[..., None], values[np.where(there, index - 1, 0)], np.nan)
+    return np.where(there[:, None], values[np.where(there, index - 1, 0)], np.nan) if there.any() else None
