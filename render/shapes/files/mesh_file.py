@@ -81,14 +81,14 @@ def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh") -> TriangleMesh:
 def _quiet() -> Iterator[None]:
     """Keep what trimesh and numpy say of a file from the console: it is refused in one line, or can be used."""
     log = logging.getLogger("trimesh")
-    was = log.disabled
-    log.disabled = True
+    was = log.level
+    log.setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             yield
     finally:
-        log.disabled = was
+        log.setLevel(was)
 
 
 class _Beside(trimesh.resolvers.FilePathResolver):
