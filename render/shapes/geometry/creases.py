@@ -39,7 +39,8 @@ def shaded(
     Around a vertex, triangles that are joined by edges which turn by less than `CREASE` share a normal: the mean of
     theirs by area and angle. Where it lies farther than that from a triangle's own, as at the tip of a cone, the
     triangle takes its own and its neighbours'. A given normal takes the place of either where it lies within `CREASE`
-    of its triangle's, and is not the same on both sides of a sharp edge; one of the opposite sign is turned first.
+    of its triangle's; one that is the same on both sides of a sharp edge has to fit on both. One of the opposite
+    sign is turned first.
 
     Args:
         vertices: (V, 3) positions, equal ones merged.
@@ -172,10 +173,12 @@ def _fitting(given: np.ndarray, flat: np.ndarray, fans: _Fans) -> tuple[np.ndarr
     unit = np.where(np.isfinite(unit), unit, 0)
     along = (unit * flat[:, None]).sum(2)
     sign = np.where(along.sum(1) < 0, -1.0, 1.0)[:, None]
+    fits = along * sign >= _LEAST
     one, other = unit.reshape(-1, 3)[fans.apart]
+    across = ((one * other).sum(1) > _SMEARED) & ~fits.ravel()[fans.apart].all(0)
     smeared = np.zeros(len(fans.owner), bool)
-    smeared[fans.faces.ravel()[fans.apart[:, (one * other).sum(1) > _SMEARED]]] = True
-    return unit * sign[..., None], (along * sign >= _LEAST) & ~smeared[fans.faces]
+    smeared[fans.faces.ravel()[fans.apart[:, across]]] = True
+    return unit * sign[..., None], fits & ~smeared[fans.faces]
 
 
 def _parted(owner: np.ndarray, faces: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
