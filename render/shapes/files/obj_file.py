@@ -111,15 +111,35 @@ def _corners(rows: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of all corners (N, 3): vertex, texture coordinate, normal, 0 for none; and (P,) corners."""
     tables, counts = [], []
     for start in range(0, len(rows), _BLOCK):
-        split = [row.split() for row in rows[start : start + _BLOCK]]
-        counts.append(np.array([len(face) for face in split]))
-        texts = [corner + _MISSING[min(corner.count("/"), 2)] for face in split for corner in face]
-        joined = " ".join(texts).replace("//", "/0/") + " "
-        values = _parsed([joined.replace("/ ", "/0 ").replace("/", " ")], np.int64)
-        if values is None or len(values) != 3 * len(texts):
-            raise InputError(_malformed(split))
-        tables.append(values.reshape(-1, 3))
+        block = rows[start : start + _BLOCK]
+        table, count = _of_one_form(block) or _of_any_form([row.split() for row in block])
+        tables.append(table)
+        counts.append(count)
     return np.concatenate(tables), np.concatenate(counts)
+
+
+def _of_one_form(rows: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Read faces whose corners all have no slash or all have two, and stand one blank apart; None for others."""
+    counts = np.array([row.count(" ") + 1 for row in rows])
+    joined, total = " ".join(rows), int(counts.sum())
+    if joined.count("/") not in (0, 2 * total):
+        return None
+    columns = 3 if "/" in joined else 1
+    values = _parsed([joined.replace("//", "/0/").replace("/", " ")], np.int64)
+    if values is None or len(values) != columns * total:
+        return None
+    table = values.reshape(-1, columns)
+    return np.pad(table, ((0, 0), (0, 3 - columns))), counts
+
+
+def _of_any_form(faces: list[list[str]]) -> tuple[np.ndarray, np.ndarray]:
+    """Read faces corner by corner."""
+    texts = [corner + _MISSING[min(corner.count("/"), 2)] for face in faces for corner in face]
+    joined = " ".join(texts).replace("//", "/0/") + " "
+    values = _parsed([joined.replace("/ ", "/0 ").replace("/", " ")], np.int64)
+    if values is None or len(values) != 3 * len(texts):
+        raise InputError(_malformed(faces))
+    return values.reshape(-1, 3), np.array([len(face) for face in faces])
 
 
 def _malformed(faces: list[list[str]]) -> str:
