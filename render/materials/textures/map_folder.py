@@ -6,6 +6,7 @@ Base colour is sRGB, all others are linear. Maps repeat over the surface. 16-bit
 import io
 import logging
 import os
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -93,7 +94,9 @@ def _fits_green_down(slopes: np.ndarray) -> bool:
 
 @lru_cache(maxsize=4)
 def _read(folder: str, files: tuple[tuple[str, Source, int], ...]) -> MapFolder:
-    pictures = {kind: _map(kind, source) for kind, source, _ in files}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Pillow's of very large pictures, which are refused in a line
+        pictures = {kind: _map(kind, source) for kind, source, _ in files}
     first = files[0][1].path
     shape = pictures[files[0][0]].shape[:2]
     for kind, source, _ in files:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import textures_support as support
+import tifffile
 from PIL import Image
 
 import render
@@ -242,6 +243,19 @@ def test_gloss_is_the_opposite_of_roughness_and_alpha_of_colours_is_left_out(tmp
     np.testing.assert_array_equal(found.values[..., 4], 1)
     Image.fromarray(rgba[..., :3]).save(tmp_path / "F_MetallicSmoothness.png")
     with pytest.raises(InputError, match=r"F_MetallicSmoothness\.png: roughness: 3 channel\(s\) where 4 are needed"):
+        read(tmp_path)
+
+
+def test_what_is_wrong_with_a_picture_is_said_in_one_line(tmp_path, recwarn):
+    Image.new("L", (16000, 6000)).save(tmp_path / "F_Color.png")
+    with pytest.raises(InputError, match=r"F_Color\.png: 16000x6000 pixels; maps may have 2 to 4096 a side|announces"):
+        read(tmp_path)
+    assert not recwarn.list
+    tifffile.imwrite(tmp_path / "F_Color.tif", np.zeros((SIZE, SIZE, 3), np.float32), photometric="rgb")
+    (tmp_path / "F_Color.png").unlink()
+    with pytest.raises(
+        InputError, match=r"F_Color\.tif: damaged or not a picture \(cannot identify image file\); copy"
+    ):
         read(tmp_path)
 
 
