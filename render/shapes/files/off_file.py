@@ -32,7 +32,7 @@ def read(data: bytes) -> Corners:
         counts = np.array([int(row[0]) for row in polygons], np.int64)
         index = np.array([int(place) for row in polygons for place in row[1 : 1 + int(row[0])]], np.int64)
         normals = np.array([row[3:6] for row in points], np.float64) if header[3] else None
-        if len(index) != counts.sum():
+        if min(vertex_count, face_count, *counts) < 0 or len(index) != counts.sum():
             raise ValueError("a face has fewer corners than it announces")
     except (ValueError, IndexError) as error:
         raise InputError(f"damaged or not a mesh ({error}); export it again") from error

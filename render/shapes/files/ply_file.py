@@ -132,7 +132,7 @@ def _ascii_table(rows: list[list[bytes]], element: _Element) -> _Table:
         for column in element.columns:
             size = 1
             if column.count:
-                size = int(row[place])
+                size = max(int(row[place]), 0)
                 place += 1
             numbers = [float(value) for value in row[place : place + size]]
             if len(numbers) < size:
@@ -188,6 +188,8 @@ def _regular(data: bytes, start: int, element: _Element, order: str) -> tuple[_T
 
 def _irregular(data: bytes, start: int, element: _Element, order: str) -> tuple[_Table, int]:
     """Read a table with lists of different lengths."""
+    if element.length > len(data):  # a row has a byte at least
+        raise IndexError
     columns = [
         (None if c.count is None else np.dtype(order + c.count), np.dtype(order + c.kind)) for c in element.columns
     ]

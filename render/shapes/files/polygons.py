@@ -2,6 +2,10 @@
 
 import numpy as np
 
+from render.shared.errors import InputError
+
+_MOST = 20_000  # corners of a concave face: the time to cut it grows with their square, to a minute
+
 
 def triangles(points: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Cut polygons into triangles without new vertices.
@@ -11,6 +15,9 @@ def triangles(points: np.ndarray, counts: np.ndarray) -> np.ndarray:
     Args:
         points: (N, 3) positions of the corners of all polygons, one polygon after the other, each counter-clockwise.
         counts: (P,) corners of each polygon; those of fewer than three give no triangle.
+
+    Raises:
+        InputError: a concave polygon of more than 20,000 corners.
 
     Returns:
         (T, 3) int64, places in `points`; the triangles of a polygon stand together, in the polygons' order.
@@ -31,6 +38,8 @@ def triangles(points: np.ndarray, counts: np.ndarray) -> np.ndarray:
         inside = (crosses * whole[polygon]).sum(1) >= -1e-9 * (whole**2).sum(1)[polygon]
     for concave in np.unique(polygon[~inside]):
         start, count = first[concave], counts[concave]
+        if count > _MOST:
+            raise InputError(f"has a face of {count:,} corners that is not convex; export it as triangles")
         fans[polygon == concave] = start + _ears(np.asarray(points[start : start + count], np.float64), whole[concave])
     return fans
 
