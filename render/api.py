@@ -28,7 +28,7 @@ from render.planning import light_sets
 from render.records.manifest import SceneSpec, View, claim
 from render.running.rendered import RenderedView, rendered_views
 from render.shapes import TriangleMesh, registry
-from render.shapes.geometry.mesh import from_trimesh
+from render.shapes.files.mesh_file import from_trimesh
 from render.shared.errors import InputError
 
 ShapeLike: TypeAlias = str | Path | trimesh.Trimesh | TriangleMesh

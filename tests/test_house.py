@@ -17,8 +17,8 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = [
     *(f"render.{name}" for name in (
-        "shared", "shared.imaging", "records", "backend", "shapes.geometry", "shapes.sculpture", "shapes",
-        "materials.textures", "materials", "materials.kernels.textures",
+        "shared", "shared.imaging", "records", "backend", "shapes.geometry", "shapes.files",
+        "shapes.sculpture", "shapes", "materials.textures", "materials", "materials.kernels.textures",
         "materials.kernels", "materials.fit", "planning", "kernel", "running", "checks", "publishing", "exchange",
     )),
     "render",

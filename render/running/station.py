@@ -17,7 +17,7 @@ from typing import NamedTuple
 import assets
 from render.backend import variant
 from render.materials import library
-from render.materials.textures import map_folder
+from render.materials.textures import map_names
 from render.planning import provenance
 from render.planning.chunks import Chunk
 from render.planning.composition import components
@@ -90,7 +90,7 @@ def needed(shapes: Iterable[str], materials: Iterable[str]) -> dict[str, str]:
 def _content(place: Path) -> str:
     """Return the first digits of the hash of a file, or of a folder of maps."""
     try:
-        files = sorted(map_folder.find(place).values()) if place.is_dir() else [place]
+        files = map_names.find(place).paths if place.is_dir() else (place,)
         states = [(str(file), (state := file.stat()).st_mtime_ns, state.st_size) for file in files]
         return _hashed(tuple(states))
     except (OSError, InputError):

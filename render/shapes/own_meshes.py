@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from render.records.manifest import OWN_MESHES
-from render.shapes.geometry.mesh import TriangleMesh, load_mesh
+from render.shapes.files.mesh_file import load_mesh
+from render.shapes.geometry.mesh import TriangleMesh
 from render.shared.errors import InputError, unknown
 
 _DIGITS = 12

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from render.shapes.geometry.mesh import TriangleMesh, load_mesh, unit
+from render.shapes.files.mesh_file import load_mesh
+from render.shapes.geometry.mesh import TriangleMesh, unit
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, cache_folder
 
@@ -39,7 +40,7 @@ def bunny() -> TriangleMesh:
     Raises:
         InputError: it is neither in the cache nor can it be fetched.
     """
-    mesh = load_mesh(bunny_file())
+    mesh = load_mesh(bunny_file(), smooth=True)
     # The file is z-up with the tail towards +x and its right side towards +y.
     x, y, z = mesh.vertices.T
     nx, ny, nz = mesh.normals.T

@@ -9,7 +9,8 @@ from threadpoolctl import threadpool_limits
 
 from render.records.manifest import COMPOSITION, OWN_MESHES
 from render.shapes import blobby, compositions, own_meshes, primitives
-from render.shapes.geometry.mesh import TriangleMesh, load_mesh
+from render.shapes.files.mesh_file import load_mesh
+from render.shapes.geometry.mesh import TriangleMesh
 from render.shapes.sculpture import family as sculpture
 from render.shared.errors import InputError, unknown
 

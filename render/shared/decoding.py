@@ -41,7 +41,9 @@ def decoding(path: str | Path, what: str, remedy: str = "copy it again") -> Iter
     except InputError:
         raise
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0].partition(" <_io.")[
+            0
+        ]  # and its address
         raise InputError(f"{path}: damaged or not {what} ({reason[:200]}); {remedy}") from error
 
 

@@ -36,6 +36,32 @@ def read_image(path: str | Path, *, channels: int | None = 3) -> np.ndarray:
     Raises:
         InputError: missing, damaged, another number of channels, or neither 8 nor 16 bits.
     """
+    pixels = _decoded(path)
+    found = 1 if pixels.ndim == 2 else pixels.shape[2]
+    if channels is None:
+        return pixels if pixels.ndim == 2 else pixels[..., 2 if found >= 3 else 0]
+    if found != channels:
+        raise InputError(f"{path}: {found} channel(s) where {channels} are needed; save it as RGB")
+    return np.ascontiguousarray(pixels[..., ::-1])
+
+
+def read_channels(path: str | Path) -> np.ndarray:
+    """Read a picture with all its channels at its own depth.
+
+    Returns:
+        (H, W, C) uint8 or uint16: grey, RGB, or RGB and alpha.
+
+    Raises:
+        InputError: missing, damaged, or neither 8 nor 16 bits.
+    """
+    pixels = _decoded(path)
+    if pixels.ndim == 2:
+        return pixels[..., None]
+    return np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], axis=2) if pixels.shape[2] >= 3 else pixels
+
+
+def _decoded(path: str | Path) -> np.ndarray:
+    """Return the pixels as OpenCV has them, BGR, uint8 or uint16."""
     data = read_bytes(path, "no such picture; copy it there or drop it from the list that names it")
     with decoding(path, "a picture"):
         with Image.open(io.BytesIO(data)) as picture:
@@ -46,12 +72,7 @@ def read_image(path: str | Path, *, channels: int | None = 3) -> np.ndarray:
         raise InputError(f"{path}: damaged or not a picture; copy it again")
     if pixels.dtype not in _TYPES.values():
         raise InputError(f"{path}: pixels are {pixels.dtype}; save it with 8 or 16 bits per channel")
-    found = 1 if pixels.ndim == 2 else pixels.shape[2]
-    if channels is None:
-        return pixels if pixels.ndim == 2 else pixels[..., 2 if found >= 3 else 0]
-    if found != channels:
-        raise InputError(f"{path}: {found} channel(s) where {channels} are needed; save it as RGB")
-    return np.ascontiguousarray(pixels[..., ::-1])
+    return pixels
 
 
 def write_png(path: str | Path, pixels: np.ndarray) -> None:

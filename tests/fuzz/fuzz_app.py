@@ -252,7 +252,7 @@ class AtOnce:
         """Run a job; its refusal goes to standard error."""
         from pipelines.app.rooms import photo_tasks, studio_tasks
         from render.materials import library
-        from render.shapes.geometry.mesh import load_mesh
+        from render.shapes.files.mesh_file import load_mesh
 
         try:
             if task in ("check", "infer"):

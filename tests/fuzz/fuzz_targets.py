@@ -320,7 +320,7 @@ def _read_maps(folder: Path, path: Path) -> None:
 
 
 def _read_mesh(folder: Path, path: Path) -> None:
-    from render.shapes.geometry.mesh import load_mesh
+    from render.shapes.files.mesh_file import load_mesh
 
     load_mesh(folder / "model.gltf" if path.suffix in (".bin", ".gltf") else path)
 

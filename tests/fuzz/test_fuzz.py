@@ -12,7 +12,7 @@ from fuzz_mutate import sealed_png, sealed_shard
 from fuzz_run import BAD, Corpus, _peak, _reset_peak, judged, run, table
 from fuzz_targets import TARGETS
 
-from render.shapes.geometry.mesh import load_mesh
+from render.shapes.files.mesh_file import load_mesh
 from render.shared import images
 from render.shared.errors import InputError
 from render.shared.imaging import environments

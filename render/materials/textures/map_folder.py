@@ -3,29 +3,29 @@
 Base colour is sRGB, all others are linear. Maps repeat over the surface. 16-bit pictures keep their depth.
 """
 
+import io
+import logging
 import os
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
+from render.materials.textures.map_names import DX, Maps, Source, find
+from render.shared.decoding import check_picture, decoding
 from render.shared.errors import InputError
-from render.shared.images import read_image, to_unit
+from render.shared.files import read_bytes
+from render.shared.images import read_channels, to_unit
 
-# What follows the asset's name, ambientCG first, then Poly Haven; compared without case.
-PATTERNS = {
-    "colour": ("_color", "_basecolor", "_albedo", "_diff", "_diffuse", "_col"),
-    "roughness": ("_roughness", "_rough"),
-    "metallic": ("_metalness", "_metallic", "_metal"),
-    "normal": ("_normalgl", "_nor_gl", "_normaldx", "_nor_dx"),
-    "height": ("_displacement", "_height", "_disp"),
-}
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-_UNREAD = (".exr", ".hdr", ".tga", ".bmp", ".webp")
+_log = logging.getLogger(__name__)
 _LARGEST = 4096
 _DEPTH = 0.03  # relief of a height map from black to white, in widths of the map
 _STEEPEST = 3.0  # slopes of a normal map are cut here, 72 degrees
+_ROUGHNESS = 0.6  # without a map
+_CLEARLY = 0.5  # of the curl of the slopes: less than this share of it with green down says that it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,89 +47,107 @@ class MapFolder:
 def read(folder: str | Path) -> MapFolder:
     """Read a folder of maps, from memory when it has not changed.
 
+    The console says once which pictures of the folder are not used.
+
     Raises:
         InputError: no folder, no base colour, two maps of one kind, maps of different sizes, or a damaged picture.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of maps")
-    found = find(folder)
-    return _read(str(folder), tuple((kind, str(path), os.stat(path).st_mtime_ns) for kind, path in found.items()))
+    maps = find(folder)
+    found = _read(
+        str(folder), tuple((kind, each, os.stat(each.path).st_mtime_ns) for kind, each in maps.sources.items())
+    )
+    _say(folder, maps, found)
+    return found
 
 
-def find(folder: Path) -> dict[str, Path]:
-    """Return the picture of each kind of map that the folder has, told by the names.
-
-    Raises:
-        InputError: no base colour, two pictures of one kind, or one in a format that is not read.
-    """
-    found: dict[str, tuple[int, Path]] = {}
-    unread: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        kind, rank = _kind(path.stem.lower())
-        if kind and path.suffix.lower() in _UNREAD:
-            unread[kind] = path
-        if not kind or path.suffix.lower() not in SUFFIXES:
-            continue
-        if kind in found and found[kind][0] == rank:
-            raise InputError(f"{folder}: {kind}: both {found[kind][1].name} and {path.name}; keep one of them")
-        if kind not in found or rank < found[kind][0]:
-            found[kind] = (rank, path)
-    for kind, path in unread.items():
-        if kind not in found:
-            raise InputError(f"{path}: {kind}: maps must be {', '.join(SUFFIXES)}; download it as PNG or JPG")
-    if "colour" not in found:
-        raise InputError(
-            f"{folder}: no base colour map; expected a picture named like Bricks_Color.jpg or brick_diff_2k.png"
-        )
-    return {kind: path for kind, (_, path) in found.items()}
+_said: set[str] = set()
 
 
-def _kind(stem: str) -> tuple[str, int]:
-    """Return the kind of map that a name tells, and its ending's place in `PATTERNS`; an empty name for none.
+def _say(folder: Path, maps: Maps, found: MapFolder) -> None:
+    """Say once in a process what of a folder is not used, and how a normal map is taken that does not say it."""
+    lines = []
+    normal = maps.sources.get("normal")
+    if normal and not normal.convention and found.slopes is not None:
+        line = f"{normal.path}: taken as OpenGL, green up; "
+        if _fits_green_down(found.slopes):
+            lines.append(f"{line}but its slopes fit together better with green down: if so, name it _NormalDX")
+        else:
+            lines.append(f"{line}name it _NormalDX if green is down")
+    if maps.unused:
+        lines.append(f"{folder}: not used: {', '.join(path.name for path in maps.unused)}")
+    for line in lines:
+        if line not in _said:
+            _said.add(line)
+            _log.warning("%s", line)
 
-    Poly Haven puts the resolution behind it: `rough_wood_diff_2k`. Of several that a name has, the last one counts.
-    """
-    told = [
-        (stem.rfind(ending), kind, rank)
-        for kind, endings in PATTERNS.items()
-        for rank, ending in enumerate(endings)
-        if stem.endswith(ending) or f"{ending}_" in stem
-    ]
-    _, kind, rank = max(told, default=(0, "", 0), key=lambda each: each[0])
-    return kind, rank
+
+def _fits_green_down(slopes: np.ndarray) -> bool:
+    """Tell whether slopes (H, W, 2) are those of a height only when the second is turned: mixed derivatives agree."""
+    along_v = np.roll(slopes[..., 0], 1, 0) - np.roll(slopes[..., 0], -1, 0)
+    along_u = np.roll(slopes[..., 1], -1, 1) - np.roll(slopes[..., 1], 1, 1)
+    up, down = float(np.square(along_v - along_u).mean()), float(np.square(along_v + along_u).mean())
+    return down < _CLEARLY * up
 
 
 @lru_cache(maxsize=4)
-def _read(folder: str, files: tuple[tuple[str, str, int], ...]) -> MapFolder:
-    pictures: dict[str, np.ndarray] = {}
-    for kind, path, _ in files:
-        pixels = to_unit(read_image(path, channels=3 if kind in ("colour", "normal") else None))
-        if max(pixels.shape[:2]) > _LARGEST or min(pixels.shape[:2]) < 2:
-            size = "{1}x{0}".format(*pixels.shape)
-            raise InputError(f"{path}: {size} pixels; maps may have 2 to {_LARGEST} a side, scale them")
-        pictures[kind] = pixels
-    first = Path(files[0][1]).name
+def _read(folder: str, files: tuple[tuple[str, Source, int], ...]) -> MapFolder:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Pillow's of very large pictures, which are refused in a line
+        pictures = {kind: _map(kind, source) for kind, source, _ in files}
+    first = files[0][1].path
     shape = pictures[files[0][0]].shape[:2]
-    for kind, path, _ in files:
+    for kind, source, _ in files:
         if pictures[kind].shape[:2] != shape:
             sizes = ("{1}x{0}".format(*size) for size in (pictures[kind].shape, shape))
-            raise InputError(f"{path}: {next(sizes)} pixels, but {first} has {next(sizes)}; scale them to one size")
+            raise InputError(
+                f"{source.path}: {next(sizes)} pixels, but {first.name} has {next(sizes)}; scale them to one size"
+            )
     values = np.empty((*shape, 5), np.float32)
     colour = pictures["colour"]
     values[..., :3] = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
-    values[..., 3] = pictures.get("roughness", np.float32(0.6))
+    values[..., 3] = pictures.get("roughness", np.float32(_ROUGHNESS))
     values[..., 4] = pictures.get("metallic", np.float32(0))
-    names = {kind: Path(path).stem.lower() for kind, path, _ in files}
-    return MapFolder(folder, values, _slopes(pictures, names))
+    down = any(kind == "normal" and source.convention == DX for kind, source, _ in files)
+    return MapFolder(folder, values, _slopes(pictures, down))
 
 
-def _slopes(pictures: dict[str, np.ndarray], names: dict[str, str]) -> np.ndarray | None:
+def _map(kind: str, source: Source) -> np.ndarray:
+    """Read one map: (H, W, 3) float32 in [0, 1] of base colour and normals, (H, W) of the others."""
+    path = source.path
+    pixels = _channels(path)
+    if max(pixels.shape[:2]) > _LARGEST or min(pixels.shape[:2]) < 2:
+        size = "{1}x{0}".format(*pixels.shape)
+        raise InputError(f"{path}: {size} pixels; maps may have 2 to {_LARGEST} a side, scale them")
+    if kind == "colour":
+        return to_unit(pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2))
+    needed = 3 if kind == "normal" else (source.channel or 0) + 1
+    if pixels.shape[2] < needed:
+        raise InputError(f"{path}: {kind}: {pixels.shape[2]} channel(s) where {needed} are needed; save it as RGB"
+                         + ("A" if needed > 3 else ""))  # fmt: skip
+    values = to_unit(pixels[..., :3] if kind == "normal" else pixels[..., source.channel or 0])
+    return 1 - values if source.inverted else values
+
+
+def _channels(path: Path) -> np.ndarray:
+    """Read a picture (H, W, C); TGA, which OpenCV does not read, by Pillow."""
+    if path.suffix.lower() != ".tga":
+        return read_channels(path)
+    data = read_bytes(path, "no such picture")
+    with decoding(path, "a picture"), Image.open(io.BytesIO(data), formats=["TGA"]) as picture:
+        check_picture(path, picture, data)
+        pixels = np.asarray(picture.convert("RGB") if picture.mode == "P" else picture)
+    return pixels[..., None] if pixels.ndim == 2 else pixels
+
+
+def _slopes(pictures: dict[str, np.ndarray], green_down: bool) -> np.ndarray | None:
     """Return the slopes of the normal map, or of the height map by central differences over the repeating picture."""
     if "normal" in pictures:
         x, y, z = np.moveaxis(2 * pictures["normal"] - 1, -1, 0)
-        if "normaldx" in names["normal"] or "nor_dx" in names["normal"]:
-            y = -y  # DirectX: green points down
+        if green_down:
+            y = -y
         slopes = np.stack([-x, -y], -1) / np.maximum(z, 0.05)[..., None]
         return np.clip(slopes, -_STEEPEST, _STEEPEST).astype(np.float32)
     if "height" not in pictures:

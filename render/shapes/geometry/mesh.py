@@ -1,17 +1,11 @@
-"""The one mesh type of the renderer, and reading it from files."""
+"""The one mesh type of the renderer, and the geometry of triangles."""
 
-import gzip
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from render.records.manifest import View
-from render.shapes.geometry.strips import from_strips
-from render.shared.decoding import decoding, largest_unpacked
 from render.shared.errors import InputError
 
 _BLOCK = 1 << 20  # points looked at together
@@ -19,7 +13,9 @@ _BLOCK = 1 << 20  # points looked at together
 
 @dataclass(frozen=True, kw_only=True)
 class TriangleMesh:
-    """A triangle mesh with one smooth normal per vertex; x right, y up, z to the camera.
+    """A triangle mesh with one normal per vertex; x right, y up, z to the camera.
+
+    Normals are interpolated over triangles. At a crease a vertex stands twice, with a normal for either side.
 
     Attributes:
         vertices: Positions, (V, 3) float32.
@@ -174,12 +170,8 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return unit(normals).astype(np.float32)
 
 
-def without_degenerate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Drop triangles without area and vertices that no triangle uses; returns (vertices, faces)."""
-    return without_unused(vertices, faces[_with_area(vertices, faces)])
-
-
-def _with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:  # (F,) bool
+def with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:  # (F,) bool
+    """Tell which triangles have an area."""
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     return distinct & (np.linalg.norm(face_normals(vertices.astype(np.float64), faces), axis=1) > 0)
 
@@ -189,100 +181,3 @@ def without_unused(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     return vertices[used], (np.cumsum(used) - 1)[faces]
-
-
-def load_mesh(path: str | Path) -> TriangleMesh:
-    """Read any mesh or scene file that trimesh reads, smoothly shaded and as placed in the file.
-
-    The parts of a scene are concatenated; see `from_trimesh`.
-
-    Raises:
-        InputError: missing file, unreadable format, damaged content, no triangles, or non-finite positions.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such mesh file")
-    try:
-        with decoding(path, "a mesh", "export it again"):
-            return _read(path)
-    except InputError as error:
-        message = str(error)
-        raise error if message.startswith(str(path)) else InputError(f"{path}: {message}") from error
-
-
-def _read(path: Path) -> TriangleMesh:
-    """Read a mesh file; one that is compressed by gzip, as in `bunny.ply.gz`, is unpacked in memory."""
-    if path.suffix.lower() == ".gz":
-        with gzip.open(path) as file:
-            unpacked = file.read(largest_unpacked(path) + 1)
-        if len(unpacked) > largest_unpacked(path):
-            raise InputError(f"{path}: unpacks to more than a file of this size can hold; unpack it by hand")
-        scene = trimesh.load_scene(io.BytesIO(unpacked), file_type=Path(path.stem).suffix[1:].lower(), process=False)
-    else:
-        scene = trimesh.load_scene(path, process=False)
-    placed = [from_strips(part) for part in scene.dump()]
-    parts = [part for part in placed if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    if not parts:
-        raise InputError(f"{path}: contains no triangles; export it as a surface mesh")
-    for part in parts:
-        if part.vertices.ndim != 2 or part.vertices.shape[1] != 3 or part.faces.ndim != 2 or part.faces.shape[1] != 3:
-            raise InputError(f"{path}: vertices and faces must have three columns; repair the file")
-        if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
-            raise InputError(f"{path}: a face names a vertex that the file does not hold; repair the file")
-    bare = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts]
-    whole = trimesh.util.concatenate(bare)
-    assert isinstance(whole, trimesh.Trimesh), type(whole)
-    known = [uv for part in parts if (uv := _corner_uv(part)) is not None]
-    uv = np.concatenate(known) if len(known) == len(parts) else None
-    with np.errstate(over="ignore", invalid="ignore"):  # of positions beyond float32, which TriangleMesh refuses
-        return from_trimesh(whole, str(path), uv)
-
-
-def _corner_uv(mesh: trimesh.Trimesh) -> np.ndarray | None:
-    """Return the texture coordinates of the corners (F, 3, 2) of a mesh that has them."""
-    uv = getattr(mesh.visual, "uv", None)
-    if uv is None or len(uv) != len(mesh.vertices) or not np.isfinite(uv).all():
-        return None
-    return np.asarray(uv, np.float64)[:, :2][np.asarray(mesh.faces)]
-
-
-def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh", uv: np.ndarray | None = None) -> TriangleMesh:
-    """Return the triangles of a mesh as placed, smoothly shaded.
-
-    Equal positions are merged, so that texture seams and the flat facets of STL do not show; normals are
-    area-weighted. A watertight surface is turned outside out.
-
-    Args:
-        mesh: Stays as it is; of its attributes only vertices, faces and texture coordinates are used.
-        name: What messages call it.
-        uv: (F, 3, 2) texture coordinates of the corners; the mesh's own when omitted.
-
-    Raises:
-        InputError: no triangles, or non-finite positions.
-    """
-    uv = _corner_uv(mesh) if uv is None else uv
-    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    if not len(mesh.faces):
-        raise InputError(f"{name}: contains no triangles; give a surface mesh")
-    if not np.isfinite(mesh.vertices).all():
-        raise InputError(f"{name}: contains vertices that are not finite; repair the file")
-    mesh.merge_vertices()
-    merged = np.asarray(mesh.faces, dtype=np.int64)
-    kept = _with_area(np.asarray(mesh.vertices), merged)
-    vertices, faces = without_unused(np.asarray(mesh.vertices), merged[kept])
-    if not len(faces):
-        raise InputError(f"{name}: all of its triangles are degenerate")
-    wound = _outward(vertices, faces)
-    if uv is not None:  # winding a face the other way moves its corners
-        moved = (wound[:, :, None] == faces[:, None, :]).argmax(2)
-        uv = np.take_along_axis(uv[kept], moved[:, :, None], axis=1)
-    return TriangleMesh(vertices=vertices, faces=wound, normals=vertex_normals(vertices, wound), uv=uv)
-
-
-def _outward(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Wind the faces of a watertight surface consistently, outside out; others are returned as they are."""
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    if not mesh.is_watertight:
-        return faces
-    mesh.fix_normals(multibody=True)
-    return np.asarray(mesh.faces, dtype=np.int64)

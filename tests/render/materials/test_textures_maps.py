@@ -9,8 +9,9 @@ from render.backend.jit import dr, mi
 from render.materials import library
 from render.materials.kernels.textures import cover, projections
 from render.materials.textures import map_folder
-from render.materials.textures.map_folder import find, read
-from render.shapes.geometry.mesh import load_mesh
+from render.materials.textures.map_folder import read
+from render.materials.textures.map_names import find
+from render.shapes.files.mesh_file import load_mesh
 from render.shared.errors import InputError
 
 
@@ -40,8 +41,10 @@ def test_base_colour_is_srgb_and_the_others_are_linear(tmp_path):
 def test_maps_are_told_by_the_names_of_both_shops(tmp_path, names):
     for name in (*names, "A.png", "A_preview.usdc", "a_ao_2k.png"):
         (tmp_path / name).write_bytes(b"")
-    found = {kind: path.name for kind, path in find(tmp_path).items()}
-    colour, rough, metal, gl, _, height = names
+    maps = find(tmp_path)
+    found = {kind: source.path.name for kind, source in maps.sources.items()}
+    colour, rough, metal, gl, dx, height = names
+    assert {path.name for path in maps.unused} == {"A.png", "a_ao_2k.png", dx}
     assert found == {"colour": colour, "roughness": rough, "metallic": metal, "normal": gl, "height": height}
 
 

@@ -20,8 +20,9 @@ from render.records.manifest import SceneSpec, View
 from render.records.shards import read_shard, write_shard
 from render.running.rendered import rendered_views
 from render.shapes import compositions
+from render.shapes.files.mesh_file import from_trimesh
 from render.shapes.geometry.contact import CLEARANCE, free_path
-from render.shapes.geometry.mesh import TriangleMesh, from_trimesh, joined
+from render.shapes.geometry.mesh import TriangleMesh, joined
 from render.shared.errors import InputError
 from render.shared.seeds import generator
 

@@ -7,8 +7,9 @@ import pytest
 import trimesh
 
 from render import shapes
+from render.shapes.files.mesh_file import load_mesh
 from render.shapes.geometry import mesh as mesh_module
-from render.shapes.geometry.mesh import TriangleMesh, load_mesh, vertex_normals
+from render.shapes.geometry.mesh import TriangleMesh, vertex_normals
 from render.shared.errors import InputError
 from render.shared.seeds import generator
 
@@ -75,14 +76,16 @@ def test_area_weights_follow_the_larger_face():
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "glb", "off"])
-def test_formats_read_as_one_smooth_closed_mesh(tmp_path, suffix):
+def test_formats_read_as_one_closed_mesh_with_the_edges_of_a_cube(tmp_path, suffix):
     path = tmp_path / f"cube.{suffix}"
     trimesh.Scene([CUBE]).export(path) if suffix == "glb" else CUBE.export(path)
     mesh = shapes.load(str(path))
-    assert len(mesh.vertices) == 8 and len(mesh.faces) == 12
+    assert len(mesh.vertices) == 24 and len(mesh.faces) == 12
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 1, atol=1e-5)
-    # Smooth: every corner has one normal, out through the corner.
-    assert ((mesh.normals * mesh.vertices).sum(axis=1) > 0.8).all()
+    corners = mesh.vertices[mesh.faces].astype(float)
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(mesh.normals[mesh.faces], np.repeat(trimesh.unitize(flat)[:, None], 3, 1), atol=1e-6)
+    assert ((mesh.normals * mesh.vertices).sum(axis=1) > 0.5).all()
 
 
 def test_scene_parts_are_joined_where_the_scene_places_them(tmp_path):
@@ -164,7 +167,8 @@ def test_degenerate_triangles_and_loose_vertices_are_dropped(tmp_path):
         ("empty.obj", b"", "no triangles|cannot be read"),
         ("nan.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
         ("flat.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "degenerate"),
-        ("mesh.unknown", b"something", "damaged or not a mesh"),
+        ("mesh.unknown", b"something", "is a .unknown file, which is not read; export it as"),
+        ("part.step", b"ISO-10303-21;", "is a .step file, which is not read; export it as"),
     ],
 )
 def test_unusable_files_are_one_line_errors(tmp_path, name, content, message):
