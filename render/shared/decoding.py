@@ -4,10 +4,14 @@ Whatever a library raises on damaged bytes becomes one line, and a file whose he
 sensibly hold is refused before anything is unpacked: a picture of 1 KB may claim 100,000 x 100,000 pixels.
 """
 
+import io
 import os
+import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 import OpenEXR
 from PIL import Image
@@ -81,21 +85,99 @@ def check_picture(path: str | Path, picture: Image.Image, data: bytes) -> None:
     check_unpacked(path, picture.width * picture.height * bands * (2 if wide else 1), "its pixels")
 
 
-def exr_parts(path: str | Path, remedy: str = "copy it again") -> list[OpenEXR.Part]:
+def exr_parts(path: str | Path, remedy: str = "copy it again", *, grouped: bool = True) -> list[OpenEXR.Part]:
     """Decode all parts of an OpenEXR file, after a look at their headers.
+
+    Args:
+        path: The file.
+        remedy: What to do about a damaged one.
+        grouped: Join R, G and B of a layer `image` to one array (H, W, 3) `image`, those without a layer to `RGB`;
+            a layer of mixed types is then refused. Otherwise channels keep their names, as `image.R`.
 
     Raises:
         InputError: missing, damaged, without a part, or of a size that such a file cannot hold.
     """
     with decoding(path, "an EXR picture", remedy):
-        size = 0
-        with OpenEXR.File(os.fspath(path), header_only=True) as file:
-            for part in file.parts:
-                low, high = (corner.astype(int) for corner in part.header["dataWindow"])
-                width, height = (max(int(side), 0) for side in high - low + 1)
-                size += width * height * 4 * len(part.header["channels"])
-        check_unpacked(path, size, "its pixels")
-        parts = OpenEXR.File(os.fspath(path)).parts
-        if not parts:
-            raise InputError(f"{path}: damaged or not an EXR picture (no part of it can be read); {remedy}")
+        count = check_exr(path)
+        parts = OpenEXR.File(os.fspath(path), separate_channels=not grouped).parts
+        if len(parts) < max(count, 1):  # it leaves out those it cannot decode
+            which = "no part of it" if not parts else f"only {len(parts)} of its {count} parts"
+            raise InputError(f"{path}: damaged or not an EXR picture ({which} can be read); {remedy}")
         return parts
+
+
+def check_exr(path: str | Path) -> int:
+    """Refuse an OpenEXR file whose headers announce more pixels than it can hold; none of them is decoded.
+
+    Returns:
+        The number of its parts.
+
+    Raises:
+        InputError: too large a data or display window; OpenEXR's own errors pass.
+    """
+    size = 0
+    with OpenEXR.File(os.fspath(path), header_only=True) as file:
+        for part in file.parts:
+            areas = []
+            for window in ("dataWindow", "displayWindow"):
+                low, high = (corner.astype(int) for corner in part.header[window])
+                width, height = (max(int(side), 0) for side in high - low + 1)
+                areas.append(width * height)
+            size += max(areas) * 4 * len(part.header["channels"])
+        count = len(file.parts)
+    check_unpacked(path, size, "its pixels")
+    return count
+
+
+_SILENT = threading.Lock()
+_silencers = 0
+_kept: list[tuple[int, int]] = []
+_output: TextIO | None = None
+
+
+@contextmanager
+def silenced() -> Iterator[None]:
+    """Keep what C libraries print about damaged files off standard output and error, in all threads of the process.
+
+    Python's own streams write there as well, so nothing but decoding belongs inside.
+    """
+    global _silencers
+    with _SILENT:
+        if not _silencers:
+            _mute()
+        _silencers += 1
+    try:
+        yield
+    finally:
+        with _SILENT:
+            _silencers -= 1
+            if not _silencers:
+                _unmute()
+
+
+def _mute() -> None:
+    global _output
+    _flush()
+    _output, sys.stdout = sys.stdout, io.StringIO()  # OpenEXR's binding prints there
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for number in (1, 2):
+        try:
+            _kept.append((number, os.dup(number)))
+        except OSError:  # closed, as of a program without a console
+            continue
+        os.dup2(nowhere, number)
+    os.close(nowhere)
+
+
+def _unmute() -> None:
+    sys.stdout = _output
+    while _kept:
+        number, kept = _kept.pop()
+        os.dup2(kept, number)
+        os.close(kept)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:
+            stream.flush()

@@ -15,7 +15,8 @@ from PIL import Image, ImageCms, ImageOps
 
 from render.shared.errors import InputError
 from sdps import photos
-from sdps.photos.response import SRGB_EXPONENT, profile_exponent
+from sdps.photos.pictures.gamma import SRGB_EXPONENT
+from sdps.photos.response import profile_exponent
 
 RAMP = np.stack(np.broadcast_arrays(np.linspace(0, 1, 20)[None], np.linspace(0.1, 0.9, 14)[:, None], 0.5), axis=-1)
 PAIR = np.stack([RAMP, RAMP * 0.5])  # (2, 14, 20, 3)

@@ -1,0 +1,114 @@
+"""What a picture's values say it is: masks have two values, pictures of normals decode to unit vectors."""
+
+import numpy as np
+from scipy import ndimage
+
+from sdps.photos.pictures.names import MASK, NORMALS
+
+_SAMPLES = 1 << 14
+_SMALLEST = 256
+"""Pixels of a picture that is judged at all."""
+
+_PART = 0.005
+"""Least share of the frame that either value of a mask has."""
+
+_CONTRAST = 0.25
+_BETWEEN = 0.35
+"""Share of sampled pixels between the two values from which on it is no mask; edges have less."""
+
+_SOFT, _SOFT_LOSSY = 2, 8
+"""Width in pixels of a mask's edge, smoothed, or blurred by lossy compression in blocks of 8."""
+
+_OFF, _OFF_LOSSY = 0.004, 0.06
+_LENGTH, _LENGTH_LOSSY = 0.03, 0.12
+_UNIT = 0.95
+_GREY = 0.02
+
+
+def judge_content(pixels: np.ndarray, *, lossy: bool = False) -> str | None:
+    """Return `a mask` or `normals` if the values are those of one and of no photograph, otherwise None.
+
+    A mask has two colours, far apart, and others along its edges only. A picture of normals has, but for a black, grey
+    or white background, unit vectors with positive z, coded as 2 v - 1 (floating point: coded so, or as they are),
+    that are not all grey.
+
+    Args:
+        pixels: (H, W, 3) uint8, uint16, or float32.
+        lossy: They come from a lossy file and are a little off.
+    """
+    if pixels.shape[0] * pixels.shape[1] < _SMALLEST:
+        return None
+    step = max(1, int(np.sqrt(pixels.shape[0] * pixels.shape[1] / _SAMPLES)))
+    few = _unit(pixels[::step, ::step])
+    if not np.isfinite(few).all():
+        return None
+    if _may_be_mask(few, lossy) and _is_mask(pixels, lossy):
+        return MASK
+    return NORMALS if _are_normals(few, lossy) else None
+
+
+def like_mask(pixels: np.ndarray) -> bool:
+    """Tell whether at least nine tenths of (H, W, 3) pixels are near their darkest or their brightest value."""
+    grey = _unit(pixels).mean(-1)
+    low, high = float(grey.min()), float(grey.max())
+    return high > low and float((np.minimum(grey - low, high - grey) <= 0.15 * (high - low)).mean()) >= 0.9
+
+
+def _unit(pixels: np.ndarray) -> np.ndarray:
+    """Return values as float32, full scale = 1."""
+    if pixels.dtype.kind == "f":
+        return pixels
+    return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+
+
+def _may_be_mask(few: np.ndarray, lossy: bool) -> bool:
+    grey = few.mean(-1)
+    low, high = float(grey.min()), float(grey.max())
+    off = (_OFF_LOSSY if lossy else _OFF) * max(high, 1e-6)
+    return high - low >= _CONTRAST and float(((grey > low + off) & (grey < high - off)).mean()) < _BETWEEN
+
+
+def _is_mask(pixels: np.ndarray, lossy: bool) -> bool:
+    """Look at all pixels: two even colours with a soft edge between."""
+    values = _unit(pixels)
+    grey = values.mean(-1)
+    low, high = float(grey.min()), float(grey.max())
+    bright = grey > (low + high) / 2
+    if not _PART <= bright.mean() <= 1 - _PART:
+        return False
+    off = (_OFF_LOSSY if lossy else _OFF) * high
+    if not lossy and all(_even(values[part], 0.0) for part in (bright, ~bright)):
+        return True
+    width = _SOFT_LOSSY if lossy else _SOFT
+    square = np.ones((2 * width + 1, 2 * width + 1), bool)
+    inside = [ndimage.binary_erosion(part, square, border_value=1) for part in (bright, ~bright)]
+    return all(part.mean() >= _PART and _even(values[part], off) for part in inside)
+
+
+def _even(colours: np.ndarray, off: float) -> bool:
+    """Tell whether all colours (N, 3) differ from the first by at most `off`."""
+    middle = np.median(colours[:: max(1, len(colours) // 1000)], axis=0)
+    return bool((np.abs(colours - middle) <= off).all())
+
+
+def _are_normals(few: np.ndarray, lossy: bool) -> bool:
+    flat = few.reshape(-1, 3)
+    ways = [2 * flat - 1]
+    if few.dtype.kind == "f" and flat.min() < -0.01:
+        ways.append(flat)
+    tolerance = _LENGTH_LOSSY if lossy else _LENGTH
+    return any(_unit_vectors(way, flat, tolerance) for way in ways)
+
+
+def _unit_vectors(vectors: np.ndarray, colours: np.ndarray, tolerance: float) -> bool:
+    """Tell whether vectors (N, 3) are unit with positive z, but for the background; they must not be greys."""
+    paper = np.array([[0, 0, 0], [0.5, 0.5, 0.5], [1, 1, 1]], np.float32)
+    nearest = np.abs(colours[:, None] - paper).max(-1).min(1)
+    vectors = vectors[nearest > _GREY]
+    if len(vectors) < max(64, 0.01 * len(colours)):
+        return False
+    unit = (np.abs(np.linalg.norm(vectors, axis=1) - 1) <= tolerance) & (vectors[:, 2] > 0)
+    if unit.mean() < _UNIT:
+        return False
+    sides = np.abs(vectors[:, :2].mean(0))
+    return bool(sides.max() < 0.8 * vectors[:, 2].mean() and (np.ptp(vectors, axis=0) > tolerance).any())
