@@ -9,7 +9,7 @@ import numpy as np
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 from sdps.photos.doubts import Doubts
-from sdps.photos.masks import Variation, automatic_mask, read_mask
+from sdps.photos.masks import Variation, automatic_mask, bright_part, read_mask
 from sdps.photos.picture_file import Picture, decode, misnamed, turned
 from sdps.photos.pictures.contents import judge_content, like_mask
 from sdps.photos.pictures.gamma import resolve_gamma
@@ -202,9 +202,8 @@ def _given_masks(folder: Path, listing: Listing) -> _Masks:
     found, odd = [], []
     for name in listing.masks:
         picture = decode(folder / name)
-        seen = picture.alpha if picture.alpha is not None and np.ptp(picture.alpha) > 0 else picture.pixels
-        whole = np.repeat(seen[..., None], 3, axis=2) if seen.ndim == 2 else seen
-        (found if like_mask(whole) else odd).append((name, turned(whole.max(-1), picture.orientation)))
+        cut_out = picture.alpha is not None and np.ptp(picture.alpha) > 0
+        (found if cut_out or like_mask(picture.pixels) else odd).append((name, bright_part(picture)))
     notes = []
     if odd:
         names = _span([name for name, _ in odd])
@@ -212,9 +211,7 @@ def _given_masks(folder: Path, listing: Listing) -> _Masks:
     if not found:
         return _Masks(None, tuple(notes))
     (first, one), *rest = found
-    one = one > full_scale(one) / 2
-    differ = any(other.shape != one.shape or ((other > full_scale(other) / 2) != one).any() for _, other in rest)
-    if differ:
+    if not all(np.array_equal(other, one) for _, other in rest):
         names = _span([name for name, _ in found])
         raise InputError(f"{folder}: several masks that differ ({names}); name the right one with --mask FILE")
     if rest:

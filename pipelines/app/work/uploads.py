@@ -12,13 +12,14 @@ from typing import Any
 
 from render.shared.errors import InputError
 from render.shared.files import parse_json
+from sdps.photos.pictures.kinds import SUFFIXES, picture_kind
 
-PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".exr")
+PICTURES = tuple(SUFFIXES)
 _BESIDE = (".txt", ".json")
 _NAME = re.compile(r"[^\w.,()+ -]+")
 _CHUNK = 2**20
 _EXR_HEADER = 2**16
-_EXR_WINDOW = re.compile(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", re.DOTALL)
+_EXR_WINDOW = re.compile(rb"(?:data|display)Window\0box2i\0\x10\0\0\0(.{16})", re.DOTALL)
 _MOST_SETTINGS = 64 << 10
 
 
@@ -155,11 +156,13 @@ def check_pixels(path: Path, limits: Limits) -> None:
 
 
 def _size(path: Path) -> tuple[int, int]:
-    """Return (width, height) that the header tells."""
+    """Return (width, height) that the header tells; the bytes say of what kind it is, as they do later."""
     try:
-        if path.suffix.lower() == ".exr":
+        with path.open("rb") as opened:
+            kind = picture_kind(opened.read(_EXR_HEADER), path.name)
+        if kind == "EXR":
             return _exr_size(path)
-        if path.suffix.lower() in (".tif", ".tiff"):
+        if kind == "TIFF":
             import tifffile
 
             with tifffile.TiffFile(path) as opened:
@@ -174,16 +177,17 @@ def _size(path: Path) -> tuple[int, int]:
 
 
 def _exr_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of an OpenEXR file's first part, read by hand: its library could take the server down.
+    """Return (width, height) of an OpenEXR file's largest window, read by hand: its library could take the server down.
 
     A header is a magic number and a version, then attributes: name, type, length, value.
     """
     with path.open("rb") as opened:
-        found = _EXR_WINDOW.search(opened.read(_EXR_HEADER))
-    if found is None or not found.string.startswith(b"\x76\x2f\x31\x01"):
+        head = opened.read(_EXR_HEADER)
+    found = [struct.unpack("<4i", corners) for corners in _EXR_WINDOW.findall(head)]  # of all parts
+    if not found or not head.startswith(b"\x76\x2f\x31\x01"):
         raise ValueError("no dataWindow")
-    left, low, right, high = struct.unpack("<4i", found[1])
-    return right - left + 1, high - low + 1
+    sizes = [(right - left + 1, high - low + 1) for left, low, right, high in found]
+    return max(sizes, key=lambda size: size[0] * size[1])
 
 
 def _extract(opened: zipfile.ZipFile, item: zipfile.ZipInfo, path: Path, room: int) -> int:

@@ -1,7 +1,7 @@
 """What a picture's values say it is: masks have two values, pictures of normals decode to unit vectors."""
 
+import cv2
 import numpy as np
-from scipy import ndimage
 
 from sdps.photos.pictures.names import MASK, NORMALS
 
@@ -13,8 +13,8 @@ _PART = 0.005
 """Least share of the frame that either value of a mask has."""
 
 _CONTRAST = 0.25
-_BETWEEN = 0.35
-"""Share of sampled pixels between the two values from which on it is no mask; edges have less."""
+_SAME = 0.5
+"""Least share of sampled pixels on either side that have its usual value; the others lie along edges."""
 
 _SOFT, _SOFT_LOSSY = 2, 8
 """Width in pixels of a mask's edge, smoothed, or blurred by lossy compression in blocks of 8."""
@@ -48,10 +48,12 @@ def judge_content(pixels: np.ndarray, *, lossy: bool = False) -> str | None:
 
 
 def like_mask(pixels: np.ndarray) -> bool:
-    """Tell whether at least nine tenths of (H, W, 3) pixels are near their darkest or their brightest value."""
+    """Tell whether nine tenths of (H, W, 3) pixels are near their darkest or brightest value, or all are bright."""
     grey = _unit(pixels).mean(-1)
     low, high = float(grey.min()), float(grey.max())
-    return high > low and float((np.minimum(grey - low, high - grey) <= 0.15 * (high - low)).mean()) >= 0.9
+    if high == low:
+        return high > 0.5
+    return float((np.minimum(grey - low, high - grey) <= 0.15 * (high - low)).mean()) >= 0.9
 
 
 def _unit(pixels: np.ndarray) -> np.ndarray:
@@ -64,8 +66,12 @@ def _unit(pixels: np.ndarray) -> np.ndarray:
 def _may_be_mask(few: np.ndarray, lossy: bool) -> bool:
     grey = few.mean(-1)
     low, high = float(grey.min()), float(grey.max())
-    off = (_OFF_LOSSY if lossy else _OFF) * max(high, 1e-6)
-    return high - low >= _CONTRAST and float(((grey > low + off) & (grey < high - off)).mean()) < _BETWEEN
+    if high - low < _CONTRAST:
+        return False
+    off = (_OFF_LOSSY if lossy else _OFF) * high
+    bright = grey > (low + high) / 2
+    levels = [grey[part] for part in (bright, ~bright)]
+    return all((np.abs(level - np.median(level)) <= off).mean() >= _SAME for level in levels)
 
 
 def _is_mask(pixels: np.ndarray, lossy: bool) -> bool:
@@ -80,8 +86,10 @@ def _is_mask(pixels: np.ndarray, lossy: bool) -> bool:
     if not lossy and all(_even(values[part], 0.0) for part in (bright, ~bright)):
         return True
     width = _SOFT_LOSSY if lossy else _SOFT
-    square = np.ones((2 * width + 1, 2 * width + 1), bool)
-    inside = [ndimage.binary_erosion(part, square, border_value=1) for part in (bright, ~bright)]
+    square = np.ones((2 * width + 1, 2 * width + 1), np.uint8)
+    inside = [
+        cv2.erode(part.astype(np.uint8), square) > 0 for part in (bright, ~bright)
+    ]  # the frame's border counts not
     return all(part.mean() >= _PART and _even(values[part], off) for part in inside)
 
 

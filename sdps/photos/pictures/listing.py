@@ -53,8 +53,12 @@ def list_pictures(folder: Path, names: Sequence[str] | None = None) -> Listing:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder that holds the photographs")
-    listed = next((folder / name for name in LISTS if (folder / name).is_file()), None)
-    choice = _by_name(folder, names) if names is not None or listed is None else _by_list(folder, listed)
+    listed = None if names is not None else _list_of(folder)
+    if listed is None:
+        choice = _by_name(folder, names)
+        listed = _list_of(folder / choice.place) if names is None and choice.place else None
+    if listed is not None:
+        choice = _by_list(folder, listed)
     files, there, place = choice.files, choice.there, choice.place
     roles = named_roles(there)
     notes = [f"the pictures are those of its folder {place}"] if place else []
@@ -85,7 +89,10 @@ class _Choice:
 
 
 def _by_list(folder: Path, listed: Path) -> _Choice:
-    files, place = _listed(folder, listed)
+    files, place = _listed(listed)
+    if listed.parent != folder:
+        base = listed.parent.relative_to(folder).as_posix()
+        files, place = [f"{base}/{name}" for name in files], f"{base}/{place}".rstrip("/")
     there = _pictures(folder) + _below(folder, place)
     others = [name for name in there if name not in files and named_roles(there).get(name) != MASK]
     left = f"; not in it: {_joined(others)}" if others else ""
@@ -140,6 +147,10 @@ def _folders(folder: Path) -> list[str]:
     return found
 
 
+def _list_of(folder: Path) -> Path | None:
+    return next((folder / name for name in LISTS if (folder / name).is_file()), None)
+
+
 def _only_folder(folder: Path, there: Sequence[str]) -> str:
     """Return the one folder in a folder that holds photographs, empty where there is none."""
     folders = _folders(folder)
@@ -149,9 +160,9 @@ def _only_folder(folder: Path, there: Sequence[str]) -> str:
     return folders[0] if folders else ""
 
 
-def _listed(folder: Path, path: Path) -> tuple[list[str], str]:
-    """Return the files that a list names, and the folder's folder that they lie in, empty for itself."""
-    names = read_names(path)
+def _listed(path: Path) -> tuple[list[str], str]:
+    """Return the files that a list names, and the folder in the list's folder that they lie in, empty for itself."""
+    folder, names = path.parent, read_names(path)
     best: list[str | None] = []
     for place in ("", *_folders(folder)):
         pictures = {name.lower(): name for name in reversed(_pictures(folder / place))}
