@@ -19,9 +19,17 @@ _SAME = 0.5
 _SOFT, _SOFT_LOSSY = 2, 8
 """Width in pixels of a mask's edge, smoothed, or blurred by lossy compression in blocks of 8."""
 
-_OFF, _OFF_LOSSY = 0.004, 0.06
-_LENGTH, _LENGTH_LOSSY = 0.03, 0.12
-_UNIT = 0.95
+_OFF, _OFF_LOSSY = 0.004, 0.012
+"""How far from its value a mask may be away from edges; compression keeps even blocks even."""
+
+_EQUAL = 0.95
+
+_LENGTH, _LENGTH_LOSSY = 0.03, 0.08
+"""How far from 1 a vector's length may be, after rounding to 8 bits or lossy compression."""
+
+_UNIT, _UNIT_LOSSY = 0.9, 0.85
+"""Least share of vectors that are unit; others lie where object and background blend."""
+
 _GREY = 0.02
 
 
@@ -94,29 +102,30 @@ def _is_mask(pixels: np.ndarray, lossy: bool) -> bool:
 
 
 def _even(colours: np.ndarray, off: float) -> bool:
-    """Tell whether all colours (N, 3) differ from the first by at most `off`."""
-    middle = np.median(colours[:: max(1, len(colours) // 1000)], axis=0)
-    return bool((np.abs(colours - middle) <= off).all())
+    """Tell whether nearly all colours (N, 3) are the same, which noise forbids, and none differs by more than `off`."""
+    usual = np.median(colours[:: max(1, len(colours) // 1000)], axis=0)
+    difference = np.abs(colours - usual).max(-1)
+    return bool(difference.max() <= off and (difference <= _OFF / 10).mean() >= _EQUAL)
 
 
 def _are_normals(few: np.ndarray, lossy: bool) -> bool:
-    flat = few.reshape(-1, 3)
+    flat = np.clip(few.reshape(-1, 3), -2, 2)  # radiance has no bounds, and its square may overflow
     ways = [2 * flat - 1]
     if few.dtype.kind == "f" and flat.min() < -0.01:
         ways.append(flat)
-    tolerance = _LENGTH_LOSSY if lossy else _LENGTH
-    return any(_unit_vectors(way, flat, tolerance) for way in ways)
+    return any(_unit_vectors(way, flat, lossy) for way in ways)
 
 
-def _unit_vectors(vectors: np.ndarray, colours: np.ndarray, tolerance: float) -> bool:
+def _unit_vectors(vectors: np.ndarray, colours: np.ndarray, lossy: bool) -> bool:
     """Tell whether vectors (N, 3) are unit with positive z, but for the background; they must not be greys."""
     paper = np.array([[0, 0, 0], [0.5, 0.5, 0.5], [1, 1, 1]], np.float32)
     nearest = np.abs(colours[:, None] - paper).max(-1).min(1)
     vectors = vectors[nearest > _GREY]
     if len(vectors) < max(64, 0.01 * len(colours)):
         return False
+    tolerance = _LENGTH_LOSSY if lossy else _LENGTH
     unit = (np.abs(np.linalg.norm(vectors, axis=1) - 1) <= tolerance) & (vectors[:, 2] > 0)
-    if unit.mean() < _UNIT:
+    if unit.mean() < (_UNIT_LOSSY if lossy else _UNIT):
         return False
     sides = np.abs(vectors[:, :2].mean(0))
     return bool(sides.max() < 0.8 * vectors[:, 2].mean() and (np.ptp(vectors, axis=0) > tolerance).any())
