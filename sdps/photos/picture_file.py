@@ -14,7 +14,7 @@ from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
 from sdps.photos.pictures.decoders import DECODERS
-from sdps.photos.pictures.kinds import NAMED, SUFFIXES, Coding, foreign_kind, name_kind, picture_kind
+from sdps.photos.pictures.picture_kinds import NAMED, SUFFIXES, Coding, foreign_kind, name_kind, picture_kind
 from sdps.photos.response import profile_exponent
 
 

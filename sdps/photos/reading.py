@@ -14,8 +14,8 @@ from render.shared.errors import InputError
 from sdps.photos.doubts import Doubts
 from sdps.photos.light_files import Lights, read_intensities, read_lights
 from sdps.photos.picture_file import decode, turned
-from sdps.photos.pictures.kinds import Coding
 from sdps.photos.pictures.listing import list_pictures
+from sdps.photos.pictures.picture_kinds import Coding
 from sdps.photos.response import to_linear
 from sdps.photos.survey import survey
 

@@ -13,9 +13,9 @@ from sdps.photos.masks import Variation, automatic_mask, bright_part, read_mask
 from sdps.photos.picture_file import Picture, decode, misnamed, turned
 from sdps.photos.pictures.contents import judge_content, like_mask
 from sdps.photos.pictures.gamma import resolve_gamma
-from sdps.photos.pictures.kinds import LOSSY, Coding
 from sdps.photos.pictures.listing import Listing
-from sdps.photos.pictures.names import MASK, is_bare
+from sdps.photos.pictures.picture_kinds import LOSSY, Coding
+from sdps.photos.pictures.picture_names import MASK, is_bare
 from sdps.photos.response import brightness, full_scale, to_linear
 
 _DARK = 0.5
@@ -197,14 +197,15 @@ def _given_masks(folder: Path, listing: Listing) -> _Masks:
         raise InputError(f"{folder}: several masks ({', '.join(bare)}); keep one, or name one with --mask")
     if bare:
         others = [name for name in listing.masks if name not in bare]
-        notes = (f"left out: {_span(others)} (another mask than {bare[0]})",) if others else ()
-        return _Masks(folder / bare[0], notes)
-    found, odd = [], []
+        why = f"left out: {_span(others)} (another mask than {bare[0]})"
+        return _Masks(folder / bare[0], (why,) if others else ())
+    found: list[tuple[str, np.ndarray]] = []
+    odd: list[tuple[str, np.ndarray]] = []
+    notes: list[str] = []
     for name in listing.masks:
         picture = decode(folder / name)
         cut_out = picture.alpha is not None and np.ptp(picture.alpha) > 0
         (found if cut_out or like_mask(picture.pixels) else odd).append((name, bright_part(picture)))
-    notes = []
     if odd:
         names = _span([name for name, _ in odd])
         notes.append(f"left out: {names} (a mask by name, but of many grey values); --mask or --images takes it")

@@ -12,7 +12,7 @@ from typing import Any
 
 from render.shared.errors import InputError
 from render.shared.files import parse_json
-from sdps.photos.pictures.kinds import SUFFIXES, picture_kind
+from sdps.photos.pictures.picture_kinds import SUFFIXES, picture_kind
 
 PICTURES = tuple(SUFFIXES)
 _BESIDE = (".txt", ".json")

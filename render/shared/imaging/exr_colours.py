@@ -15,8 +15,11 @@ import numpy as np
 from render.shared.decoding import decoding, exr_parts, silenced
 from render.shared.errors import InputError
 
-_COLOURS = (("R", "G", "B"), ("RED", "GREEN", "BLUE"))
-_GREYS = ("Y", "V", "L", "GRAY", "GREY", "LUMINANCE")
+_LIGHT: tuple[tuple[str, ...], ...] = (
+    ("R", "G", "B"), ("RED", "GREEN", "BLUE"), ("Y",), ("V",), ("L",), ("GRAY",), ("GREY",), ("LUMINANCE",),
+)  # fmt: skip
+"""Channels that are light, in capitals, the first that are there."""
+
 _PREFERRED = ("combined", "beauty", "rgba", "rgb", "composite", "color", "colour", "image", "final")
 _OTHERS = re.compile(
     r"crypto|normal|denois|depth|position|motion|vector|velocity|\buv\b|^[nzp]$|\bmask\b|\bmatte\b|objectid|index|\bmist\b",
@@ -88,11 +91,8 @@ def _layers(part: Any, alone: bool) -> Iterator[_Layer]:
         full = ".".join(piece for piece in ("" if alone else part.name() or "", before) if piece)
         if _OTHERS.search(full):
             continue
-        names = next((names for names in _COLOURS if group.keys() >= set(names)), None)
-        if names is None:
-            names = next(((name,) for name in _GREYS if name in group), None)
-        if names is None and group.keys() - {"A"} == {"R"}:
-            names = ("R",)
+        ways = (*_LIGHT, ("R",)) if group.keys() <= {"R", "A"} else _LIGHT
+        names = next((names for names in ways if group.keys() >= set(names)), None)
         if names is not None:
             yield _Layer(full, tuple(group[name] for name in names), group.get("A"), part.header)
 

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from sdps.photos.pictures.names import MASK, NORMALS
+from sdps.photos.pictures.picture_names import MASK, NORMALS
 
 _SAMPLES = 1 << 14
 _SMALLEST = 256

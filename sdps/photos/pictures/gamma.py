@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from render.shared.errors import InputError
-from sdps.photos.pictures.kinds import LOSSY, Coding
 from sdps.photos.pictures.listing import find_light_files
+from sdps.photos.pictures.picture_kinds import LOSSY, Coding
 
 SRGB_EXPONENT = 2.224
 """log f(1/2) / log(1/2) of sRGB's decoding curve f, by which colour profiles with that curve are recognised."""

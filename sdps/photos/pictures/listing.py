@@ -9,8 +9,8 @@ from pathlib import Path, PurePosixPath
 
 from render.shared.errors import InputError
 from render.shared.tables import natural_key, read_names
-from sdps.photos.pictures.kinds import NAMED, SUFFIXES, UNREAD
-from sdps.photos.pictures.names import AMBIENT, DARK, MASK, is_bare, named_roles
+from sdps.photos.pictures.picture_kinds import NAMED, SUFFIXES, UNREAD
+from sdps.photos.pictures.picture_names import AMBIENT, DARK, MASK, is_bare, named_roles
 
 LISTS = ("names.txt", "filenames.txt")
 """Files that name the photographs in order; the first that is there decides."""

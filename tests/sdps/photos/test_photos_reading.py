@@ -256,9 +256,9 @@ def test_truncated_tiff_with_its_directory_in_front(tmp_path: Path) -> None:
 def test_pictures_that_do_not_fit_together(good: Path) -> None:
     folders.write(good / "4.png", RAMP[:-1], 16)
     message = refusal(good)
-    assert "4.png: is 20x13 pixels, 1.png is 20x14" in message
+    assert "4.png: is 20x13 pixels, the other 4 (as 1.png) are 20x14" in message
     folders.write(good / "4.png", RAMP, 8)
-    assert "4.png: is 8-bit PNG, 1.png is 16-bit PNG" in refusal(good)
+    assert "4.png: is 8-bit PNG, the other 4 (as 1.png) are 16-bit PNG" in refusal(good)
 
 
 def test_bad_masks(good: Path) -> None:

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from render.shared.images import encode_normals
 from sdps.photos.pictures.contents import judge_content, like_mask
-from sdps.photos.pictures.names import MASK, NORMALS
+from sdps.photos.pictures.picture_names import MASK, NORMALS
 
 LIGHTS = np.array([[0.5, 0, 0.8], [-0.5, 0, 0.8], [0, 0.5, 0.8], [0, -0.9, 0.1], [0, 0, 1]])
 
@@ -73,7 +73,7 @@ def test_a_relief_of_normals_that_fills_the_frame() -> None:
 @pytest.mark.parametrize("bits", [8, 16, 32])
 @pytest.mark.parametrize("gain", [0.01, 0.1, 1, 3, 30, 1000])
 def test_photographs_are_neither(gain: float, bits: int) -> None:
-    images, mask = folders.matte(LIGHTS, size=96)
+    images, _ = folders.matte(LIGHTS, size=96)
     for image in images:
         for tint in ([1, 1, 1], [0.5, 0.5, 1], [1, 0.7, 0.4]):
             values = np.clip(image * gain * np.array(tint), 0, 1 if bits < 32 else None).astype(np.float32)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sdps.photos.pictures.names import AMBIENT, DARK, MASK, NORMALS, named_roles, split_words
+from sdps.photos.pictures.picture_names import AMBIENT, DARK, MASK, NORMALS, named_roles, split_words
 
 SHOTS = [f"p{number:02}.png" for number in range(1, 9)]
 
@@ -10,11 +10,14 @@ SHOTS = [f"p{number:02}.png" for number in range(1, 9)]
 @pytest.mark.parametrize(
     ("name", "role"),
     [
-        ("x.mask.png", MASK), ("sample_mask.png", MASK), ("Mask-001.png", MASK), ("MASK.PNG", MASK), ("catMask.tga", MASK),
+        ("x.mask.png", MASK), ("sample_mask.png", MASK), ("Mask-001.png", MASK), ("MASK.PNG", MASK),
+        ("catMask.tga", MASK),
         ("mask2.png", MASK), ("IMGMask.png", MASK), ("masks.png", MASK), ("cat silhouette.png", MASK),
-        ("normal_mask.png", MASK), ("normal_map.png", NORMALS), ("NormalMap.png", NORMALS), ("Normal_gt.png", "a result"),
+        ("normal_mask.png", MASK), ("normal_map.png", NORMALS), ("NormalMap.png", NORMALS),
+        ("Normal_gt.png", "a result"),
         ("x_normal_result.png", "a result"), ("cat.normals.exr", NORMALS), ("cat_normal.png", NORMALS),
-        ("cat_depth.png", "depth"), ("heightMap.tif", "depth"), ("catAlbedo01.png", "albedo"), ("baseColor.png", "albedo"),
+        ("cat_depth.png", "depth"), ("heightMap.tif", "depth"), ("catAlbedo01.png", "albedo"),
+        ("baseColor.png", "albedo"),
         ("base_color.png", "albedo"), ("roughness.png", "a map of the material"), ("ambient.png", AMBIENT),
         ("sample_ambient.png", AMBIENT), ("lights_off.png", AMBIENT), ("no-flash.jpg", AMBIENT), ("dark.png", DARK),
     ],
