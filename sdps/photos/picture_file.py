@@ -1,7 +1,6 @@
 """One picture file, decoded at its own depth, whatever its name says it is."""
 
 import logging
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -90,9 +89,7 @@ def _quiet() -> Iterator[None]:
     for logger in loggers:
         logger.setLevel(logging.CRITICAL + 1)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
+        yield
     finally:
         cv2.utils.logging.setLogLevel(before)
         for logger, level in zip(loggers, levels, strict=True):

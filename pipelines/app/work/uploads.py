@@ -135,7 +135,7 @@ def unpack(archive: Path, folder: Path, limits: Limits, room: int) -> int:
     except Exception as error:  # damaged archives end in errors of many kinds: zlib.error, OSError of a seek
         raise InputError(f"{archive.name}: cannot be unpacked ({error}); make the ZIP again") from error
     if not count:
-        raise InputError(f"{archive.name}: no pictures in it; put PNG, TIFF, JPEG or EXR files there")
+        raise InputError(f"{archive.name}: no pictures in it; put PNG, TIFF, JPEG or other pictures there")
     return size
 
 

@@ -4,8 +4,11 @@ Renderers write many layers into a file, under names of their own: `ViewLayer.Co
 `rgba` with plain `R`. A file may store less than the picture, the data window, or more; what is not stored is 0.
 """
 
+import io
 import re
+import threading
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,9 @@ import numpy as np
 
 from render.shared.decoding import decoding, exr_parts, silenced
 from render.shared.errors import InputError
+
+_PRINTING = threading.Lock()
+"""OpenEXR's binding prints to Python's standard output, which one thread at a time may exchange."""
 
 _LIGHT: tuple[tuple[str, ...], ...] = (
     ("R", "G", "B"), ("RED", "GREEN", "BLUE"), ("Y",), ("V",), ("L",), ("GRAY",), ("GREY",), ("LUMINANCE",),
@@ -62,7 +68,7 @@ def read_exr_colours(path: str | Path, remedy: str = "copy it again") -> ExrColo
     Raises:
         InputError: missing, damaged, of a size that such a file cannot hold, or without light in it.
     """
-    with decoding(path, "an EXR picture", remedy), silenced():
+    with decoding(path, "an EXR picture", remedy), silenced(), _PRINTING, redirect_stdout(io.StringIO()):
         parts = exr_parts(path, remedy, grouped=False)
         layers = [layer for part in parts for layer in _layers(part, alone=len(parts) == 1)]
         if not layers:
