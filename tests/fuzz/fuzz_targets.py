@@ -108,7 +108,7 @@ def _pictures(folder: Path) -> None:
     assert cv2.imwrite(str(folder / "alpha.png"), (grey * 65535).astype(np.uint16))
     for name in ("a.bmp", "a.tga", "a.ppm", "a.webp", "jpeg.png"):
         Image.fromarray((_IMAGE * 255).astype(np.uint8)).save(folder / name, "JPEG" if name == "jpeg.png" else None)
-    (folder / "text.pgm").write_text("P2 16 12 1023\n" + " ".join(str(number % 1024) for number in range(192)))
+    (folder / "text.pgm").write_text("P2 16 12 1023\n" + " ".join(str(5 * number) for number in range(192)))
     layers = {f"View.{name}": np.ascontiguousarray(_IMAGE[..., k], np.float32) for k, name in enumerate("RGB")}
     OpenEXR.File({}, layers | {"View.Depth.Z": layers["View.R"]}).write(str(folder / "layers.exr"))
 
