@@ -5,10 +5,14 @@ sensibly hold is refused before anything is unpacked: a picture of 1 KB may clai
 """
 
 import os
+import sys
+import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import OpenEXR
 from PIL import Image
 
@@ -37,7 +41,9 @@ def decoding(path: str | Path, what: str, remedy: str = "copy it again") -> Iter
         InputError: in place of any other exception; one that is raised inside passes.
     """
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # libraries' remarks on odd tags and sizes
+            yield
     except InputError:
         raise
     except Exception as error:
@@ -83,21 +89,94 @@ def check_picture(path: str | Path, picture: Image.Image, data: bytes) -> None:
     check_unpacked(path, picture.width * picture.height * bands * (2 if wide else 1), "its pixels")
 
 
-def exr_parts(path: str | Path, remedy: str = "copy it again") -> list[OpenEXR.Part]:
+def exr_parts(path: str | Path, remedy: str = "copy it again", *, grouped: bool = True) -> list[OpenEXR.Part]:
     """Decode all parts of an OpenEXR file, after a look at their headers.
+
+    Args:
+        path: The file.
+        remedy: What to do about a damaged one.
+        grouped: Join R, G and B of a layer `image` to one array (H, W, 3) `image`, those without a layer to `RGB`;
+            a layer of mixed types is then refused. Otherwise channels keep their names, as `image.R`.
 
     Raises:
         InputError: missing, damaged, without a part, or of a size that such a file cannot hold.
     """
     with decoding(path, "an EXR picture", remedy):
-        size = 0
-        with OpenEXR.File(os.fspath(path), header_only=True) as file:
-            for part in file.parts:
-                low, high = (corner.astype(int) for corner in part.header["dataWindow"])
-                width, height = (max(int(side), 0) for side in high - low + 1)
-                size += width * height * 4 * len(part.header["channels"])
-        check_unpacked(path, size, "its pixels")
-        parts = OpenEXR.File(os.fspath(path)).parts
-        if not parts:
-            raise InputError(f"{path}: damaged or not an EXR picture (no part of it can be read); {remedy}")
+        count = check_exr(path)
+        parts = OpenEXR.File(os.fspath(path), separate_channels=not grouped).parts
+        if len(parts) < max(count, 1):  # it leaves out those it cannot decode
+            which = "no part of it" if not parts else f"only {len(parts)} of its {count} parts"
+            raise InputError(f"{path}: damaged or not an EXR picture ({which} can be read); {remedy}")
         return parts
+
+
+def check_exr(path: str | Path) -> int:
+    """Refuse an OpenEXR file whose headers announce more pixels than it can hold; none of them is decoded.
+
+    Returns:
+        The number of its parts.
+
+    Raises:
+        InputError: too large a data or display window; OpenEXR's own errors pass.
+    """
+    stored = shown = 0
+    with OpenEXR.File(os.fspath(path), header_only=True) as file:
+        for part in file.parts:
+            stored += _area(part.header["dataWindow"]) * 4 * len(part.header["channels"])
+            shown = max(shown, _area(part.header["displayWindow"]))
+        count = len(file.parts)
+    check_unpacked(path, stored, "its pixels")
+    check_unpacked(path, 4 * shown, "one channel of its display window")  # rightly large and nearly empty
+    return count
+
+
+def _area(window: tuple[np.ndarray, np.ndarray]) -> int:
+    low, high = (corner.astype(int) for corner in window)
+    width, height = (max(int(side), 0) for side in high - low + 1)
+    return width * height
+
+
+_SILENT = threading.Lock()
+_silencers = 0
+_kept = -1
+
+
+@contextmanager
+def silenced() -> Iterator[None]:
+    """Keep what C libraries print about damaged files off standard error, in all threads of the process.
+
+    Python's own stream writes there as well, so nothing but decoding belongs inside.
+    """
+    global _silencers
+    with _SILENT:
+        if not _silencers:
+            _mute()
+        _silencers += 1
+    try:
+        yield
+    finally:
+        with _SILENT:
+            _silencers -= 1
+            if not _silencers:
+                _unmute()
+
+
+def _mute() -> None:
+    global _kept
+    if sys.stderr is not None:
+        sys.stderr.flush()
+    try:
+        _kept = os.dup(2)
+    except OSError:  # closed, as of a program without a console
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+
+
+def _unmute() -> None:
+    global _kept
+    if _kept >= 0:
+        os.dup2(_kept, 2)
+        os.close(_kept)
+        _kept = -1

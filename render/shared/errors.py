@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 _BREAKS = re.compile(r"\s*[\n\v\f\r\x1c-\x1e\x85\u2028\u2029]\s*")
+_ADDRESSES = re.compile(r"\s*<[^<>]*\b(?:at )?0x[0-9a-fA-F]{4,}[^<>]*>")
 _LONGEST = 1000
 
 
@@ -16,14 +17,15 @@ class InputError(ValueError):
     """A mistake in a file, flag or name. The message is one line: what is wrong, where, and the remedy.
 
     It may quote names and values from files. So line breaks in it become blanks, other control characters, which a
-    terminal would obey, are spelled out, and of more than 1,000 characters the middle is left out.
+    terminal would obey, are spelled out, objects that a library's message shows by their address in memory
+    (`<_io.BytesIO object at 0x7f...>`) are dropped, and of more than 1,000 characters the middle is left out.
     """
 
     def __init__(self, message: object) -> None:
         text = str(message)
         if len(text) > 100 * _LONGEST:
             text = f"{text[:_LONGEST]}{text[-_LONGEST:]}"
-        text = _BREAKS.sub(" ", text)
+        text = _ADDRESSES.sub("", _BREAKS.sub(" ", text))
         text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
         if len(text) > _LONGEST:
             text = f"{text[: _LONGEST // 2]} [...] {text[-_LONGEST // 2 :]}"

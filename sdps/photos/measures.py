@@ -4,6 +4,7 @@ Legend: L images, P sampled pixels of the object.
 """
 
 import hashlib
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -100,11 +101,12 @@ def spread(observations: np.ndarray) -> np.ndarray:
     plain and painted, frontal and tilted by 40 degrees (Lambertian); the third is 0.5 to 0.9 of the second, and under
     0.25 of it for lights along an arc of up to 100 degrees.
     """
+    observations = observations.astype(np.float64)  # squares of float32 overflow where radiance has odd units
     lengths = np.linalg.norm(observations, axis=1, keepdims=True)
     lit = observations[lengths[:, 0] > 1e-6] / lengths[lengths[:, 0] > 1e-6]
     if not len(lit):
         return np.zeros(1)
-    values = np.linalg.svd(lit.astype(np.float64), compute_uv=False)
+    values = np.linalg.svd(lit, compute_uv=False)
     return values / values[0]
 
 
@@ -113,7 +115,7 @@ def _camera_settings(path: Path) -> dict[str, float]:
     if path.suffix.lower() == ".exr":
         return {}
     try:
-        with Image.open(path) as picture:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # of damaged tags, of size
             if picture.format not in ("JPEG", "MPO", "TIFF"):
                 return {}
             tags = dict(picture.getexif()) | picture.getexif().get_ifd(_EXIF)

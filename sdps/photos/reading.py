@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from render.shared.errors import InputError
-from render.shared.progress import progress_bar
 from sdps.photos.doubts import Doubts
-from sdps.photos.gamma import resolve_gamma
 from sdps.photos.light_files.light_choice import known_lights
-from sdps.photos.listing import find_mask, list_pictures
-from sdps.photos.masks import Variation, automatic_mask, read_mask
-from sdps.photos.picture_file import Coding, Picture, decode, turned
-from sdps.photos.response import brightness, to_linear
+from sdps.photos.picture_file import decode, turned
+from sdps.photos.pictures.listing import list_pictures
+from sdps.photos.pictures.picture_kinds import Coding
+from sdps.photos.response import to_linear
+from sdps.photos.survey import survey
 
 _LOG = logging.getLogger(__name__)
 
@@ -105,8 +104,8 @@ def load(
     Every file is decoded once, one at a time, so that a damaged one is found now (the folder: docs/guides/capture.md).
 
     Args:
-        folder: PNG, TIFF, JPEG or EXR files of one kind and size, and what may lie beside them.
-        mask: A picture, bright where the object is; None for the folder's mask.* or, without one, an automatic mask.
+        folder: Pictures of one kind and size, and what may lie there with them.
+        mask: A picture, bright where the object is; None for the folder's mask or, without one, an automatic mask.
         lights: A lights file (docs/guides/capture.md), or `folder` for that of the folder; None for unknown lights.
         intensities: A file of intensities, `folder` for its light_intensities.txt, or `equal`; None for those of
             `lights`, which are found from the photographs where it has none.
@@ -120,99 +119,20 @@ def load(
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
     """
     folder = Path(folder)
-    files, notes = list_pictures(folder, names)
+    listing = list_pictures(folder, names)
     doubts = Doubts(anyway)
-    survey = _survey(folder, files, gamma, find_mask(folder) if mask is None else Path(mask), doubts)
-    known = known_lights(folder, files, lights, intensities, frame, doubts)
+    seen = survey(folder, listing, gamma, None if mask is None else Path(mask), doubts)
+    try:
+        known = known_lights(listing.places, seen.files, lights, intensities, frame, doubts)
+    except InputError as error:
+        raise InputError(f"{error} ({seen.left_out})" if seen.left_out else error) from error
     photos = Photographs(
-        folder=folder, files=files, shape=survey.mask.shape, bits=survey.coding.bits, gamma=survey.gamma,
-        mask=survey.mask, mask_origin=survey.origin, light_directions=known.directions, intensities=known.intensities,
-        lights_name=known.name, lights_frame=known.frame, notes=(*notes, *survey.notes, *known.notes),
-        coding=survey.coding, orientation=survey.orientation,
+        folder=folder, files=seen.files, shape=seen.mask.shape, bits=seen.coding.bits, gamma=seen.gamma,
+        mask=seen.mask, mask_origin=seen.origin, light_directions=known.directions, intensities=known.intensities,
+        lights_name=known.name, lights_frame=known.frame, notes=(*listing.notes, *seen.notes, *known.notes),
+        coding=seen.coding, orientation=seen.orientation,
         overridden=tuple(doubts.overridden),
     )  # fmt: skip
     if photos.mask_origin == "automatic" and photos.mask.all():
         _LOG.warning("%s", next(note for note in photos.notes if "whole frame" in note))
     return photos
-
-
-@dataclass(frozen=True, eq=False)
-class _Survey:
-    """What one look at all files tells."""
-
-    coding: Coding
-    gamma: str | float
-    orientation: int
-    mask: np.ndarray
-    origin: str
-    notes: tuple[str, ...]
-
-
-def _survey(
-    folder: Path, files: tuple[str, ...], gamma: str | float, mask_file: Path | None, doubts: Doubts
-) -> _Survey:
-    """Decode every file once: all of one kind and size, finite in the mask, and the mask if it has to be found."""
-    first = decode(folder / files[0])
-    applied, why = resolve_gamma(gamma, first.coding, folder)
-    shape = turned(first.pixels, first.orientation).shape[:2]
-    given = None if mask_file is None else read_mask(mask_file, shape)
-    variation = Variation(shape)
-    broken = np.full(shape, -1, np.int32)  # the first picture with a value that is not finite
-    turns = set()
-    for number, file in enumerate(progress_bar(files, desc="photographs", unit="picture", delay=5)):
-        picture = first if number == 0 else decode(folder / file)
-        _refuse_other(folder, files[0], first, file, picture)
-        turns.add(picture.orientation)
-        pixels = turned(picture.pixels, first.orientation)
-        if picture.coding.floating:
-            broken[(broken < 0) & ~np.isfinite(pixels).all(-1)] = number
-        if given is None:
-            variation.add(brightness(to_linear(pixels, applied)))
-    notes = [why, *_orientation_note(first.orientation, turns)]
-    if given is None and not variation.changes().any():
-        doubts.stop(f"{folder}: nothing changes between the pictures; is the lamp on and moved? otherwise give a mask")
-    known = None if given is None or mask_file is None else (given, f"the mask is {mask_file.name}")
-    try:
-        mask, said = known or automatic_mask(variation)
-    except InputError as error:
-        raise InputError(f"{folder}: {error}") from error
-    _refuse_broken(folder, files, broken, mask, doubts)
-    if (broken >= 0).any():
-        notes.append("values that are not finite were set to 0")
-    origin = "automatic" if given is None else "file"
-    return _Survey(first.coding, applied, first.orientation, mask, origin, (*notes, said))
-
-
-def _refuse_other(folder: Path, one: str, first: Picture, other: str, picture: Picture) -> None:
-    """Refuse a picture of another size or coding than the first."""
-    if picture.pixels.shape != first.pixels.shape:
-        sizes = [f"{pixels.shape[1]}x{pixels.shape[0]}" for pixels in (picture.pixels, first.pixels)]
-        raise InputError(
-            f"{folder / other}: is {sizes[0]} pixels, {one} is {sizes[1]}; all pictures must have one size and the "
-            "camera must not move"
-        )
-    if picture.coding != first.coding:
-        raise InputError(
-            f"{folder / other}: is {picture.coding}, {one} is {first.coding}; keep one kind in the folder or name the "
-            "pictures to use"
-        )
-
-
-def _refuse_broken(folder: Path, files: tuple[str, ...], broken: np.ndarray, mask: np.ndarray, doubts: Doubts) -> None:
-    """Refuse values that are not finite inside the mask."""
-    inside = broken[mask]
-    bad = inside[inside >= 0]
-    if len(bad):
-        name = files[int(bad.min())]
-        doubts.stop(
-            f"{folder / name}: NaN or infinite values inside the mask ({len(bad)} pixels over all pictures); write it "
-            "again or cut them out of the mask"
-        )
-
-
-def _orientation_note(first: int, turns: set[int]) -> list[str]:
-    if len(turns) > 1:
-        return [
-            "the pictures' orientation tags differ, as happens when the camera looks down; all were turned as the first"
-        ]
-    return [] if first == 1 else ["all pictures were turned upright as their orientation tag says"]

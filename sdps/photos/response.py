@@ -5,9 +5,6 @@ from functools import cache
 
 import numpy as np
 
-SRGB_EXPONENT = 2.224
-"""log f(1/2) / log(1/2) of sRGB's decoding curve f, by which colour profiles with that curve are recognised."""
-
 _FULL = {8: 255, 16: 65535}
 
 

@@ -159,7 +159,8 @@ def residuals(
 
 
 def _relative(off: np.ndarray, power: np.ndarray) -> np.ndarray:
-    return np.sqrt(off / np.maximum(power, np.finfo(np.float64).tiny))
+    """Return the root of off / power; 1 where all is black and the model is not."""
+    return np.sqrt(np.divide(off, power, out=(off > 0).astype(np.float64), where=power > np.finfo(np.float32).tiny))
 
 
 def _shading(unit: np.ndarray, light: np.ndarray) -> np.ndarray:  # (n,)

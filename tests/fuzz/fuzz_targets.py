@@ -19,10 +19,12 @@ import data_folders
 import exchange_support
 import fuzz_app
 import numpy as np
+import OpenEXR
 import scipy.io
 import tifffile
 import trimesh
 import yaml
+from PIL import Image
 from textures_support import write_maps
 
 
@@ -105,6 +107,11 @@ def _pictures(folder: Path) -> None:
     tifffile.imwrite(folder / "float.tiff", _IMAGE.astype(np.float32), compression="deflate")
     grey = np.dstack([_IMAGE, _IMAGE[..., :1]])
     assert cv2.imwrite(str(folder / "alpha.png"), (grey * 65535).astype(np.uint16))
+    for name in ("a.bmp", "a.tga", "a.ppm", "a.webp", "jpeg.png"):
+        Image.fromarray((_IMAGE * 255).astype(np.uint8)).save(folder / name, "JPEG" if name == "jpeg.png" else None)
+    (folder / "text.pgm").write_text("P2 16 12 1023\n" + " ".join(str(5 * number) for number in range(192)))
+    layers = {f"View.{name}": np.ascontiguousarray(_IMAGE[..., k], np.float32) for k, name in enumerate("RGB")}
+    OpenEXR.File({}, layers | {"View.Depth.Z": layers["View.R"]}).write(str(folder / "layers.exr"))
 
 
 def _environments(folder: Path) -> None:

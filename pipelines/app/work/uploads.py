@@ -13,7 +13,7 @@ from PIL import Image
 from render.shared.errors import InputError
 from render.shared.files import parse_json
 from sdps.photos.light_files import SUFFIXES as BESIDE
-from sdps.photos.picture_file import SUFFIXES
+from sdps.photos.pictures.picture_kinds import SUFFIXES
 
 PICTURES = tuple(SUFFIXES)
 """Suffixes of the pictures that `sdps infer` reads; so does the page."""

@@ -14,9 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from render.shared.decoding import check_unpacked, decoding, exr_parts
+from render.shared.decoding import check_unpacked, decoding, silenced
 from render.shared.errors import InputError, unknown
 from render.shared.files import read_bytes
+from render.shared.imaging.exr_colours import read_exr_colours
 from render.shared.seeds import generator
 
 HEIGHT = 64  # rows of built-in maps
@@ -180,17 +181,15 @@ def _read(path: Path) -> np.ndarray:
         with decoding(path, "a Radiance picture", "save it as .hdr or .exr again"):
             if size:
                 check_unpacked(path, 12 * int(size[1]) * int(size[2]), "its pixels")
-                pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+                with silenced():
+                    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if pixels is None or pixels.ndim != 3:
             raise InputError(f"{path}: damaged or no Radiance picture; save it as .hdr or .exr again")
         return pixels[..., ::-1]
-    channels = exr_parts(path, "save it as .hdr or .exr again")[0].channels
-    joined = next((channels[name].pixels for name in ("RGB", "RGBA") if name in channels), None)
-    if joined is not None:
-        return joined[..., :3]
-    if not {"R", "G", "B"} <= channels.keys():
-        raise InputError(f"{path}: has channels {', '.join(channels)}; an environment map needs R, G and B")
-    return np.stack([channels[name].pixels for name in "RGB"], axis=-1)
+    pixels = read_exr_colours(path, "save it as .hdr or .exr again").pixels
+    if pixels.shape[2] != 3:
+        raise InputError(f"{path}: is grey; an environment map needs R, G and B")
+    return pixels
 
 
 def _checked(pixels: np.ndarray, name: str) -> np.ndarray:

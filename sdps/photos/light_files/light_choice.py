@@ -35,7 +35,7 @@ class KnownLights:
 
 
 def known_lights(
-    folder: Path,
+    folders: Sequence[Path],
     files: Sequence[str],
     lights: str | Path | None,
     intensities: str | Path | None,
@@ -45,7 +45,7 @@ def known_lights(
     """Read directions and intensities where asked for; a frame flag without lights is checked all the same.
 
     Args:
-        folder: The photographs.
+        folders: Where the photographs and what goes with them may lie, the first first.
         files: Their names, (L,).
         lights: A file, `folder` for what lies there, or None.
         intensities: A file, `folder`, `equal`, or None for those of the file of lights or of the light_intensities.txt
@@ -57,8 +57,8 @@ def known_lights(
         InputError: a file that is missing or cannot be used, or intensities in two files.
     """
     frame_matrix(frame)
-    asked = (find_lights(folder) or lights) if str(lights) == "folder" else lights
-    path = _resolve(folder, asked, _USUAL)
+    lying = next(filter(None, map(find_lights, folders)), lights) if str(lights) == "folder" else lights
+    path = _resolve(folders, lying, _USUAL)
     directions = strengths = None
     name, used, notes = "", "", KnownLights.notes
     if path is not None:
@@ -68,7 +68,7 @@ def known_lights(
     if intensities is not None and str(intensities) == EQUAL:
         strengths, notes = np.ones(len(files), np.float32), (*notes, "intensities are taken for equal, as asked")
         return KnownLights(directions=directions, intensities=strengths, name=name, frame=used, notes=notes)
-    second = _resolve(folder, intensities, (_PARTNER,))
+    second = _resolve(folders, intensities, (_PARTNER,))
     partner = None if path is None else path.with_name(_PARTNER)
     if second is None and path is not None and path.name == _USUAL[1] and partner is not None and partner.is_file():
         second = partner
@@ -82,11 +82,11 @@ def known_lights(
     return KnownLights(directions=directions, intensities=strengths, name=name, frame=used, notes=notes)
 
 
-def _resolve(folder: Path, asked: str | Path | None, known: tuple[str, ...]) -> Path | None:
-    """Resolve `folder` to the first known file of the folder."""
+def _resolve(folders: Sequence[Path], asked: str | Path | None, known: tuple[str, ...]) -> Path | None:
+    """Resolve `folder` to the first known file of the folders."""
     if asked is None or str(asked) != "folder":
         return None if asked is None else Path(asked)
-    found = next((folder / name for name in known if (folder / name).is_file()), None)
+    found = next((folder / name for folder in folders for name in known if (folder / name).is_file()), None)
     if found is None:
-        raise InputError(f"{folder}: no {' or '.join(known)} in it; give the file's path")
+        raise InputError(f"{folders[0]}: no {' or '.join(known)} in it; give the file's path")
     return found

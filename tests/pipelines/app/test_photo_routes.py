@@ -10,6 +10,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import photo_folders as folders
 import pytest
 from app_server import Client, serving
@@ -156,6 +157,40 @@ def test_the_header_of_an_exr_is_read_without_its_library(tmp_path: Path) -> Non
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(InputError, match=r"a\.exr: is no picture"):
         uploads.check_pixels(path, uploads.Limits())
+
+
+def test_uploads_are_what_their_bytes_say(tmp_path: Path) -> None:
+    picture, limits = np.zeros((40, 50, 3), np.uint8), uploads.Limits(pixels=1000)
+    kinds = {
+        "PNG": ".png",
+        "JPEG": ".jpg",
+        "BMP": ".bmp",
+        "PPM": ".ppm",
+        "TGA": ".tga",
+        "WEBP": ".webp",
+        "TIFF": ".tif",
+    }
+    for kind, suffix in kinds.items():
+        for name in {f"a{suffix}", "a.png" if kind != "TGA" else "a.tga", "a.jpg" if kind != "TGA" else "a.tga"}:
+            path = tmp_path / uploads.safe_name(name)
+            Image.fromarray(picture).save(path, kind)
+            assert uploads._size(path) == (50, 40)
+            with pytest.raises(InputError, match="is 50x40 pixels"):
+                uploads.check_pixels(path, limits)
+    folders.write(tmp_path / "a.exr", picture / 1.0)
+    (tmp_path / "a.exr").rename(tmp_path / "b.png")
+    assert uploads._size(tmp_path / "b.png") == (50, 40)
+
+
+def test_all_windows_of_an_exr_count(tmp_path: Path) -> None:
+    small, large = np.zeros((4, 5), np.float32), np.zeros((40, 50), np.float32)
+    header = {"displayWindow": (np.array([0, 0], np.int32), np.array([4, 3], np.int32))}
+    parts = [OpenEXR.Part(dict(header), {"Y": small}, "a"), OpenEXR.Part(dict(header), {"Y": large}, "b")]
+    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
+    assert uploads._size(tmp_path / "a.exr") == (50, 40)
+    window = (np.array([0, 0], np.int32), np.array([999, 799], np.int32))
+    OpenEXR.File({"displayWindow": window}, {"Y": small}).write(str(tmp_path / "b.exr"))
+    assert uploads._size(tmp_path / "b.exr") == (1000, 800)
 
 
 def test_archives_do_not_explode(address: str, hills: Path) -> None:

@@ -15,7 +15,8 @@ from PIL import Image, ImageCms, ImageOps
 
 from render.shared.errors import InputError
 from sdps import photos
-from sdps.photos.response import SRGB_EXPONENT, profile_exponent
+from sdps.photos.pictures.gamma import SRGB_EXPONENT
+from sdps.photos.response import profile_exponent
 
 RAMP = np.stack(np.broadcast_arrays(np.linspace(0, 1, 20)[None], np.linspace(0.1, 0.9, 14)[:, None], 0.5), axis=-1)
 PAIR = np.stack([RAMP, RAMP * 0.5])  # (2, 14, 20, 3)
@@ -255,9 +256,9 @@ def test_truncated_tiff_with_its_directory_in_front(tmp_path: Path) -> None:
 def test_pictures_that_do_not_fit_together(good: Path) -> None:
     folders.write(good / "4.png", RAMP[:-1], 16)
     message = refusal(good)
-    assert "4.png: is 20x13 pixels, 1.png is 20x14" in message
+    assert "4.png: is 20x13 pixels, the other 4 (as 1.png) are 20x14" in message
     folders.write(good / "4.png", RAMP, 8)
-    assert "4.png: is 8-bit PNG, 1.png is 16-bit PNG" in refusal(good)
+    assert "4.png: is 8-bit PNG, the other 4 (as 1.png) are 16-bit PNG" in refusal(good)
 
 
 def test_bad_masks(good: Path) -> None:

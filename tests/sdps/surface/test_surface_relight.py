@@ -99,6 +99,16 @@ def test_residuals_see_wrong_lights(scene):
     assert left.images[5] > 0.3
 
 
+@pytest.mark.filterwarnings("error")
+def test_residual_of_a_black_picture_is_finite(scene):
+    scene, _ = scene
+    images = scene.images.copy()
+    images[3] = 0
+    found = fit_albedo(images, scene.mask, scene.normals, scene.lights, scene.intensities)
+    left = residuals(images, scene.mask, scene.normals, scene.lights, scene.intensities, found)
+    assert left.images[3] == 1 and np.isfinite(left.images).all() and np.isfinite(left.pixels).all()
+
+
 def test_cast_shadow_of_a_wall():
     z = np.zeros((21, 41), np.float32)
     z[:, 20] = 10.0

@@ -1,18 +1,26 @@
 """Which curve lies between radiance and the values of a folder's files."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from render.shared.errors import InputError
-from sdps.photos.listing import find_light_files
-from sdps.photos.picture_file import Coding
-from sdps.photos.response import SRGB_EXPONENT
+from sdps.photos.pictures.listing import find_light_files
+from sdps.photos.pictures.picture_kinds import LOSSY, Coding
+
+SRGB_EXPONENT = 2.224
+"""log f(1/2) / log(1/2) of sRGB's decoding curve f, by which colour profiles with that curve are recognised."""
 
 _EXPONENTS = (0.3, 4.0)
 """Exponents that are believed to be a display curve."""
 
 
-def resolve_gamma(gamma: str | float, coding: Coding, folder: Path) -> tuple[str | float, str]:
+def resolve_gamma(gamma: str | float, coding: Coding, folders: Sequence[Path]) -> tuple[str | float, str]:
     """Return the curve to take off (linear, srgb or an exponent) and a sentence that says why.
+
+    Args:
+        gamma: As of `load`.
+        coding: Of the photographs.
+        folders: Where they and other files lie.
 
     Raises:
         InputError: a gamma that is none.
@@ -28,8 +36,8 @@ def resolve_gamma(gamma: str | float, coding: Coding, folder: Path) -> tuple[str
         return applied, f"values are taken as {_words(applied)}, because the files' colour profile says so"
     if coding.bits == 16:
         return "linear", "values are taken as linear, because 16-bit files without colour profile mostly are"
-    listed = find_light_files(folder)
-    if coding.kind != "JPEG" and listed:
+    listed = [name for folder in folders for name in find_light_files(folder)]
+    if coding.kind not in LOSSY and listed:
         return "linear", f"values are taken as linear, because {listed[0]} marks a benchmark's folder"
     return (
         "srgb",

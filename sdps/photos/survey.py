@@ -1,0 +1,281 @@
+"""One look at every picture of a folder: which are photographs, that they fit together, and where the object is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from render.shared.errors import InputError
+from render.shared.progress import progress_bar
+from sdps.photos.doubts import Doubts
+from sdps.photos.masks import Variation, automatic_mask, bright_part, read_mask
+from sdps.photos.picture_file import Picture, decode, misnamed, turned
+from sdps.photos.pictures.contents import judge_content, like_mask
+from sdps.photos.pictures.gamma import resolve_gamma
+from sdps.photos.pictures.listing import Listing
+from sdps.photos.pictures.picture_kinds import LOSSY, Coding
+from sdps.photos.pictures.picture_names import MASK, is_bare
+from sdps.photos.response import brightness, full_scale, to_linear
+
+_DARK = 0.5
+"""A picture named as a dark frame is one if its mean is under this share of the others' median."""
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What one look at all files tells.
+
+    Attributes:
+        files: (L,) names of the photographs below the folder.
+        coding, gamma, orientation: As of `Photographs`.
+        mask: (H, W) bool.
+        origin: `file` or `automatic`.
+        notes: What was decided, in plain sentences.
+        left_out: Which pictures were left out for what they look like, empty for none.
+    """
+
+    files: tuple[str, ...]
+    coding: Coding
+    gamma: str | float
+    orientation: int
+    mask: np.ndarray
+    origin: str
+    notes: tuple[str, ...]
+    left_out: str = ""
+
+
+def survey(folder: Path, listing: Listing, gamma: str | float, mask_file: Path | None, doubts: Doubts) -> Survey:
+    """Decode every file once: photographs of one kind and size, finite in the mask, and the mask if there is none.
+
+    Args:
+        folder: The folder.
+        listing: Its pictures.
+        gamma: As of `load`.
+        mask_file: The mask, None for the listing's or, without one, an automatic mask.
+        doubts: What becomes of faults that leave something to compute.
+
+    Raises:
+        InputError: pictures that cannot be used together.
+    """
+    masks = _given_masks(folder, listing) if mask_file is None else _Masks(mask_file, ())
+    look = _Look(folder, listing, gamma, masked=masks.file is not None)
+    look.through(judging=True)
+    if len(look.kept) < len(look.dropped):  # what most pictures look like is their nature
+        look = _Look(folder, listing, gamma, masked=masks.file is not None)
+        look.through(judging=False)
+    left = [f"{name} ({why})" for name, why in look.dropped.items()]
+    left_out = f"left out: {', '.join(left)}; --images takes what it names" if left else ""
+    _check_fit(folder, look, left_out)
+    assert look.first is not None and look.variation is not None  # two pictures fit
+    notes = [note for note in (left_out, *masks.notes, *look.suspicious, *look.kinds(), look.why) if note]
+    notes += _orientation_note(look.first.orientation, look.turns)
+    if masks.file is not None:
+        mask, said = read_mask(masks.file, look.broken.shape), f"the mask is {masks.file.name}"
+    else:
+        if not look.variation.changes().any():
+            doubts.stop(
+                f"{folder}: nothing changes between the pictures; is the lamp on and moved? otherwise give a mask"
+            )
+        mask, said = automatic_mask(look.variation)
+    _refuse_broken(folder, look.kept, look.broken, mask, doubts)
+    if (look.broken >= 0).any():
+        notes.append("values that are not finite were set to 0")
+    return Survey(
+        files=tuple(name for name in listing.files if name in look.kept), coding=look.first.coding, gamma=look.gamma,
+        orientation=look.first.orientation, mask=mask, origin="automatic" if masks.file is None else "file",
+        notes=(*notes, said), left_out=left_out,
+    )  # fmt: skip
+
+
+@dataclass(eq=False)
+class _Look:
+    """Goes through the pictures one by one and holds none."""
+
+    folder: Path
+    listing: Listing
+    asked: str | float
+    masked: bool
+    kept: list[str] = field(default_factory=list)
+    dropped: dict[str, str] = field(default_factory=dict)
+    suspicious: list[str] = field(default_factory=list)
+    groups: dict[tuple[tuple[int, ...], Coding], list[str]] = field(default_factory=dict)
+    layers: dict[str, list[str]] = field(default_factory=dict)
+    turns: set[int] = field(default_factory=set)
+    first: Picture | None = None
+    gamma: str | float = "linear"
+    why: str = ""
+    variation: Variation | None = None
+    broken: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))  # first picture with a value not finite
+    levels: list[float] = field(default_factory=list)
+
+    def through(self, judging: bool) -> None:
+        """Decode all files; `judging` leaves out those that look like no photograph."""
+        listing = self.listing
+        order = [name for name in listing.files if name not in listing.dark] + list(listing.dark)
+        for name in progress_bar(order, desc="photographs", unit="picture", delay=5):
+            picture = decode(self.folder / name)
+            why = self._no_photograph(name, picture) if judging else ""
+            if why:
+                self.dropped[name] = why
+            else:
+                self._keep(name, picture)
+
+    def kinds(self) -> list[str]:
+        """Say which files are of another kind than their names tell, and which layers of EXR files were read."""
+        notes = []
+        kind = self.first.coding.kind if self.first else ""
+        wrong = [name for name in self.kept if misnamed(name, kind)]
+        if wrong:
+            verb = f"is a {kind} file" if len(wrong) == 1 else f"are {kind} files"
+            notes.append(f"{_span(wrong)} {verb} in spite of the name, and read as such")
+        if any(self.layers):
+            parts = [f"{layer or 'the one without a name'}{'' if len(self.layers) == 1 else f' ({_span(names)})'}"
+                     for layer, names in self.layers.items()]  # fmt: skip
+            notes.append(f"layers read from the EXR files: {', '.join(parts)}")
+        return notes
+
+    def _no_photograph(self, name: str, picture: Picture) -> str:
+        """Return why a picture is no photograph, empty where it may be one."""
+        if name in self.listing.dark:
+            return "a dark frame; not yet subtracted" if _level(picture) < _DARK * np.median(self.levels or [0]) else ""
+        role = judge_content(picture.pixels, lossy=picture.coding.kind in LOSSY)
+        if role is None:
+            return ""
+        means = "has two values only, as a mask" if role == MASK else "has the colours of normals"
+        if name in self.listing.certain:
+            self.suspicious.append(f"{name} {means}; it is used as a photograph because it was named")
+            return ""
+        return f"{means}; --mask takes it as the mask" if role == MASK else means
+
+    def _keep(self, name: str, picture: Picture) -> None:
+        """Take a picture for a photograph."""
+        shape = picture.pixels.shape[:2]
+        self.kept.append(name)
+        self.groups.setdefault((shape, picture.coding), []).append(name)
+        self.levels.append(_level(picture))
+        if picture.coding.kind == "EXR":
+            self.layers.setdefault(picture.layer, []).append(name)
+        if self.first is None:
+            self._begin(picture)
+        assert self.first is not None and self.variation is not None
+        if (shape, picture.coding) != (self.first.pixels.shape[:2], self.first.coding):
+            return  # refused when all are known
+        self.turns.add(picture.orientation)
+        pixels = turned(picture.pixels, self.first.orientation)
+        if picture.coding.floating:
+            self.broken[(self.broken < 0) & ~np.isfinite(pixels).all(-1)] = len(self.kept) - 1
+        if not self.masked:
+            self.variation.add(brightness(to_linear(pixels, self.gamma)))
+
+    def _begin(self, picture: Picture) -> None:
+        """Settle what the first photograph decides."""
+        shape = turned(picture.pixels, picture.orientation).shape[:2]
+        self.first = picture
+        self.gamma, self.why = resolve_gamma(self.asked, picture.coding, self.listing.places)
+        self.variation = Variation(shape)
+        self.broken = np.full(shape, -1, np.int32)
+
+
+@dataclass(frozen=True)
+class _Masks:
+    file: Path | None
+    notes: tuple[str, ...]
+
+
+def _given_masks(folder: Path, listing: Listing) -> _Masks:
+    """Choose the folder's mask.
+
+    `mask.*` is one whatever it holds; others, such as `cat_mask.png`, must have about two values, and several must
+    hold the same.
+
+    Raises:
+        InputError: several that differ.
+    """
+    bare = [name for name in listing.masks if is_bare(name, MASK)]
+    if len(bare) > 1:
+        raise InputError(f"{folder}: several masks ({', '.join(bare)}); keep one, or name one with --mask")
+    if bare:
+        others = [name for name in listing.masks if name not in bare]
+        why = f"left out: {_span(others)} (another mask than {bare[0]})"
+        return _Masks(folder / bare[0], (why,) if others else ())
+    found: list[tuple[str, np.ndarray]] = []
+    odd: list[tuple[str, np.ndarray]] = []
+    notes: list[str] = []
+    for name in listing.masks:
+        picture = decode(folder / name)
+        cut_out = picture.alpha is not None and np.ptp(picture.alpha) > 0
+        (found if cut_out or like_mask(picture.pixels) else odd).append((name, bright_part(picture)))
+    if odd:
+        names = _span([name for name, _ in odd])
+        notes.append(f"left out: {names} (a mask by name, but of many grey values); --mask or --images takes it")
+    if not found:
+        return _Masks(None, tuple(notes))
+    (first, one), *rest = found
+    if not all(np.array_equal(other, one) for _, other in rest):
+        names = _span([name for name, _ in found])
+        raise InputError(f"{folder}: several masks that differ ({names}); name the right one with --mask FILE")
+    if rest:
+        notes.append(f"left out: {_span([name for name, _ in rest])} (the same mask as {first})")
+    return _Masks(folder / first, tuple(notes))
+
+
+def _level(picture: Picture) -> float:
+    """Return the mean of some pixels, full scale = 1."""
+    some = picture.pixels[::8, ::8]
+    return float(np.nan_to_num(some.astype(np.float64), posinf=0, neginf=0).mean() / full_scale(some))
+
+
+def _span(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= 6 else f"{names[0]} to {names[-1]} ({len(names)} files)"
+
+
+def _check_fit(folder: Path, look: _Look, left_out: str) -> None:
+    """Refuse pictures of another size or coding than most, and a single one."""
+    groups = look.groups
+    if len(look.kept) < 2:
+        raise InputError(
+            f"{folder}: only one picture, {look.kept[0]}; photometric stereo compares at least 3; {left_out}"
+        )
+    if len(groups) < 2:
+        return
+    usual = max(groups, key=lambda group: len(groups[group]))
+    shape, coding = usual
+    odd = [name for group, names in groups.items() if group != usual for name in names]
+    (other_shape, other), names = next((group, names) for group, names in groups.items() if group != usual)
+    count, which = len(groups[usual]), f"{groups[usual][0]}"
+    rest = f"the other {count} (as {which})" if len(odd) == 1 and count > 1 else f"{count} others (as {which})"
+    rest, verb = (which, "is") if count == 1 else (rest, "are")
+    more = f"; {len(odd)} differ: {_span(odd)}" if len(odd) > 1 and count > 1 else ""
+    drop = f"--images '!{Path(names[0]).name}'" if len(odd) == 1 else "--images PATTERN"
+    if other_shape != shape:
+        sizes = [f"{width}x{height}" for height, width in (other_shape, shape)]
+        hint = "it is turned by 90 degrees, turn it back" if other_shape == shape[::-1] else "the camera must not move"
+        raise InputError(
+            f"{folder / names[0]}: is {sizes[0]} pixels, {rest} {verb} {sizes[1]}{more}; all pictures must have one "
+            f"size ({hint}); leave out what is no photograph with {drop}"
+        )
+    raise InputError(
+        f"{folder / names[0]}: is {other}, {rest} {verb} {coding}{more}; keep one kind in the folder, or choose with "
+        f"{drop}"
+    )
+
+
+def _refuse_broken(folder: Path, files: Sequence[str], broken: np.ndarray, mask: np.ndarray, doubts: Doubts) -> None:
+    """Refuse values that are not finite inside the mask."""
+    inside = broken[mask]
+    bad = inside[inside >= 0]
+    if len(bad):
+        name = files[int(bad.min())]
+        doubts.stop(
+            f"{folder / name}: NaN or infinite values inside the mask ({len(bad)} pixels over all pictures); write it "
+            "again or cut them out of the mask"
+        )
+
+
+def _orientation_note(first: int, turns: set[int]) -> list[str]:
+    if len(turns) > 1:
+        return [
+            "the pictures' orientation tags differ, as happens when the camera looks down; all were turned as the first"
+        ]
+    return [] if first == 1 else ["all pictures were turned upright as their orientation tag says"]
