@@ -33,8 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lights", default=None, metavar="FILE|folder",
                         help="known light directions: rows x y z, .lp, .csv, .npy, .npz, .mat, lights.json, JSON of "
                         "Meshroom or RelightLab; folder: the file of lights among the photographs")  # fmt: skip
-    parser.add_argument("--intensities", default=None, metavar="FILE|folder", help="known light intensities")
-    parser.add_argument("--frame", default="y-up", help="axes of the lights file: y-up, y-down, x-left, z-away")
+    parser.add_argument("--intensities", default=None, metavar="FILE|folder|equal",
+                        help="known light intensities; equal if all lights are alike (default: those of --lights, else "
+                        "found by a network)")  # fmt: skip
+    parser.add_argument(
+        "--frame", default="y-up", help="axes of the lights file: y-up, y-down, x-left, z-away, xy-swapped"
+    )
     parser.add_argument("--gamma", default="auto", help="linear, srgb, or an exponent (default: by kind of file)")
     parser.add_argument("--images", action="append", default=None, metavar="PATTERN",
                         help="files to use, in this order; one that begins with ! leaves files out")  # fmt: skip
@@ -65,6 +69,8 @@ def main(args: argparse.Namespace) -> int:
 
         sys.stdout.write(compare(args.folder, result, args.out))
     sys.stdout.write(f"{result.method}: {result.seconds:.1f} s; {', '.join(path.name for path in made)}\n{page}\n")
+    if result.verdict:
+        sys.stdout.write(f"{_MARKS['error']} {result.verdict}\n")
     return 0
 
 
@@ -84,10 +90,12 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     height, width = photos.shape
     sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is taken for orthographic\n")
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
-    return infer(
+    result = infer(
         photos, args.method, models=args.models, config=config, refine=args.refine,
         discontinuities=args.discontinuities, findings=findings, anyway=args.anyway,
     )  # fmt: skip
+    sys.stdout.write(describe(result.findings[len(findings) :]))
+    return result
 
 
 def describe(findings: "Sequence[Finding]") -> str:
@@ -121,7 +129,12 @@ def _section(result: "Inference") -> SectionWriter:
         "x right, y up, z to the camera; lights from the surface to the light. The camera is taken for orthographic."
     )
     section = Section(
-        name="photographs", title="What was found", text=text, tables=_tables(result), pictures_first=True
+        name="photographs",
+        title="What was found",
+        alert=result.verdict,
+        text=text,
+        tables=_tables(result),
+        pictures_first=True,
     )
     writer, box = SectionWriter(section), _box(mask)
     lit = photos[_brightest(result)][0]
@@ -223,8 +236,8 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
         )
         header: tuple[str, ...] = ("photograph", "x", "y", "z", "intensity / mean")
         if "refined" in facts:
-            expected = facts["refined"]["expected_light_error_degrees"]
-            body = tuple((*row, f"{expected[row[0]]:.1f}°") for row in body)
+            expected = facts["refined"].get("expected_light_error_degrees")
+            body = tuple((*row, f"{expected[row[0]]:.1f}°" if expected else "given, not known") for row in body)
             header = (*header, "error to expect")
         tables.append(Table(title="Lights", header=header, rows=body))
     return tuple(tables)

@@ -197,4 +197,22 @@ def test_the_automatic_method_depends_on_what_follows(
 ) -> None:
     from sdps import api
 
-    assert api._runner("auto", lit, None, None, refine, images).method.name.replace(" (shipped)", "") == expected
+    assert api._runner("auto", (lit, False), None, None, refine, images).method.name.replace(" (shipped)", "") == expected
+
+
+def test_intensities_without_directions_are_used() -> None:
+    """They were left unused without a word."""
+    from sdps import api
+
+    runner = api._runner("auto", (False, True), None, None)
+    assert runner.method.intensities == "true"
+
+
+@pytest.mark.parametrize(("method", "known"), [("lcnet+psfcn", (True, False)), ("pf14", (False, True))])
+def test_what_a_method_does_not_look_at_is_said(
+    caplog: pytest.LogCaptureFixture, method: str, known: tuple[bool, bool]
+) -> None:
+    from sdps import api
+
+    api._runner(method, known, None, None)
+    assert "those given are not used" in caplog.text

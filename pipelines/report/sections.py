@@ -97,6 +97,7 @@ class Section:
         name: Folder name, unique within a report.
         title: Heading.
         text: A paragraph: what was evaluated, and how the numbers are defined.
+        alert: A sentence above it that a reader must not miss.
         order: Sections are shown in rising order.
         tables: Tables.
         strips: Rows of pictures.
@@ -107,6 +108,7 @@ class Section:
     name: str
     title: str
     text: str
+    alert: str = ""
     order: int = 100
     tables: tuple[Table, ...] = ()
     strips: tuple[Strip, ...] = ()

@@ -41,13 +41,13 @@ class Trust(NamedTuple):
 
     Attributes:
         normals: (H, W) float32, expected error in degrees, zero outside the mask.
-        lights: (L,) float32, expected error in degrees.
+        lights: (L,) float32, expected error in degrees; None where the directions were given: they may be exact or not.
         start: Expected mean error of the start's normals in degrees.
         doubt: Why the start is to be kept, in one line; empty where refinement is better.
     """
 
     normals: np.ndarray
-    lights: np.ndarray
+    lights: np.ndarray | None
     start: float
     doubt: str
 
@@ -60,8 +60,8 @@ def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = Fa
         mask: (H, W) bool.
         start: Its start, with normals (H, W, 3), lights (L, 3) and, if a network tells it, `expected_error` (H, W),
             degrees, among the diagnostics.
-        given: The light directions were given: less is expected to be off, of lights nothing, and the start is kept for
-            no error that is expected.
+        given: The light directions were given: less is expected to be off, of lights nothing is said, and the start is
+            kept for no error that is expected.
     """
     of_normals, of_lights, moved = features(found, mask, start)
     plain = np.exp(of_normals[:, : len(NORMAL)] @ NORMAL)
@@ -75,8 +75,8 @@ def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = Fa
     # What a network tells raises both sides, so it is left out here.
     if not doubt and not given and mean > of_start:
         doubt = f"the model does not explain the photographs: {mean:.1f} degrees expected, {of_start:.1f} without it"
-    of_light = np.zeros(len(of_lights)) if given else np.exp(of_lights @ LIGHT)
-    return Trust(expected, of_light.astype(np.float32), of_start, doubt)
+    of_light = None if given else np.exp(of_lights @ LIGHT).astype(np.float32)
+    return Trust(expected, of_light, of_start, doubt)
 
 
 def features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

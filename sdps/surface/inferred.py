@@ -23,6 +23,7 @@ from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
 from sdps.surface.meshing import mesh, write_mesh
 from sdps.surface.relight import Residuals, fit_albedo, relit, residuals
+from sdps.surface.verdict import give_verdict
 
 RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
          "grazing": (-0.85, 0.45, 0.25)}  # fmt: skip
@@ -93,6 +94,14 @@ class Inference:
         own, trust = diagnostics.get("expected_error"), diagnostics.get("trust")
         return own if trust is None or (trust.doubt and own is not None) else trust.normals
 
+    @cached_property
+    def verdict(self) -> str:
+        """Why the result is not to be used, with the likeliest reason; empty where nothing speaks against it."""
+        diagnostics = self.estimate.diagnostics
+        refined = diagnostics.get("refined")
+        residual = 0.0 if refined is None else float(refined.pixel_residual[self.photos.mask].mean())
+        return give_verdict(self.photos, self.expected_error, self.findings, diagnostics.get("trust"), residual)
+
     @property
     def gains(self) -> np.ndarray:
         """Intensities (L,) or (L, 3), equal ones where none were found."""
@@ -114,6 +123,7 @@ class Inference:
         """Return what a reader needs to judge the result, JSON ready."""
         photos = self.photos
         facts = {
+            "verdict": self.verdict,
             "method": self.method,
             "weights": {name: str(path) for name, path in self.files.items()},
             "terms": pretrained.terms(self.files.values()),
@@ -123,6 +133,8 @@ class Inference:
             "gamma": photos.gamma,
             "mask": photos.mask_origin,
             "mask_pixels": int(photos.mask.sum()),
+            "light_directions": "found" if photos.light_directions is None else "given",
+            "light_intensities": "found" if photos.intensities is None else "given",
             "camera": "orthographic, looking along -z",
             "frame": "x right, y up, z to the camera; lights from the surface to the light",
             "depth": {"unit": "pixels towards the camera", "components": self.depth.components,
@@ -229,7 +241,8 @@ def _about_refined(diagnostics: dict[str, Any], photos: Photographs) -> dict[str
         "normals_moved_degrees": round(float(moved.mean()), 2),
         "lights_moved_degrees": round(float(turned.mean()), 2),
         "expected_normal_error_degrees": round(float(expected.normals[mask].mean()), 2),
-        "expected_light_error_degrees": _by_file(photos, expected.lights, 2),
+        # How far given directions are off, nobody knows; it is not 0.
+        **({} if expected.lights is None else {"expected_light_error_degrees": _by_file(photos, expected.lights, 2)}),
         "residual": round(float(refined.pixel_residual[mask].mean()), 4),
         "unexplained": [name for name, value in zip(photos.files, residual, strict=True) if value > limit],
         "body": refined.body.round(4).tolist(),

@@ -52,8 +52,8 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
     found = bool(len(result.light_directions))
     confidence = facts.get("light_confidence", {})
     return {
-        "method": result.method, "seconds": facts["seconds"], "terms": facts["terms"], "width": width,
-        "height": height, "step": step, "full": [mask.shape[1], mask.shape[0]], "albedo": peak * scale,
+        "verdict": result.verdict, "method": result.method, "seconds": facts["seconds"], "terms": facts["terms"],
+        "width": width, "height": height, "step": step, "full": [mask.shape[1], mask.shape[0]], "albedo": peak * scale,
         "strength": shine * scale if lobes else 0.0, "lobes": lobes, "files": list(result.photos.files),
         "lights": np.round(result.light_directions, 5).tolist() if found else [],
         "intensities": _grey(result.gains).round(4).tolist() if found else [],

@@ -141,6 +141,8 @@ async function show(run) {
   const facts = [`method: ${run.method}`, `${seconds(run.seconds)}`, `${run.components} part${run.components > 1 ? "s" : ""}`, `integrability: ${run.integrability}°`];
   if (run.residual !== null) facts.push(`off Lambert's law: ${run.residual}`);
   if (run.error !== null) facts.push(`normals off the truth: ${run.error}°`);
+  $("verdict").hidden = !run.verdict;
+  $("verdict").textContent = run.verdict;
   $("run-facts").replaceChildren(...facts.map((text) => element("span", {}, text)), ...(run.terms ? [element("span", {}, `weights: ${run.terms}`)] : []));
   $("download").href = inSet(`runs/${run.number}/download`);
   $("report").href = inSet(`files/runs/${run.number}/files/report.html`);
