@@ -277,7 +277,7 @@ def _adapted(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -
     method = parse(text if "+" in text else f"{TRUE_LIGHTS}+{text}", find)
     if method.lights != TRUE_LIGHTS:
         _log.warning("%s finds the lights itself; those given are not used", text)
-    return method
+    return replace(method, name=method.name.replace("true lights", "given lights"))
 
 
 def _automatic(lit: bool, find: Callable[[str], Path]) -> str:

@@ -188,8 +188,8 @@ def test_methods_that_can_be_used_are_listed():
         (False, None, 7, "sdps-frames (lightset + frames)"),  # too few to refine
         (False, None, 96, "sdps-frames (lightset + frames), refined"),
         (False, True, 7, "sdps-frames (lightset + frames), refined"),
-        (True, False, 96, "frames, true lights"),
-        (True, None, 96, "frames, true lights, refined"),
+        (True, False, 96, "frames, given lights"),
+        (True, None, 96, "frames, given lights, refined"),
     ],
 )
 def test_the_automatic_method_depends_on_what_follows(
