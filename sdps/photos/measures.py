@@ -12,8 +12,8 @@ from PIL import Image
 
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
-from sdps.photos.colours import colour_casts
-from sdps.photos.motion import Shift, Tracker, second_look
+from sdps.photos.evidence.colours import colour_casts
+from sdps.photos.evidence.motion import Shift, Tracker, second_look
 from sdps.photos.reading import Photographs
 from sdps.photos.response import brightness
 
