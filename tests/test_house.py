@@ -24,7 +24,7 @@ FOLDERS = [
     "render",
     *(f"sdps.{name}" for name in (
         "core", "data", "models", "training", "publishing", "inference", "refinement", "classical.common", "classical",
-        "methods", "photos", "surface",
+        "methods", "photos.evidence", "photos", "surface",
     )),
     "sdps",
     *(f"pipelines.{name}" for name in (
