@@ -37,11 +37,11 @@ WHOLE = (5, 0.35, 3.0)
 """Votes by which a shift is believed where the frame is the object: tiles, share of the telling ones, times those
 against."""
 
-WHOLE_OF_FEW = (6, 0.6, 4.0)
-"""The same where there are few other images, which may not explain a new light."""
-
 SURE = (12, 0.5, 3.0)
 """Votes by which a shift is believed before a background, whatever edges and silhouette say."""
+
+WHOLE_OF_FEW = (6, 0.6, 4.0)
+"""The same where there are few other images, which may not explain a new light."""
 
 SUSPICIOUS = (3, 0.17, 1.0)
 """Votes by which an image is worth a second look."""
@@ -188,7 +188,8 @@ class Tracker:
         votes = self._explainer.search(view.part)
         outline = self._lit >= max(2, _COVERED * self._count)
         whole = self._whole or not 0 < outline.mean() < _FULL
-        needed = (WHOLE if self._count >= _FEW else WHOLE_OF_FEW) if whole else SURE
+        few = self._count < _FEW
+        needed = (WHOLE_OF_FEW if few else WHOLE) if whole else SURE
         if votes.carried(*needed):
             return self._shift(votes.rows, votes.columns, suspicious=True, sure=True, alike=True)
         if whole or self._count < _EDGES_FROM:
@@ -235,12 +236,13 @@ def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np
     """Measure the suspects again.
 
     All that still look moved are taken out first, then each is measured against the rest: images that moved together
-    would speak for each other.
+    would speak for each other. Where the rest are few, what they do not convict goes back, and whoever is left is
+    measured once more.
 
     Args:
         tracker: Has taken in all images.
         shifts: What `add` returned for each.
-        image: Returns the brightness (H, W) of the image of a number, once or twice.
+        image: Returns the brightness (H, W) of the image of a number, up to three times.
 
     Returns:
         A shift per image, of zero length unless it moved.
@@ -255,10 +257,20 @@ def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np
             apart.append(number)
         else:
             tracker.take(number, view, Shift())
-    again = {number: tracker.compare(tracker.view(image(number))) for number in apart}
-    sure = [shift for shift in again.values() if shift.sure]
-    believed = {number: shift for number, shift in again.items() if any(tracker.near(shift, one) for one in sure)}
-    return [believed.get(number, Shift()) for number in range(len(shifts))]
+    found = _believed(tracker, apart, image)
+    if found and len(tracker) < _FEW:
+        for number in apart:
+            if number not in found:
+                tracker.take(number, tracker.view(image(number)), Shift())
+        found = _believed(tracker, list(found), image)
+    return [found.get(number, Shift()) for number in range(len(shifts))]
+
+
+def _believed(tracker: Tracker, numbers: list[int], image: Callable[[int], np.ndarray]) -> dict[int, Shift]:
+    """Measure images that are not taken in, and return the shifts that are sure, or like one that is."""
+    found = {number: tracker.compare(tracker.view(image(number))) for number in numbers}
+    sure = [shift for shift in found.values() if shift.sure]
+    return {number: shift for number, shift in found.items() if any(tracker.near(shift, one) for one in sure)}
 
 
 def _silhouette(outline: np.ndarray, lit: np.ndarray, rows: int, columns: int) -> tuple[float, float]:
