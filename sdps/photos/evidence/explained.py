@@ -116,8 +116,10 @@ def _judge(part: np.ndarray, fields: np.ndarray, place: tuple[int, int]) -> Vote
     counts = [np.count_nonzero(one) if np.hypot(*shift) >= _SHORTEST else 0
               for one, shift in zip(near, _square(place, 2), strict=True)]  # fmt: skip
     most = int(np.argmax(counts))
-    shift = _square(place, 2)[most]
-    return Votes(*shift, counts[most], np.count_nonzero(still & telling), np.count_nonzero(telling))
+    if not counts[most]:
+        return Votes(*place, 0, np.count_nonzero(still & telling), np.count_nonzero(telling))
+    rows, columns = np.rint(np.median(best[near[most]], axis=0)).astype(int).tolist()
+    return Votes(rows, columns, counts[most], np.count_nonzero(still & telling), np.count_nonzero(telling))
 
 
 class _Tiles:
