@@ -24,7 +24,8 @@ FOLDERS = [
     "render",
     *(f"sdps.{name}" for name in (
         "core", "data", "models", "training", "publishing", "inference", "refinement", "classical.common", "classical",
-        "methods", "photos.light_files", "photos.pictures", "photos", "surface",
+        "methods", "photos.light_files", "photos.pictures", "photos.evidence", "photos",
+        "surface",
     )),
     "sdps",
     *(f"pipelines.{name}" for name in (

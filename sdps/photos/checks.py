@@ -49,7 +49,7 @@ class Finding:
 def check(photos: Photographs) -> list[Finding]:
     """Look for what spoils photometric stereo, the gravest first.
 
-    The files are read once more, one at a time, and a few of them twice.
+    The files are read once more, one at a time, and a few of them again.
 
     Raises:
         InputError: a file that can no longer be read.
@@ -183,6 +183,16 @@ def _given_lights(photos: Photographs, _: Measures) -> Iterator[Finding]:
         yield Finding("note", f"The lights come from one side only; no light comes from a sector of {gap:.0f} degrees.")
 
 
+def _near_lamps(photos: Photographs, measures: Measures) -> Iterator[Finding]:
+    if measures.dimming.near:
+        yield Finding(
+            "warning",
+            "The whole frame is the object, and each picture dims towards the rim away from its lamp: the lamps "
+            f"probably stood near, about {measures.dimming.distance:.1f} object widths away. A flat object will come "
+            "out as a dome. Move the lamps further away, at least 5 object widths.",
+        )
+
+
 def _duplicates(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     groups = defaultdict(list)
     for file, digest in zip(photos.files, measures.digests, strict=True):
@@ -276,6 +286,7 @@ _RULES: tuple[Callable[[Photographs, Measures], Iterator[Finding]], ...] = (
     _movement,
     _light_spread,
     _given_lights,
+    _near_lamps,
     _duplicates,
     _colour,
     _camera,

@@ -13,13 +13,15 @@ from PIL import Image
 
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
-from sdps.photos.colours import colour_casts
-from sdps.photos.motion import Shift, Tracker, second_look
+from sdps.photos.evidence.colours import colour_casts
+from sdps.photos.evidence.fall_off import FallOff, block_means, fall_off
+from sdps.photos.evidence.motion import Shift, Tracker, second_look
 from sdps.photos.reading import Photographs
 from sdps.photos.response import brightness
 
 _PIXELS = 2048
 _COLOUR_PIXELS = 512
+_WHOLE = 0.95  # share of the frame from which on the object fills it
 _EXPOSURE = {33434: "exposure time", 33437: "aperture", 34855: "ISO", 37386: "focal length"}
 _EXIF = 0x8769
 
@@ -38,6 +40,7 @@ class Measures:
         digests: (L,) of the brightness of all pixels.
         settings: (L,) what the camera wrote about its exposure, by name.
         shifts: (L,) against the other images; of zero length unless the image moved.
+        dimming: How the pictures dim over the frame, where the object fills it.
     """
 
     observations: np.ndarray
@@ -49,6 +52,7 @@ class Measures:
     digests: list[bytes]
     settings: list[dict[str, float]]
     shifts: list[Shift]
+    dimming: FallOff
 
 
 def measure(photos: Photographs) -> Measures:
@@ -62,7 +66,7 @@ def measure(photos: Photographs) -> Measures:
     sample = pixels[np.unique(np.linspace(0, len(pixels) - 1, _PIXELS).round().astype(int))]
     observations = np.empty((count, len(sample), 3), np.float32)
     levels, peaks, saturated, outside = np.empty(count), np.empty(count), np.empty(count), np.zeros(count)
-    digests, settings, shifts = [], [], []
+    digests, settings, shifts, blocks = [], [], [], []
     tracker = Tracker(photos.mask)
     for number in progress_bar(range(count), desc="checking", unit="picture", delay=5):
         image = photos[number : number + 1][0]
@@ -70,6 +74,7 @@ def measure(photos: Photographs) -> Measures:
         digests.append(hashlib.blake2b(grey.tobytes(), digest_size=16).digest())
         settings.append(_camera_settings(photos.folder / photos.files[number]))
         shifts.append(tracker.add(grey))
+        blocks.append(block_means(grey))
         observations[number] = image.reshape(-1, 3)[sample]
         inside, bright = image[photos.mask], grey[photos.mask]  # (Q, 3), (Q,)
         full = (inside >= photos.saturation).any(-1)
@@ -79,7 +84,10 @@ def measure(photos: Photographs) -> Measures:
             outside[number] = rest / max(float(bright.mean()), 1e-6)
     moved = second_look(tracker, shifts, lambda number: brightness(photos[number : number + 1][0]))
     casts = _casts(photos, observations)
-    return Measures(observations, levels, peaks, float(np.median(outside)), saturated, casts, digests, settings, moved)
+    dimming = fall_off(np.stack(blocks), photos.shape) if photos.mask.mean() >= _WHOLE else FallOff()
+    return Measures(
+        observations, levels, peaks, float(np.median(outside)), saturated, casts, digests, settings, moved, dimming
+    )
 
 
 def _casts(photos: Photographs, observations: np.ndarray) -> np.ndarray:  # (L,)

@@ -47,3 +47,48 @@ def write_folder(
     if mask is not None:
         write(folder / "mask.png", mask.astype(np.float32))
     return folder
+
+
+def plate(
+    lights: np.ndarray,
+    *,
+    distance: float | None = None,
+    lumps: bool = False,
+    depth: float = 1.0,
+    paint: bool = False,
+    shape: tuple[int, int] = (96, 128),
+    seed: int = 0,
+) -> np.ndarray:
+    """Return images (L, H, W, 3) with noise of a matte plate that fills the frame.
+
+    Args:
+        lights: (L, 3) unit directions.
+        distance: Of the lamps from the middle, in longer sides of the frame; None for distant ones.
+        lumps: Half balls lie on the plate, instead of a fine relief.
+        depth: Factor of the relief's depth; 0 for a flat plate.
+        paint: Random patches of colour.
+        shape: (H, W).
+        seed: Of relief, paint and noise.
+    """
+    rng, side = np.random.default_rng(seed), max(shape)
+    down, right = ((np.arange(count) + 0.5 - count / 2) / side for count in shape)
+    y, x = np.meshgrid(-down, right, indexing="ij")
+    if lumps:
+        height = np.zeros(shape)
+        for row, column, radius in rng.uniform((-0.4, -0.5, 0.05), (0.4, 0.5, 0.1), (16, 3)):
+            height = np.maximum(height, 0.7 * np.sqrt(np.maximum(radius**2 - (y - row) ** 2 - (x - column) ** 2, 0)))
+        height = cv2.GaussianBlur(height, (0, 0), 1)
+    else:
+        height = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), 2) * 0.015
+    down, right = np.gradient(depth * height, 1 / side)
+    normals = np.stack([-right, down, np.ones(shape)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    towards = np.broadcast_to(lights[:, None, None], (len(lights), *shape, 3))
+    if distance is not None:
+        towards = towards - np.stack([x, y, np.zeros(shape)], axis=-1) / distance
+    squared = (towards**2).sum(-1)
+    shading = np.maximum(np.einsum("lhwc,hwc->lhw", towards, normals), 0) / squared**1.5
+    albedo = scenes.patches(np.ones(shape, bool), 12, rng) if paint else np.full((*shape, 3), 0.8)
+    images = shading[..., None] * albedo
+    images *= 0.9 / np.percentile(images, 99.9, axis=(1, 2, 3), keepdims=True)  # as cameras expose
+    return np.clip(images + rng.normal(0, NOISE, images.shape), 0, 1).astype(np.float32)

@@ -10,9 +10,9 @@ from PIL import Image
 
 from sdps import photos
 from sdps.photos.checks import Finding
+from sdps.photos.evidence.motion import Tracker, second_look
 from sdps.photos.masks import Variation, automatic_mask
 from sdps.photos.measures import spread
-from sdps.photos.motion import Tracker, second_look
 
 RING = np.arange(12) * 2 * np.pi * 5 / 12
 AROUND = np.stack([0.8 * np.cos(RING), 0.8 * np.sin(RING), np.full(12, 0.6)], axis=-1)

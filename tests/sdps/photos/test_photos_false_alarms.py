@@ -14,7 +14,7 @@ from pipelines.cli import main
 from pipelines.evaluate.self_test import photograph_bunny
 from sdps import photos
 from sdps.photos.checks import Finding
-from sdps.photos.colours import colour_casts
+from sdps.photos.evidence.colours import colour_casts
 
 BODIES = {"red": (0.5, 0.05, 0.05), "black": (0.015, 0.015, 0.015), "blue": (0.05, 0.1, 0.4)}
 STEP = (5, -4)  # pixels

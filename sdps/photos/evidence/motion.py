@@ -1,14 +1,16 @@
-"""Did the camera or the object move between photographs? Told from edges that no light can move.
+"""Did the camera or the object move between photographs? Two witnesses that no light can move.
+
+Tiles of a picture are explained by the other pictures where the picture lies: they vote on its shift (`explained`).
 
 Outlines and paint have their edges in the same place, with the same sign, under every light; edges of shading, shadows
 and highlights wander with it. So every image's field of edge directions is laid over the sum of the fields of the
 others, in which the former add up and the latter do not (after the orientation correlation of Fitch, Kadyrov,
 Christmas, Kittler 2002), and the places where the others disagree count little.
 
-Highlights have sharp edges as well, and may fit the outline at some shift. So the silhouette must agree: an object that
-moved is lit where the others show background, and shows background where it was. An image that is dark there tells
-nothing and passes, unless it lies where another surely does. Without a dark background there is no silhouette, and the
-edges decide alone.
+A whole frame has no outline, and its edges may all be relief: there the votes decide. Before a dark background few
+tiles may see anything, and highlights have sharp edges as well, so edges, votes and the silhouette must agree, unless
+the votes are many: an object that moved is lit where the others show background, and shows background where it was. An
+image that is dark there tells nothing and passes, unless it lies where another surely does.
 """
 
 from collections.abc import Callable
@@ -18,17 +20,36 @@ import cv2
 import numpy as np
 from scipy import fft, ndimage
 
-START = 6
-"""Images at the beginning that are taken to lie still: fewer, of opposite lights, may have no edge in common."""
+from sdps.photos.evidence.explained import Explainer
+
+START = 3
+"""Images at the beginning that are taken to lie still: three explain a matte surface under a fourth light."""
+
+_EDGES_FROM = 6  # images: fewer, of opposite lights, may have no edge in common
 
 LEAD = 0.08
 """Least lead in fit by which a shift is believed."""
 
-FIT = 0.22
-"""Least correlation with the other images by which a shift is believed without a silhouette."""
+FIT = 0.1
+"""Least correlation with the other images by which a shift is believed, where the silhouette agrees."""
 
-FIT_WITH_OUTLINE = 0.1
-"""The same where the silhouette agrees."""
+WHOLE = (5, 0.35, 3.0)
+"""Votes by which a shift is believed where the frame is the object: tiles, share of the telling ones, times those
+against."""
+
+SURE = (12, 0.5, 3.0)
+"""Votes by which a shift is believed before a background, whatever edges and silhouette say."""
+
+WHOLE_OF_FEW = (6, 0.6, 4.0)
+"""The same where there are few other images, which may not explain a new light."""
+
+SUSPICIOUS = (3, 0.17, 1.0)
+"""Votes by which an image is worth a second look."""
+
+BESIDE_EDGES = (3, 0.2, 1.0)
+"""Votes that must come to edges and silhouette."""
+
+_FEW = 7  # images
 
 LIT_AHEAD, LIT_BEHIND = 0.1, 0.05
 """Least share of the pixels newly covered that is lit, and largest share of those uncovered, if the object moved."""
@@ -45,6 +66,8 @@ _AGREEMENT = 4  # power of the agreement between the images by which an edge cou
 _LIT = 0.02  # of the bright parts' level, above the background: a pixel is lit
 _COVERED = 0.05  # share of the images that light a pixel of the object at least
 _FULL = 0.85  # share of the window that a silhouette may cover
+_WHOLE = 0.97  # share of the window that the mask covers where there is no background
+_BRIGHTEST = 2.0  # of the bright parts' level; highlights above count as this bright
 
 
 @dataclass(frozen=True)
@@ -53,18 +76,16 @@ class Shift:
 
     Attributes:
         rows, columns: In pixels of the photographs, positive down and to the right.
-        lead: How much better the edges fit there than unmoved, as a part of the fit there.
-        fit: Correlation of the edges with those of the others, at most 1.
-        ahead: Share of the background that the shifted silhouette covers which is lit; NaN without silhouette.
-        behind: Share of the object that the shifted silhouette uncovers which is lit; NaN without silhouette.
+        suspicious: The image is worth a second look.
+        sure: The shift is longer and surer than what changing light alone brings about.
+        alike: Where another image surely lies just so, this one does.
     """
 
     rows: float = 0.0
     columns: float = 0.0
-    lead: float = 0.0
-    fit: float = 0.0
-    ahead: float = np.nan
-    behind: float = np.nan
+    suspicious: bool = False
+    sure: bool = False
+    alike: bool = False
 
     @property
     def length(self) -> float:
@@ -79,16 +100,18 @@ class View:
     Attributes:
         edges: (h, w) complex64, right + i down, towards the brighter side, shorter than 1 where the edge is faint.
         lit: (h, w) bool, brighter than the background.
+        part: (h, w) float32, the brightness, 1 for that of the bright parts.
     """
 
     edges: np.ndarray
     lit: np.ndarray
+    part: np.ndarray
 
 
 class Tracker:
     """Follows the edges of the object through a series of images.
 
-    Its memory does not depend on their number: three fields of the reduced window.
+    Its memory does not depend on their number: some fifteen fields of the reduced window.
 
     Args:
         mask: (H, W) bool, where the object is.
@@ -106,6 +129,7 @@ class Tracker:
             sides.append(slice(max(int(inside[0]) - extra, 0), int(inside[-1]) + 1 + extra))
         self._window = tuple(sides)
         shape = mask[self._window].shape
+        self._whole = bool(mask[self._window].mean() > _WHOLE)
         self._scale = max(1.0, max(shape) / _SIDE)  # photograph's pixels per pixel of the window
         self._size = [max(8, round(side / self._scale)) for side in shape]
         self._reach = [max(2, round(_REACH * side)) for side in self._size]
@@ -114,6 +138,7 @@ class Tracker:
         self._edges = np.zeros(self._size, np.complex64)  # sums over the images, each where it lies
         self._strength = np.zeros(self._size, np.float32)
         self._lit = np.zeros(self._size, np.int32)
+        self._explainer = Explainer((self._size[0], self._size[1]))
         self._count = 0
         self.suspects: list[int] = []
 
@@ -125,11 +150,11 @@ class Tracker:
         """Measure an image (H, W) float32 against those before, and take it in where it lies."""
         view = self.view(grey)
         shift = self.compare(view) if self._count >= START else Shift()
-        if self._count < START or self.suspicious(shift):
+        if self._count < START or shift.suspicious:
             self.suspects.append(self._count)
-        if not self.moved(shift):
+        if not shift.sure:
             shift = Shift()
-        self.take(view, shift)
+        self.take(self._count, view, shift)
         return shift
 
     def view(self, grey: np.ndarray) -> View:
@@ -145,18 +170,34 @@ class Tracker:
         rim = np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]])
         ground = float(np.median(rim))
         noise = 1.48 * float(np.median(np.abs(rim - ground)))
-        return View(edges.astype(np.complex64), part > ground + max(_LIT * level, 6 * noise))
+        lit = part > ground + max(_LIT * level, 6 * noise)
+        return View(edges.astype(np.complex64), lit, np.minimum(part / level, _BRIGHTEST))
 
-    def take(self, view: View, shift: Shift, sign: int = 1) -> None:
-        """Add an image's view, moved back by its shift, to those of the others; with `sign` -1, take it out again."""
-        edges, lit = (_moved(field, *self._steps(shift, -1)) for field in (view.edges, view.lit))
+    def take(self, number: int, view: View, shift: Shift, sign: int = 1) -> None:
+        """Add the view of image `number`, moved back by its shift, to the others; with `sign` -1, take it out again."""
+        back = self._steps(shift, -1)
+        edges, lit, part = (_moved(field, *back) for field in (view.edges, view.lit, view.part))
         self._edges += sign * edges
         self._strength += sign * np.abs(edges)
         self._lit += sign * lit.astype(np.int32)
+        self._explainer.take(number, part, sign)
         self._count += sign
 
     def compare(self, view: View) -> Shift:
         """Find where a view that is not taken in agrees best with those that are, to a pixel of the window."""
+        votes = self._explainer.search(view.part)
+        outline = self._lit >= max(2, _COVERED * self._count)
+        whole = self._whole or not 0 < outline.mean() < _FULL
+        few = self._count < _FEW
+        needed = (WHOLE_OF_FEW if few else WHOLE) if whole else SURE
+        if votes.carried(*needed):
+            return self._shift(votes.rows, votes.columns, suspicious=True, sure=True, alike=True)
+        if whole or self._count < _EDGES_FROM:
+            return self._shift(votes.rows, votes.columns, suspicious=votes.carried(*SUSPICIOUS))
+        return self._edges_shift(view, outline)
+
+    def _edges_shift(self, view: View, outline: np.ndarray) -> Shift:
+        """Find where a view's edges lie, and ask the silhouette (h, w) bool and the votes about it."""
         agreement = np.abs(self._edges) / (self._strength + 0.02 * max(self._count, 1))
         reference = self._edges * agreement**_AGREEMENT
         product = fft.fft2(view.edges, self._padded) * fft.fft2(reference, self._padded).conj()
@@ -167,40 +208,24 @@ class Tracker:
             return Shift()
         place = np.unravel_index(int(near.argmax()), near.shape)
         still = float(near[down - 1 : down + 2, right - 1 : right + 2].max())
-        steps = int(place[0]) - down, int(place[1]) - right
-        return Shift(
-            steps[0] * self._scale,
-            steps[1] * self._scale,
-            (best - still) / best,
-            best / float(np.linalg.norm(view.edges) * np.linalg.norm(reference)),
-            *self._silhouette(view.lit, *steps),
-        )
+        rows, columns = int(place[0]) - down, int(place[1]) - right
+        fit = best / float(np.linalg.norm(view.edges) * np.linalg.norm(reference))
+        if np.hypot(rows, columns) < STEP or (best - still) / best < LEAD or fit < FIT:
+            return Shift()
+        votes = self._explainer.judge(view.part, rows, columns)
+        ahead, behind = _silhouette(outline, view.lit, rows, columns)
+        alike = behind <= LIT_BEHIND and votes.agree >= votes.against
+        sure = alike and ahead >= LIT_AHEAD and votes.carried(*BESIDE_EDGES)
+        return self._shift(rows, columns, suspicious=True, sure=sure, alike=alike)
 
-    def suspicious(self, shift: Shift) -> bool:
-        """Whether the edges alone speak for a shift."""
-        return shift.length >= STEP * self._scale and shift.lead >= LEAD and shift.fit >= FIT_WITH_OUTLINE
+    def _shift(self, rows: int, columns: int, **said: bool) -> Shift:
+        """Return a shift by pixels of the window."""
+        return Shift(rows * self._scale, columns * self._scale, **said)
 
-    def moved(self, shift: Shift) -> bool:
-        """Whether a shift is longer and surer than what changing light alone brings about."""
-        if np.isnan(shift.ahead):
-            return self.suspicious(shift) and shift.fit >= FIT
-        return self.suspicious(shift) and shift.ahead >= LIT_AHEAD and shift.behind <= LIT_BEHIND
-
-    def alike(self, shift: Shift, sure: Shift) -> bool:
+    def near(self, shift: Shift, sure: Shift) -> bool:
         """Whether a shift is one that was believed, or the same movement seen with its front side in the dark."""
         apart = np.hypot(shift.rows - sure.rows, shift.columns - sure.columns)
-        return shift == sure or (self.suspicious(shift) and apart < STEP * self._scale and shift.behind <= LIT_BEHIND)
-
-    def _silhouette(self, lit: np.ndarray, rows: int, columns: int) -> tuple[float, float]:
-        """Return which share is lit of what a shifted silhouette newly covers and of what it uncovers."""
-        outline = self._lit >= max(2, _COVERED * self._count)
-        if not 0 < outline.mean() < _FULL:
-            return np.nan, np.nan
-        shifted = _moved(outline, rows, columns)
-        covered = shifted & ~ndimage.binary_dilation(outline)
-        uncovered = outline & ~ndimage.binary_dilation(shifted)
-        share, other = (float(lit[part].mean()) if part.any() else 0.0 for part in (covered, uncovered))
-        return share, other
+        return shift == sure or (shift.alike and apart < STEP * self._scale)
 
     def _steps(self, shift: Shift, sign: int) -> tuple[int, int]:
         """Return a shift in pixels of the window."""
@@ -211,12 +236,13 @@ def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np
     """Measure the suspects again.
 
     All that still look moved are taken out first, then each is measured against the rest: images that moved together
-    would speak for each other.
+    would speak for each other. Where the rest are few, what they do not convict goes back, and whoever is left is
+    measured once more.
 
     Args:
         tracker: Has taken in all images.
         shifts: What `add` returned for each.
-        image: Returns the brightness (H, W) of the image of a number, once or twice.
+        image: Returns the brightness (H, W) of the image of a number, up to three times.
 
     Returns:
         A shift per image, of zero length unless it moved.
@@ -226,15 +252,34 @@ def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np
         if len(tracker) <= START:
             break
         view = tracker.view(image(number))
-        tracker.take(view, shifts[number], -1)
-        if tracker.suspicious(tracker.compare(view)):
+        tracker.take(number, view, shifts[number], -1)
+        if tracker.compare(view).suspicious:
             apart.append(number)
         else:
-            tracker.take(view, Shift())
-    again = {number: tracker.compare(tracker.view(image(number))) for number in apart}
-    sure = [shift for shift in again.values() if tracker.moved(shift)]
-    believed = {number: shift for number, shift in again.items() if any(tracker.alike(shift, one) for one in sure)}
-    return [believed.get(number, Shift()) for number in range(len(shifts))]
+            tracker.take(number, view, Shift())
+    found = _believed(tracker, apart, image)
+    if found and len(tracker) < _FEW:
+        for number in apart:
+            if number not in found:
+                tracker.take(number, tracker.view(image(number)), Shift())
+        found = _believed(tracker, list(found), image)
+    return [found.get(number, Shift()) for number in range(len(shifts))]
+
+
+def _believed(tracker: Tracker, numbers: list[int], image: Callable[[int], np.ndarray]) -> dict[int, Shift]:
+    """Measure images that are not taken in, and return the shifts that are sure, or like one that is."""
+    found = {number: tracker.compare(tracker.view(image(number))) for number in numbers}
+    sure = [shift for shift in found.values() if shift.sure]
+    return {number: shift for number, shift in found.items() if any(tracker.near(shift, one) for one in sure)}
+
+
+def _silhouette(outline: np.ndarray, lit: np.ndarray, rows: int, columns: int) -> tuple[float, float]:
+    """Return which share is lit of what the outline (h, w), shifted, newly covers, and of what it uncovers."""
+    shifted = _moved(outline, rows, columns)
+    covered = shifted & ~ndimage.binary_dilation(outline)
+    uncovered = outline & ~ndimage.binary_dilation(shifted)
+    ahead, behind = (float(lit[part].mean()) if part.any() else 0.0 for part in (covered, uncovered))
+    return ahead, behind
 
 
 def _moved(field: np.ndarray, rows: int, columns: int) -> np.ndarray:
