@@ -9,6 +9,7 @@ SRGB_EXPONENT = 2.224
 """log f(1/2) / log(1/2) of sRGB's decoding curve f, by which colour profiles with that curve are recognised."""
 
 _FULL = {8: 255, 16: 65535}
+_AT_ONCE = 2**20
 
 
 def full_scale(pixels: np.ndarray) -> float:
@@ -23,9 +24,17 @@ def to_linear(pixels: np.ndarray, gamma: str | float) -> np.ndarray:
         pixels: Any shape, uint8, uint16 or float32.
         gamma: linear, srgb, or the exponent of a power curve.
     """
-    if pixels.dtype.kind == "f":
-        return curve(np.maximum(np.nan_to_num(pixels, nan=0.0, posinf=0.0, neginf=0.0), np.float32(0.0)), gamma)
-    return _table(8 * pixels.dtype.itemsize, gamma)[pixels]
+    linear = np.empty(pixels.shape, np.float32)
+    # Few rows at a time: for indexing numpy widens pixels to 8 bytes, and floats are copied more than once.
+    step = max(1, _AT_ONCE * len(pixels) // max(pixels.size, 1))
+    for start in range(0, len(pixels), step):
+        rows = pixels[start : start + step]
+        if rows.dtype.kind == "f":
+            finite = np.nan_to_num(rows, nan=0.0, posinf=0.0, neginf=0.0)
+            linear[start : start + step] = curve(np.maximum(finite, np.float32(0.0)), gamma)
+        else:
+            linear[start : start + step] = _table(8 * rows.dtype.itemsize, gamma)[rows]
+    return linear
 
 
 def brightness(image: np.ndarray) -> np.ndarray:  # (..., H, W) float32
