@@ -26,8 +26,8 @@ _ROUGH = 1e-4  # the same while weights still change
 _SETTLED = 1e-3
 _OUTWORN = 12  # steps of a solve after which the preconditioner is built anew for the changed weights
 _WEAKEST = 1e-6  # weight of an edge that both of its equations have left
-LARGE = 600_000
-"""Pixels above which the grid is solved in place (`sdps.core.large_depth`); a graph of so many takes 1.5 GiB."""
+LARGE = 1_000_000
+"""Pixels above which the grid is solved in place (`sdps.core.large_depth`); a graph of so many takes 0.7 GiB."""
 _BAND = 2**18  # pixels looked at at once
 
 

@@ -53,7 +53,13 @@ def curve(values: np.ndarray, gamma: str | float) -> np.ndarray:
 
 def display(linear: np.ndarray) -> np.ndarray:  # uint8
     """Return linear values as a screen wants them: clipped to [0, 1], sRGB's curve, 8 bits."""
-    linear = np.clip(np.asarray(linear, np.float32), 0, 1)
+    linear = np.asarray(linear, np.float32)
+    if linear.size > 4 * _AT_ONCE and linear.ndim > 1:  # few rows at a time
+        shown = np.empty(linear.shape, np.uint8)
+        for start in range(0, len(linear), step := max(1, _AT_ONCE * len(linear) // linear.size)):
+            shown[start : start + step] = display(linear[start : start + step])
+        return shown
+    linear = np.clip(linear, 0, 1)
     coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return (255 * coded + 0.5).astype(np.uint8)
 

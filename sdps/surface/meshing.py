@@ -17,6 +17,9 @@ from sdps.photos.response import to_linear
 
 FORMATS = (".ply", ".obj", ".glb")
 
+MOST_VERTICES = 1_500_000
+"""Of the meshes in files. A vertex takes about 700 bytes while they are written, and 200 in the file."""
+
 _MATT = {
     "name": "matt",
     "pbrMetallicRoughness": {"baseColorFactor": [1.0] * 4, "metallicFactor": 0.0, "roughnessFactor": 1.0},
@@ -29,6 +32,11 @@ def unit_scale(shape: tuple[int, int]) -> float:
     return 2.0 / max(shape)
 
 
+def step_of(mask: np.ndarray) -> int:
+    """Return every how manyth pixel is a vertex of the object's files, so that they have at most 1.5 million."""
+    return max(1, int(np.ceil(np.sqrt(int(mask.sum()) / MOST_VERTICES))))
+
+
 def mesh(
     depth: Depth | np.ndarray,
     mask: np.ndarray | None = None,
@@ -36,6 +44,7 @@ def mesh(
     colour: np.ndarray | None = None,
     normals: np.ndarray | None = None,
     steepest: float | None = None,
+    every: int = 1,
 ) -> trimesh.Trimesh:
     """Triangulate the masked pixels: a vertex at each pixel's centre, two triangles between four, one between three.
 
@@ -50,11 +59,15 @@ def mesh(
         normals: (H, W, 3), normals of the vertices, not those of the triangles around them.
         steepest: Leave out triangles with an edge that rises by more pixels than this per pixel, such as walls across
             discontinuities; None keeps all.
+        every: Take every so manyth pixel of every so manyth row alone (`step_of`).
 
     Raises:
         InputError: sizes or types that do not fit, depth that is not finite, or no triangle.
     """
     z, mask = _checked(depth, mask, colour, normals)
+    height, width = mask.shape
+    few = slice(None, None, every), slice(None, None, every)
+    z, mask = z[few] / np.float32(every) if every > 1 else z, mask[few]
     index = np.full(mask.shape, -1, np.int64)
     index[mask] = np.arange(mask.sum())
     faces = _triangles(z, index)
@@ -67,13 +80,12 @@ def mesh(
         raise InputError("no three neighbouring mask pixels make a triangle; mark a larger object, or raise steepest")
     used, faces = np.unique(faces, return_inverse=True)
     rows, columns = rows[used], columns[used]
-    height, width = mask.shape
-    vertices = np.stack([columns - (width - 1) / 2, (height - 1) / 2 - rows, z[rows, columns]], axis=-1)
+    places = every * columns - (width - 1) / 2, (height - 1) / 2 - every * rows, every * z[rows, columns]
     return trimesh.Trimesh(
-        vertices=vertices * unit_scale(mask.shape),
+        vertices=np.stack(places, axis=-1) * unit_scale((height, width)),
         faces=faces.reshape(-1, 3),
-        vertex_normals=None if normals is None else np.asarray(normals, np.float64)[rows, columns],
-        vertex_colors=None if colour is None else colour[rows, columns],
+        vertex_normals=None if normals is None else np.asarray(normals[few][rows, columns], np.float64),
+        vertex_colors=None if colour is None else colour[few][rows, columns],
         process=False,
     )
 
