@@ -59,7 +59,9 @@ def photograph_large(folder: Path, config: LargeConfig) -> Path:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         for number in progress_bar(range(config.pictures), desc="photograph", unit="picture"):
-            picture = np.concatenate([_shaded(rows, lights[number], gains[number], config, rng) for rows in _bands(config)])
+            picture = np.concatenate(
+                [_shaded(rows, lights[number], gains[number], config, rng) for rows in _bands(config)]
+            )
             Image.fromarray(picture).save(folder / f"{number:03d}.jpg", quality=_QUALITY)
         if config.share < 1.0:
             mask = np.concatenate([_relief(rows, config)[2] for rows in _bands(config)])

@@ -307,9 +307,7 @@ def _slopes(normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...]) -> tu
     return slopes, flat / int(mask.sum())
 
 
-def _reweighted(
-    slopes: Slopes, inside: np.ndarray, z: np.ndarray, edges: Edges, sharpness: float, most: int
-) -> int:
+def _reweighted(slopes: Slopes, inside: np.ndarray, z: np.ndarray, edges: Edges, sharpness: float, most: int) -> int:
     """Reweight the one-sided equations as `_bilateral` does, z (h, w) in place; return the systems solved."""
     energy, rows = np.inf, np.zeros(len(inside))
     for number in range(most):

@@ -16,7 +16,6 @@ import numba
 import numpy as np
 from scipy import ndimage
 
-from render.shared.progress import stage
 from sdps.core.laplacian import laplacian, multigrid
 
 _COARSE = 2**17

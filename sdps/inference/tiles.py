@@ -5,6 +5,7 @@ that the inner parts together are what the whole would have given.
 """
 
 from collections.abc import Iterator
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +50,7 @@ def tiles(mask: np.ndarray, most: int, halo: int, multiple: int = 1) -> list[Til
     height, width = mask.shape
     if mask.size <= most:
         return [Tile(*2 * (slice(0, height), slice(0, width)))]
-    halo = -(-halo // multiple) * multiple
+    halo = ceil(halo / multiple) * multiple
     side = max(int(most**0.5) - 2 * halo, _LEAST_SIDE)
     # Of a narrow image the tiles may be as long as it leaves room for.
     across = min(width, max(side, int(most / min(height, side + 2 * halo)) - 2 * halo))
@@ -64,8 +65,8 @@ def tiles(mask: np.ndarray, most: int, halo: int, multiple: int = 1) -> list[Til
 
 def _cut(length: int, most: int, multiple: int) -> Iterator[slice]:
     """Cut a length into parts of about equal length, each a multiple but the last."""
-    count = -(-length // most)
-    step = -(-(-(-length // count)) // multiple) * multiple
+    count = ceil(length / most)
+    step = ceil(length / count / multiple) * multiple
     return (slice(start, min(start + step, length)) for start in range(0, length, step))
 
 

@@ -178,7 +178,10 @@ def residuals(
     if albedo.shape != (*mask.shape, 3):
         raise InputError(f"albedo must be {(*mask.shape, 3)} like the mask, got {albedo.shape}")
     inside = albedo[mask].astype(np.float32)
-    wrong, power = np.zeros((2, len(lights))), np.zeros((2, len(unit)), np.float64 if len(unit) <= _PART else np.float32)
+    wrong, power = (
+        np.zeros((2, len(lights))),
+        np.zeros((2, len(unit)), np.float64 if len(unit) <= _PART else np.float32),
+    )
     for part, observed in _read(images, mask):
         for number, values in zip(range(part.start, part.stop), observed, strict=True):
             for some in _parts(len(unit)):
