@@ -98,7 +98,8 @@ def _shaded(
     rows: slice, light: np.ndarray, gain: float, config: LargeConfig, rng: np.random.Generator
 ) -> np.ndarray:  # (h, W, 3) uint8
     normals, albedo, mask = _relief(rows, config)
-    half = (light + (0.0, 0.0, 1.0)) / np.linalg.norm(light + (0.0, 0.0, 1.0))
+    half = light + np.array([0.0, 0.0, 1.0])
+    half /= np.linalg.norm(half)
     shading = np.maximum(normals @ light.astype(np.float32), 0.0)[..., None]
     gloss = np.maximum(normals @ half.astype(np.float32), 0.0)[..., None] ** _SHININESS
     linear = np.where(mask[..., None], gain * (albedo + _GLOSS * gloss) * shading, _GROUND)
