@@ -13,7 +13,7 @@ from pipelines.report import page as report
 from pipelines.report.sections import Section, SectionWriter, Table, Tile
 from pipelines.shared import pictures, using
 from render.shared.errors import InputError
-from render.shared.progress import stage
+from render.shared.progress import bars, stage
 
 if TYPE_CHECKING:
     from sdps.api import Inference
@@ -44,6 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         "a network finds the normals)")  # fmt: skip
     parser.add_argument("--anyway", action="store_true",
                         help="go on where a check of the photographs stops (the report says which)")  # fmt: skip
+    parser.add_argument("--scale", type=float, default=1.0, metavar="F",
+                        help="reduce pictures and mask as they are read; 0.5 halves the sides")  # fmt: skip
     using.add_arguments(parser)
     parser.add_argument("--self-test", action="store_true",
                         help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
@@ -57,9 +59,10 @@ def main(args: argparse.Namespace) -> int:
         args.folder = photograph_bunny(args.out / "photographs")
     if args.folder is None:
         raise InputError("name a folder of photographs, or use --self-test")
-    result = infer_folder(args)
-    made = result.save(args.out)
-    page = write_page(args.out / "report.html", result)
+    with bars(without=("reading", "checks", "refinement")):  # these have their own
+        result = infer_folder(args)
+        made = result.save(args.out)
+        page = write_page(args.out / "report.html", result)
     if args.self_test:
         from pipelines.evaluate.self_test import compare
 
@@ -70,7 +73,7 @@ def main(args: argparse.Namespace) -> int:
 
 def infer_folder(args: argparse.Namespace) -> "Inference":
     """Read the photographs, say what was found about them, and run the method."""
-    from sdps.api import check_out, infer, load
+    from sdps.api import check_out, infer, load, plan
     from sdps.inference.inference_config import inference_config
     from sdps.photos import check
 
@@ -78,15 +81,18 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     check_out(args.out, args.folder)
     photos = load(
         args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
-        gamma=args.gamma, names=args.images, anyway=args.anyway,
+        gamma=args.gamma, names=args.images, anyway=args.anyway, scale=args.scale,
     )  # fmt: skip
     findings = tuple(check(photos))
     height, width = photos.shape
     sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is taken for orthographic\n")
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
+    options = {"models": args.models, "config": config, "refine": args.refine, "discontinuities": args.discontinuities}
+    if args.anyway or not any(finding.level == "error" for finding in findings):
+        sys.stdout.write(f"{plan(photos, args.method, **options).describe()}\n")
+        sys.stdout.flush()
     return infer(
-        photos, args.method, models=args.models, config=config, refine=args.refine,
-        discontinuities=args.discontinuities, findings=findings, anyway=args.anyway,
+        photos, args.method, findings=findings, anyway=args.anyway, **options
     )  # fmt: skip
 
 

@@ -36,9 +36,10 @@ from sdps.photos import Finding, Photographs, check, load
 from sdps.photos.doubts import ANYWAY
 from sdps.refinement.trust import FEWEST_IMAGES
 from sdps.surface.inferred import Inference, check_out
+from sdps.surface.workload import Workload, workload
 from sdps.training.trainer import TrainingResult
 
-__all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "load", "train"]
+__all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "load", "plan", "train"]
 
 AUTO = "auto"
 _LEARNED = ("sdps-frames", "sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
@@ -86,12 +87,23 @@ def infer(
     if grave is not None and not anyway:
         raise InputError(f"{photos.folder}: {grave.text} ({ANYWAY})")
     runner = _runner(method, photos.light_directions is not None, models, config, refine, len(photos))
+    if not anyway:
+        workload(photos, runner, discontinuities=discontinuities).check()
     began = time.perf_counter()
     found = runner.estimate(
         photos, photos.mask, photos.light_directions, photos.intensities, saturation=photos.saturation
     )
     seconds = time.perf_counter() - began
     return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
+
+
+def plan(
+    photos: Photographs, method: str = AUTO, *, models: str | Path | None = None,
+    config: InferenceConfig | None = None, refine: bool | None = None, discontinuities: bool = False,
+) -> Workload:  # fmt: skip
+    """Return about what `infer` will take, in seconds and memory; arguments as of `infer`."""
+    runner = _runner(method, photos.light_directions is not None, models, config, refine, len(photos))
+    return workload(photos, runner, discontinuities=discontinuities)
 
 
 def estimate(

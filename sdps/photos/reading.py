@@ -226,8 +226,14 @@ def _refuse_broken(folder: Path, files: tuple[str, ...], broken: np.ndarray, mas
 
 
 def _reduced_mask(path: Path, full: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
-    """Read a mask of the files' size and reduce it as the pictures are."""
-    mask = reduced_mask(read_mask(path, full), shape)
+    """Read a mask of the files' size and reduce it as the pictures are, or one that is of their size already."""
+    try:
+        mask = reduced_mask(read_mask(path, full), shape)
+    except InputError as error:
+        try:
+            mask = read_mask(path, shape)
+        except InputError:
+            raise error from error.__cause__
     if not mask.any():
         raise InputError(f"{path}: nothing is left of the mask once it is reduced; give a larger scale")
     return mask

@@ -22,6 +22,7 @@ from render.shared.files import atomic_path
 
 PHOTOS, PAINTED = "photos", "painted.png"
 _GAMMAS = ("auto", "linear", "srgb", "2.2")
+_SCALES = ("1", "0.5", "0.25")
 _TASKS = ("example", "check", "infer")
 _MOST_MASK = 32 * 2**20
 _MOST_RUNS = 20
@@ -107,6 +108,7 @@ async def start(request: Request) -> Response:
         (place / "runs" / str(number)).mkdir(parents=True)
         arguments |= {"number": number, "method": str(asked.get("method", "auto"))[:80]}
         arguments |= {key: asked.get(key) is True for key in ("refine", "anyway", "discontinuities")}
+        arguments["scale"] = float(_one_of(asked, "scale", _SCALES))
     job = request.app.state.jobs.submit(session.token, task, **arguments)
     if job is None:
         raise InputError("too many jobs wait; try again in a minute")

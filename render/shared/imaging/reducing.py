@@ -17,7 +17,7 @@ def check_scale(scale: float) -> float:
         InputError: anything else.
     """
     if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not (math.isfinite(scale) and 0 < scale <= 1):
-        raise InputError(f"scale must be a number above 0 and at most 1, got {scale}; 0.5 halves the sides")
+        raise InputError(f"scale (--scale) must be a number above 0 and at most 1, got {scale}; 0.5 halves the sides")
     return float(scale)
 
 
@@ -32,7 +32,7 @@ def reduced_shape(shape: tuple[int, int], scale: float) -> tuple[int, int]:
     height, width = (round(side * scale) for side in shape)
     if min(height, width) < _LEAST_SIDE:
         raise InputError(
-            f"scale {scale:g} leaves {width}x{height} pixels of pictures of {shape[1]}x{shape[0]}; give a larger one"
+            f"scale (--scale) {scale:g} leaves {width}x{height} pixels of pictures of {shape[1]}x{shape[0]}; give a larger one"
         )
     return height, width
 
