@@ -90,8 +90,8 @@ def _relief(rows: slice, config: LargeConfig) -> tuple[np.ndarray, np.ndarray, n
     normals = np.stack([-slopes[0], -slopes[1], np.ones_like(dome)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     cells = (np.floor(14 * x) + np.floor(14 * y)) % 2
-    albedo = np.where(cells[..., None] > 0, np.float32([0.6, 0.3, 0.2]), np.float32([0.3, 0.4, 0.5]))
-    return normals, albedo, mask
+    colours = np.array([[0.3, 0.4, 0.5], [0.6, 0.3, 0.2]], np.float32)
+    return normals, colours[cells.astype(int)], mask
 
 
 def _shaded(

@@ -16,7 +16,7 @@ from sdps.inference.image_source import ImageSource, survey
 
 PART_BYTES = 5 * 2**28
 """Memory for the observations that a method which looks at pixels one by one sees at once."""
-_BYTES = 90
+_BYTES = 60
 """Memory of an observation, one pixel in one image, with its copies; measured."""
 _MARGIN = 2
 

@@ -66,12 +66,11 @@ def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = Fa
             no error that is expected.
     """
     of_lights, moved, parts = _features(found, mask, start)
-    plain, values = [], []
+    told, plainly, values = "expected_error" in start.diagnostics, [], []
     for of_normals in parts:
-        plain.append(np.exp(of_normals[:, : len(NORMAL)] @ NORMAL))
-        told = "expected_error" in start.diagnostics
-        values.append(np.exp(of_normals @ NORMAL_TOLD) if told else (_GIVEN if given else 1.0) * plain[-1])
-    expected, plain = np.zeros(mask.shape, np.float32), np.concatenate(plain)
+        plainly.append(np.exp(of_normals[:, : len(NORMAL)] @ NORMAL))
+        values.append(np.exp(of_normals @ NORMAL_TOLD) if told else (_GIVEN if given else 1.0) * plainly[-1])
+    expected, plain = np.zeros(mask.shape, np.float32), np.concatenate(plainly)
     expected[mask] = np.concatenate(values)
     of_start, mean = float(np.exp(moved @ START)), float(plain.mean())
     doubt = _doubt(mask, start.normals, start.light_directions)

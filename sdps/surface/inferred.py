@@ -219,6 +219,7 @@ class Inference:
         (folder / "relit").mkdir()
         for name in RELIT:
             write_png(folder / "relit" / f"{name}.png", display(self.relit_view(name)))
+            stage("relit pictures", 1, 1)
         write_json(folder / "result.json", self.summary())
 
 

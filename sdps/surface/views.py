@@ -76,7 +76,7 @@ def turned(depth: Depth, degrees: float, height: int, *, colour: np.ndarray | No
 def _of_the_box(depth: Depth, colour: np.ndarray | None, side: int) -> tuple[Depth, np.ndarray | None]:
     """Return depth and colour of the mask's box, thinned to sides of about `side` pixels where they are twice that."""
     rows, columns = (np.flatnonzero(depth.mask.any(axis=axis)) for axis in (1, 0))
-    every = max(1, max(np.ptp(rows), np.ptp(columns)) // side)
+    every = max(1, int(max(np.ptp(rows), np.ptp(columns))) // side)
     few = slice(rows[0], rows[-1] + 1, every), slice(columns[0], columns[-1] + 1, every)
     z = depth.z[few] if every == 1 else depth.z[few] / np.float32(every)
     return replace(depth, z=z, mask=depth.mask[few]), None if colour is None else colour[few]

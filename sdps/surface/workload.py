@@ -150,7 +150,7 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
         found["lights"] = 2 * once + images * (40e-9 * size.box + 4e-3 * views * slower)
     normals = runner.method.normals
     if normals in classical.METHODS:
-        found["normals"] = 2e-6 * size.pixels * images + 1e-5 * size.pixels
+        found["normals"] = 8e-7 * size.pixels * images + 1e-5 * size.pixels
     elif estimator is not None and estimator.normals is not None:
         found["normals"] = _normal_seconds(size, runner, slower) + once * _tile_count(size, runner)
     if runner.method.refined:

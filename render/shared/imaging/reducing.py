@@ -32,7 +32,8 @@ def reduced_shape(shape: tuple[int, int], scale: float) -> tuple[int, int]:
     height, width = (round(side * scale) for side in shape)
     if min(height, width) < _LEAST_SIDE:
         raise InputError(
-            f"scale (--scale) {scale:g} leaves {width}x{height} pixels of pictures of {shape[1]}x{shape[0]}; give a larger one"
+            f"scale (--scale) {scale:g} leaves {width}x{height} pixels of pictures of {shape[1]}x{shape[0]}; give a "
+            "larger one"
         )
     return height, width
 
