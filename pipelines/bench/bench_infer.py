@@ -3,7 +3,8 @@
 The photographs are 16-bit pictures of the object of `bench-classical`, which fills the frame but for a margin. Every
 run is a process of its own; both kinds of processor are measured (`pipelines.shared.machines`). With `--many`, a
 second folder repeats the pictures up to that number, to show that memory does not grow with them. With `--large`,
-seven JPEG files of twelve megapixels are inferred as well, as `sdps infer` does with no flag, and each stage is timed.
+seven JPEG files of twelve megapixels are inferred as well, as `sdps infer` does with no flag but for its page, and each
+stage is timed.
 """
 
 import argparse
@@ -88,9 +89,7 @@ def _large(args: argparse.Namespace, config: LargeConfig) -> int:
 
 
 def _large_work(folder: Path, models: Path | None, config: InferenceConfig) -> dict[str, Any]:
-    """Do what `sdps infer` does; return seconds per stage and in all, peak_gib, pixels, and what was expected."""
-    from pipelines.infer import write_page
-
+    """Do what `sdps infer` does but for its page; return seconds per stage, peak_gib, and what was expected."""
     stages: dict[str, float] = {}
     began = last = time.perf_counter()
 
@@ -105,7 +104,6 @@ def _large_work(folder: Path, models: Path | None, config: InferenceConfig) -> d
         expected = plan(photos, models=models, config=config)
         result = infer(photos, models=models, config=config, findings=findings)
         result.save(out)
-        write_page(Path(out) / "report.html", result)
     return {
         "stages": stages, "seconds": time.perf_counter() - began, "expected": expected.total, "peak_gib": peak_gib(),
         "expected_gib": expected.gib, "pixels": int(photos.mask.sum()), "method": result.method,

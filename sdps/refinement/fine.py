@@ -5,7 +5,7 @@ stay here, and pixels see their neighbours alone, so tiles join; but how far nor
 how well the model fits, which is then a tile's own.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
@@ -72,49 +72,43 @@ def _interpolation(
     return up
 
 
-class Pictures:
-    """What was found, laid out tile by tile, and how far the model is from the images.
+def pictures(scene: ObjectImages, parts: Iterable[tuple[Tile, Problem, State]], state: State) -> Refined:
+    """Lay out what was found, tile by tile, and how far the model is from the images.
 
     Args:
         scene: The object.
+        parts: Tiles with their pixels and the state there.
+        state: For what is the same in all tiles.
     """
-
-    def __init__(self, scene: ObjectImages) -> None:
-        self.scene, self.count = scene, 0
-        self.normals, self.albedo = np.zeros((2, *scene.shape, 3), np.float32)
-        self.strength, self.residual = np.zeros((2, *scene.shape), np.float32)
-        self.by_image = torch.zeros(len(scene))
-
-    def add(self, tile: Tile, problem: Problem, state: State) -> None:
-        """Lay out a tile's inner part."""
-        made, inside = factors(state), self.scene.mask[tile.inner]
-        own = np.zeros(problem.mask.shape, bool)
-        own[tile.within] = True
-        chosen = torch.from_numpy(own[problem.mask])
-        by_pixel, images = torch.empty(len(problem.images)), problem.explained(made, state)
+    normals, albedo = np.zeros((2, *scene.shape, 3), np.float32)
+    strength, residual = np.zeros((2, *scene.shape), np.float32)
+    by_image, made = torch.zeros(len(scene)), factors(state)
+    for tile, problem, own in parts:
+        found, inside = factors(own), scene.mask[tile.inner]
+        inner = np.zeros(problem.mask.shape, bool)
+        inner[tile.within] = True
+        chosen = torch.from_numpy(inner[problem.mask])
+        by_pixel, images = torch.empty(len(problem.images)), problem.explained(found, own)
         for part in parts_of(len(by_pixel)):
-            some = made._replace(normals=made.normals[part], albedo=made.albedo[part], strength=made.strength[part])
+            some = found._replace(
+                normals=found.normals[part], albedo=found.albedo[part], strength=found.strength[part]
+            )  # fmt: skip
             gaps = difference(some, images[part], problem.kept[part] == 0.0)
             by_pixel[part] = gaps.mean(dim=(1, 2))
-            self.by_image += gaps[chosen[part]].mean(dim=1).sum(dim=0)
-        found = (made.normals, made.albedo, made.strength, by_pixel)
-        for picture, values in zip((self.normals, self.albedo, self.strength, self.residual), found, strict=True):
-            picture[self.scene.rows, self.scene.columns][tile.inner][inside] = values[chosen].numpy()
-        self.count += int(inside.sum())
-
-    def result(self, state: State) -> Refined:
-        """Return everything; `state` for what is the same in all tiles."""
-        made = factors(state)
-        return Refined(
-            normals=self.normals,
-            light_directions=made.directions.numpy(),
-            intensities=made.log_intensities.exp().numpy(),
-            albedo=self.albedo,
-            strength=self.strength,
-            modes=state.modes.numpy(),
-            body=made.body.numpy(),
-            amplitudes=made.amplitudes.numpy(),
-            sharpness=made.sharpness.numpy(),
-            pixel_residual=self.residual,
-            image_residual=(self.by_image / self.count).numpy(),
-        )
+            by_image += gaps[chosen[part]].mean(dim=1).sum(dim=0)
+        values = (found.normals, found.albedo, found.strength, by_pixel)
+        for picture, of_pixels in zip((normals, albedo, strength, residual), values, strict=True):
+            picture[scene.rows, scene.columns][tile.inner][inside] = of_pixels[chosen].numpy()
+    return Refined(
+        normals=normals,
+        light_directions=made.directions.numpy(),
+        intensities=made.log_intensities.exp().numpy(),
+        albedo=albedo,
+        strength=strength,
+        modes=state.modes.numpy(),
+        body=made.body.numpy(),
+        amplitudes=made.amplitudes.numpy(),
+        sharpness=made.sharpness.numpy(),
+        pixel_residual=residual,
+        image_residual=(by_image / int(scene.mask.sum())).numpy(),
+    )

@@ -4,7 +4,7 @@ The equations stand in `sdps.refinement.image_model`, the priors in `priors`.
 What was measured: docs/studies/refinement.md.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -16,10 +16,10 @@ from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
 from sdps.core.integration import integrate
-from sdps.inference.image_source import ImageSource, survey
-from sdps.inference.tiles import tiles
+from sdps.inference.image_source import ImageSource, ObjectImages, survey
+from sdps.inference.tiles import Tile, tiles
 from sdps.refinement.descent import Problem, Weights, solve
-from sdps.refinement.fine import Pictures, finer
+from sdps.refinement.fine import finer, pictures
 from sdps.refinement.image_model import LOBES, SHAPES, State, factors
 from sdps.refinement.modes import MODES
 from sdps.refinement.problems import gathered, log_albedo, on_grid, problem_of
@@ -81,7 +81,7 @@ def refine(
     """Refine normals and lights.
 
     Args:
-        images: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time; read twice.
+        images: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time.
         mask: (H, W) bool.
         normals: (H, W, 3) unit, where a method put them.
         lights: (L, 3) unit directions from the surface to the light.
@@ -94,35 +94,41 @@ def refine(
     Raises:
         InputError: fewer than four images, shapes that do not fit, or an object that is black.
     """
-    config = config or RefineConfig()
-    gains = _checked(len(images), mask, normals, lights, intensities)
+    config, gains = config or RefineConfig(), _checked(len(images), mask, normals, lights, intensities)
     scene = survey(images, mask, 0, stray=stray)
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
-    parts = tiles(scene.mask, TILE_BYTES // (_PIXEL_BYTES + _OBSERVATION_BYTES * len(scene)), _HALO)
+    most = TILE_BYTES // (_PIXEL_BYTES + _OBSERVATION_BYTES * len(scene)) if stride > 1 else scene.mask.size
+    parts = tiles(scene.mask, most, _HALO)
     values = gathered(scene, scene.mask if len(parts) == 1 else on_grid(scene.mask, stride))
     problem = problem_of(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
     begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
     free = frozenset(State._fields) - ({"directions"} if directions_given else set())
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
-    total = before + config.iterations + fine * len(parts)
-    with progress_bar(None, total=total, desc="refine", unit="iteration") as bar:
+    with progress_bar(None, total=before + config.iterations + fine * len(parts), desc="refine") as bar:
         move = partial(solve, free=free, boost=config.boost, weights=Weights(), after=_advance(bar))
         start = start_of(problem, begun, lights, gains)
         if before:
             problem = _traced(problem, move(problem, start, iterations=before), config.bounces)
             start = start._replace(log_albedo=log_albedo(problem, start))
         state = move(problem, start, iterations=config.iterations)
-        weights, found = Weights(curl=(config.fine_curl, config.fine_curl)), Pictures(scene)
-        for tile in parts:
-            every, own = problem, state
-            if stride > 1:
-                part = scene.part(tile.outer_rows, tile.outer_columns)
-                values = values if len(parts) == 1 else gathered(part, part.mask)
-                every, own = finer(values, scene, tile, problem, stride, state, full)
-            if fine:
-                own = move(every, own, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
-            found.add(tile, every, own)
-    return found.result(state)
+        if stride == 1:
+            return pictures(scene, [(parts[0], problem, state)], state)
+        weights = Weights(curl=(config.fine_curl, config.fine_curl))
+        settle = partial(move, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
+        return pictures(scene, _every_pixel(scene, parts, values, problem, stride, state, full, settle), state)
+
+
+def _every_pixel(
+    scene: ObjectImages, parts: list[Tile], values: np.ndarray, coarse: Problem, stride: int, state: State,
+    full: np.ndarray, settle: Callable[[Problem, State], State],
+) -> Iterator[tuple[Tile, Problem, State]]:  # fmt: skip
+    """Yield every pixel, tile by tile; `values` are all pixels' where one tile holds them."""
+    for tile in parts:
+        if len(parts) > 1:
+            part = scene.part(tile.outer_rows, tile.outer_columns)
+            values = gathered(part, part.mask)
+        problem, begun = finer(values, scene, tile, coarse, stride, state, full)
+        yield tile, problem, settle(problem, begun)
 
 
 def _advance(bar: Any) -> Callable[[], None]:

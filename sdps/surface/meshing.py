@@ -67,15 +67,13 @@ def mesh(
     z, mask = _checked(depth, mask, colour, normals)
     height, width = mask.shape
     few = slice(None, None, every), slice(None, None, every)
-    z, mask = z[few] / np.float32(every) if every > 1 else z, mask[few]
+    z, mask = z[few] / np.float32(every), mask[few]
     index = np.full(mask.shape, -1, np.int64)
     index[mask] = np.arange(mask.sum())
     faces = _triangles(z, index)
     rows, columns = np.nonzero(mask)
     if steepest is not None:
-        corners = np.stack([columns, rows, z[mask]], axis=-1).astype(np.float64)[faces]  # (f, 3, 3)
-        edges = corners - np.roll(corners, 1, axis=1)
-        faces = faces[(np.abs(edges[..., 2]) <= steepest * np.linalg.norm(edges[..., :2], axis=-1)).all(axis=1)]
+        faces = _no_walls(faces, np.stack([columns, rows, z[mask]], axis=-1).astype(np.float64), steepest)
     if not len(faces):
         raise InputError("no three neighbouring mask pixels make a triangle; mark a larger object, or raise steepest")
     used, faces = np.unique(faces, return_inverse=True)
@@ -88,6 +86,13 @@ def mesh(
         vertex_colors=None if colour is None else colour[few][rows, columns],
         process=False,
     )
+
+
+def _no_walls(faces: np.ndarray, corners: np.ndarray, steepest: float) -> np.ndarray:
+    """Return the triangles (f, 3) without an edge that is steeper; corners (v, 3) in pixels."""
+    found = corners[faces]  # (f, 3, 3)
+    edges = found - np.roll(found, 1, axis=1)
+    return faces[(np.abs(edges[..., 2]) <= steepest * np.linalg.norm(edges[..., :2], axis=-1)).all(axis=1)]
 
 
 def write_mesh(surface: trimesh.Trimesh, path: str | Path) -> None:
