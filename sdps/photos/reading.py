@@ -21,6 +21,9 @@ from sdps.photos.masks import Variation, automatic_mask, read_mask
 from sdps.photos.picture_file import Coding, Picture, decode, turned
 from sdps.photos.response import brightness, to_linear
 
+MOST_PIXELS = 50_000_000
+"""Of a picture, once reduced: the checks hold one at a time, and 70 bytes for each of its pixels."""
+_AT_ONCE = 2**20
 _LOG = logging.getLogger(__name__)
 
 
@@ -89,9 +92,11 @@ class Photographs:
             if reduced_shape(pixels.shape[:2], self.scale) != self.shape or picture.coding != self.coding:
                 raise InputError(f"{self.folder / self.files[number]}: changed while it was in use; start again")
             if self.scale == 1.0:
-                image[:] = to_linear(pixels[rows, columns], self.gamma)
+                to_linear(pixels[rows, columns], self.gamma, image)
             else:
-                image[:] = reduced(to_linear(pixels, self.gamma), self.shape)[rows, columns]
+                for channel in range(3):  # one by one: a whole picture of floats may take a gigabyte
+                    linear = to_linear(pixels[..., channel], self.gamma)
+                    image[..., channel] = reduced(linear, self.shape)[rows, columns]
         return images
 
     @property
@@ -168,6 +173,7 @@ def _survey(
     applied, why = resolve_gamma(gamma, first.coding, folder)
     full = turned(first.pixels, first.orientation).shape[:2]
     shape = reduced_shape(full, scale)
+    _refuse_huge(folder / files[0], full, shape, doubts)
     given = None if mask_file is None else _reduced_mask(mask_file, full, shape)
     variation = Variation(shape)
     broken = np.full(shape, -1, np.int32)  # the first picture with a value that is not finite
@@ -181,7 +187,7 @@ def _survey(
             touched = reduced((~np.isfinite(pixels).all(-1)).astype(np.float32), shape) > 0
             broken[(broken < 0) & touched] = number
         if given is None:
-            variation.add(reduced(brightness(to_linear(pixels, applied)), shape))
+            variation.add(reduced(_grey(pixels, applied), shape))
         stage("reading", number + 1, len(files))
     notes = [why, *_orientation_note(first.orientation, turns), *_scale_note(full, shape)]
     if given is None and not variation.changes().any():
@@ -222,6 +228,23 @@ def _refuse_broken(folder: Path, files: tuple[str, ...], broken: np.ndarray, mas
         doubts.stop(
             f"{folder / name}: NaN or infinite values inside the mask ({len(bad)} pixels over all pictures); write it "
             "again or cut them out of the mask"
+        )
+
+
+def _grey(pixels: np.ndarray, gamma: str | float) -> np.ndarray:
+    """Return the brightness of pixels (H, W, 3), a few rows at a time."""
+    step = max(1, _AT_ONCE // pixels.shape[1])
+    rows = (pixels[start : start + step] for start in range(0, len(pixels), step))
+    return np.concatenate([brightness(to_linear(some, gamma)) for some in rows])
+
+
+def _refuse_huge(path: Path, full: tuple[int, int], shape: tuple[int, int], doubts: Doubts) -> None:
+    """Refuse pictures that would fill the memory one by one."""
+    if shape[0] * shape[1] > MOST_PIXELS:
+        fits = int(20 * (MOST_PIXELS / (full[0] * full[1])) ** 0.5) / 20
+        doubts.stop(
+            f"{path}: is {full[1]}x{full[0]} pixels; more than {MOST_PIXELS // 10**6} million would take more than "
+            f"4 GiB of memory; give --scale {fits:g} (in Python load(..., scale={fits:g}))"
         )
 
 

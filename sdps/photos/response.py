@@ -17,14 +17,15 @@ def full_scale(pixels: np.ndarray) -> float:
     return 1.0 if pixels.dtype.kind == "f" else float(_FULL[8 * pixels.dtype.itemsize])
 
 
-def to_linear(pixels: np.ndarray, gamma: str | float) -> np.ndarray:
+def to_linear(pixels: np.ndarray, gamma: str | float, out: np.ndarray | None = None) -> np.ndarray:
     """Return pixels as float32 linear radiance, full scale = 1; negative and non-finite values become 0.
 
     Args:
         pixels: Any shape, uint8, uint16 or float32.
         gamma: linear, srgb, or the exponent of a power curve.
+        out: Where to write them, float32 of the same shape; new memory if not given.
     """
-    linear = np.empty(pixels.shape, np.float32)
+    linear = np.empty(pixels.shape, np.float32) if out is None else out
     # Few rows at a time: for indexing numpy widens pixels to 8 bytes, and floats are copied more than once.
     step = max(1, _AT_ONCE * len(pixels) // max(pixels.size, 1))
     for start in range(0, len(pixels), step):

@@ -143,7 +143,7 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
     """Return about how long each stage takes."""
     threads, images = max(1, torch.get_num_threads()), size.pictures
     once = images * (size.file * (_DECODED.get(kind, _DECODED_ELSE) + 30e-9 * reduces) + 15e-9 * size.frame)
-    found = {"reading": 2 * once + 40e-9 * images * size.frame}
+    found = {"reading": 2 * once + 70e-9 * images * size.frame}
     estimator, slower = runner.estimator, _slower(runner)
     if estimator is not None and estimator.lighting is not None:
         views = runner.config.light_views or 1
@@ -188,7 +188,7 @@ def _tile_pixels(size: Size, runner: Runner) -> float:
 def _memory(size: Size, runner: Runner) -> float:
     """Return about how many GiB are in use at most."""
     kept = 29.0 * size.frame  # normals, mask, error to expect, and what they are cut from
-    stages = [40.0 * size.file, 70.0 * size.box + 12 * size.frame]
+    stages = [16.0 * size.file + 30.0 * size.frame, 70.0 * size.frame]
     if runner.method.normals in classical.METHODS:
         stages.append(observed_bytes(runner.method.normals, size.pictures, size.box))
     elif runner.estimator is not None:

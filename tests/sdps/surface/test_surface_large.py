@@ -1,4 +1,4 @@
-"""Large objects: depth on the grid itself, thinned meshes, shadows and views, work in parts; as small ones have them."""
+"""Large objects: depth on the grid itself, thinned meshes, shadows and views, work in parts."""
 
 import numpy as np
 import pytest
