@@ -203,7 +203,7 @@ bench-classical: $(READY)
 
 bench-infer: OUT = out/bench-infer
 bench-infer: $(READY)
-	$(SDPS) bench-infer --out $(OUT) $(if $(METHODS),--methods '$(METHODS)') $(if $(RUNS),--models $(RUNS))
+	$(SDPS) bench-infer --out $(OUT) $(if $(QUICK),--quick,--large) $(if $(METHODS),--methods '$(METHODS)') $(if $(RUNS),--models $(RUNS))
 
 bench-surface: OUT = out/bench-surface
 bench-surface: $(READY)

@@ -13,6 +13,7 @@ from pipelines.report import page as report
 from pipelines.report.sections import Section, SectionWriter, Table, Tile
 from pipelines.shared import pictures, using
 from render.shared.errors import InputError
+from render.shared.progress import bars, stage
 
 if TYPE_CHECKING:
     from sdps.api import Inference
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 _MARKS = {"error": "!!", "warning": "! ", "note": "- "}
 _MOST_LISTED = 6
+_MOST_SIDE = 700  # of the object, in pixels: twice that and more is thinned for the page
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,6 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         "a network finds the normals)")  # fmt: skip
     parser.add_argument("--anyway", action="store_true",
                         help="go on where a check of the photographs stops (the report says which)")  # fmt: skip
+    parser.add_argument("--scale", type=float, default=1.0, metavar="F",
+                        help="reduce pictures and mask as they are read; 0.5 halves the sides")  # fmt: skip
     using.add_arguments(parser)
     parser.add_argument("--self-test", action="store_true",
                         help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
@@ -61,9 +65,10 @@ def main(args: argparse.Namespace) -> int:
         args.folder = photograph_bunny(args.out / "photographs")
     if args.folder is None:
         raise InputError("name a folder of photographs, or use --self-test")
-    result = infer_folder(args)
-    made = result.save(args.out)
-    page = write_page(args.out / "report.html", result)
+    with bars(without=("reading", "checks", "refinement")):  # these have their own
+        result = infer_folder(args)
+        made = result.save(args.out)
+        page = write_page(args.out / "report.html", result)
     if args.self_test:
         from pipelines.evaluate.self_test import compare
 
@@ -76,7 +81,7 @@ def main(args: argparse.Namespace) -> int:
 
 def infer_folder(args: argparse.Namespace) -> "Inference":
     """Read the photographs, say what was found about them, and run the method."""
-    from sdps.api import check_out, infer, load
+    from sdps.api import check_out, infer, load, plan
     from sdps.inference.inference_config import inference_config
     from sdps.photos import check
 
@@ -84,16 +89,17 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     check_out(args.out, args.folder)
     photos = load(
         args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
-        gamma=args.gamma, names=args.images, anyway=args.anyway,
+        gamma=args.gamma, names=args.images, anyway=args.anyway, scale=args.scale,
     )  # fmt: skip
     findings = tuple(check(photos))
     height, width = photos.shape
     sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is taken for orthographic\n")
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
-    result = infer(
-        photos, args.method, models=args.models, config=config, refine=args.refine,
-        discontinuities=args.discontinuities, findings=findings, anyway=args.anyway,
-    )  # fmt: skip
+    options = {"models": args.models, "config": config, "refine": args.refine, "discontinuities": args.discontinuities}
+    if args.anyway or not any(finding.level == "error" for finding in findings):
+        sys.stdout.write(f"{plan(photos, args.method, **options).describe()}\n")
+        sys.stdout.flush()
+    result = infer(photos, args.method, findings=findings, anyway=args.anyway, **options)
     sys.stdout.write(describe(result.findings[len(findings) :]))
     return result
 
@@ -112,14 +118,19 @@ def _named(images: Sequence[str]) -> str:
 
 def write_page(path: Path, result: "Inference") -> Path:
     """Write the self-contained page of an inference."""
+    stage("page")
     with tempfile.TemporaryDirectory() as temporary:
-        _section(result).write(Path(temporary))
+        writer = _section(result)
+        stage("page", 1, 3)
+        writer.write(Path(temporary))
+        stage("page", 2, 3)
         report.render(path, [Path(temporary)], f"Photometric stereo: {result.photos.folder.resolve().name}", "")
     return path
 
 
 def _section(result: "Inference") -> SectionWriter:
     """Return everything the page shows."""
+    from sdps.surface.inferred import RELIT
     from sdps.surface.views import strip
 
     photos, mask = result.photos, result.photos.mask
@@ -137,33 +148,33 @@ def _section(result: "Inference") -> SectionWriter:
         pictures_first=True,
     )
     writer, box = SectionWriter(section), _box(mask)
-    lit = photos[_brightest(result)][0]
-    shown = pictures.tone_map(lit, pictures.auto_exposure(lit[None], mask))
+    lit = photos.window(_brightest(result), *box)[0]
+    shown = pictures.tone_map(lit, pictures.auto_exposure(lit[None], mask[box]))
     tiles = [
-        Tile("a photograph", shown[box]),
-        Tile(f"mask ({photos.mask_origin})", _masked(shown, mask)[box]),
-        Tile("normals", pictures.normal_map(result.normals, mask)[box], "normals"),
-        Tile("depth, near is bright", depth_picture(result)[box]),
+        Tile("a photograph", shown),
+        Tile(f"mask ({photos.mask_origin})", _masked(shown, mask[box])),
+        Tile("normals", pictures.normal_map(result.normals[box], mask[box]), "normals"),
+        Tile("depth, near is bright", depth_picture(result, box)),
     ]
     if len(result.light_directions):
         tiles.append(Tile("lights, seen from the camera", pictures.light_plot(result.light_directions, result.gains)))
     writer.strip("Photograph, mask, normals, depth, lights", tiles)
     writer.strip("The surface from the left, the front and the right", [("", strip(result.depth, 360))], wide=True)
-    relit = [(name.replace("-", " "), pictures.tone_map(view)[box]) for name, view in result.relit().items()]
+    relit = [(name.replace("-", " "), pictures.tone_map(result.relit_view(name, box))) for name in RELIT]
     writer.strip("Under lights of our choice (matt, with cast shadows)", relit)
     if "refined" in result.estimate.diagnostics:
         writer.strip("Refinement", _refinement_pictures(result, box))
     elif result.expected_error is not None:
-        caption, picture = _expected_picture(result.expected_error, result.photos.mask)
-        writer.strip("How sure the network is", [Tile(caption, picture[box])])
+        writer.strip("How sure the network is", [_expected_picture(result.expected_error[box], mask[box])])
     return writer
 
 
 def _box(mask: np.ndarray) -> tuple[slice, slice]:
-    """Return the rows and columns of the object, with a little room around it."""
-    found = np.nonzero(mask)
-    room = round(0.06 * max(np.ptp(places) for places in found)) + 1
-    rows, columns = (slice(max(places.min() - room, 0), places.max() + room + 1) for places in found)
+    """Return the rows and columns of the object, with a little room around it; every n-th where they are very many."""
+    found = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
+    side = max(int(np.ptp(places)) for places in found)
+    room, every = round(0.06 * side) + 1, max(1, side // _MOST_SIDE)
+    rows, columns = (slice(max(places.min() - room, 0), places.max() + room + 1, every) for places in found)
     return rows, columns
 
 
@@ -171,22 +182,21 @@ def _refinement_pictures(result: "Inference", box: tuple[slice, slice]) -> list[
     """Return how far normals moved, the error to expect, and what the model did not explain."""
     from sdps.core.metrics import angle_degrees
 
-    found, mask = result.estimate.diagnostics, result.photos.mask
-    moved = angle_degrees(found["refined"].normals, found["start"].normals)
-    residual, expected = found["refined"].pixel_residual, found["trust"].normals
+    found, mask = result.estimate.diagnostics, result.photos.mask[box]
+    moved = angle_degrees(found["refined"].normals[box], found["start"].normals[box])
+    residual, expected = found["refined"].pixel_residual[box], found["trust"].normals[box]
     most = float(np.percentile(residual[mask], 99))
-    maps = (
-        ("moved (yellow: 20 degrees)", pictures.error_map(np.where(mask, moved, np.nan), 20.0)),
+    return [
+        Tile("normals before", pictures.normal_map(found["start"].normals[box], mask), "normals"),
+        Tile("moved (yellow: 20 degrees)", pictures.error_map(np.where(mask, moved, np.nan), 20.0)),
         _expected_picture(expected, mask),
-        (f"not explained (yellow: {most:.2f})", pictures.error_map(np.where(mask, residual, np.nan), most)),
-    )
-    before = Tile("normals before", pictures.normal_map(found["start"].normals, mask)[box], "normals")
-    return [before, *(Tile(caption, picture[box]) for caption, picture in maps)]
+        Tile(f"not explained (yellow: {most:.2f})", pictures.error_map(np.where(mask, residual, np.nan), most)),
+    ]
 
 
-def _expected_picture(expected: np.ndarray, mask: np.ndarray) -> tuple[str, np.ndarray]:
-    """Return the errors to expect, in degrees, as a caption and a picture."""
-    return "error to expect (yellow: 20 degrees)", pictures.error_map(np.where(mask, expected, np.nan), 20.0)
+def _expected_picture(expected: np.ndarray, mask: np.ndarray) -> Tile:
+    """Return a picture of the errors to expect, in degrees."""
+    return Tile("error to expect (yellow: 20 degrees)", pictures.error_map(np.where(mask, expected, np.nan), 20.0))
 
 
 def _brightest(result: "Inference") -> slice:
@@ -204,9 +214,9 @@ def _masked(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) u
     return np.where(mask[..., None], picture, outside).astype(np.uint8)
 
 
-def depth_picture(result: "Inference") -> np.ndarray:  # (H, W, 3) uint8
+def depth_picture(result: "Inference", box: tuple[slice, ...] = ()) -> np.ndarray:  # (H, W, 3) uint8
     """Return depth as grey, from the farthest (dark) to the nearest (bright) of each component, white outside."""
-    z, mask = result.depth.z, result.photos.mask
+    z, mask = result.depth.z[box], result.photos.mask[box]
     low, high = np.percentile(z[mask], (0.5, 99.5))
     grey = np.clip((z - low) / max(high - low, 1e-9), 0.0, 1.0) * 225 + 15
     return np.repeat(np.where(mask, grey, 255.0)[..., None], 3, -1).astype(np.uint8)

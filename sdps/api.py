@@ -40,9 +40,10 @@ from sdps.photos.doubts import ANYWAY
 from sdps.photos.light_files.light_advice import advise
 from sdps.refinement.trust import FEWEST_IMAGES
 from sdps.surface.inferred import Inference, check_out
+from sdps.surface.workload import Workload, workload
 from sdps.training.trainer import TrainingResult
 
-__all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "load", "train"]
+__all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "load", "plan", "train"]
 
 AUTO = "auto"
 _LEARNED = ("sdps-frames", "sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
@@ -96,9 +97,21 @@ def infer(
         _stop(photos, findings, anyway)
     known = photos.light_directions is not None, intensities is not None
     runner = _runner(method, known, models, config, refine, len(photos))
+    if not anyway:
+        workload(photos, runner, discontinuities=discontinuities).check()
     found = runner.estimate(photos, photos.mask, photos.light_directions, intensities, saturation=photos.saturation)
     seconds = time.perf_counter() - began
     return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
+
+
+def plan(
+    photos: Photographs, method: str = AUTO, *, models: str | Path | None = None,
+    config: InferenceConfig | None = None, refine: bool | None = None, discontinuities: bool = False,
+) -> Workload:  # fmt: skip
+    """Return about what `infer` will take, in seconds and memory; arguments as of `infer`."""
+    known = photos.light_directions is not None, photos.intensities is not None
+    runner = _runner(method, known, models, config, refine, len(photos))
+    return workload(photos, runner, discontinuities=discontinuities)
 
 
 def estimate(

@@ -197,7 +197,9 @@ def test_the_automatic_method_depends_on_what_follows(
 ) -> None:
     from sdps import api
 
-    assert api._runner("auto", (lit, False), None, None, refine, images).method.name.replace(" (shipped)", "") == expected
+    assert (
+        api._runner("auto", (lit, False), None, None, refine, images).method.name.replace(" (shipped)", "") == expected
+    )
 
 
 def test_intensities_without_directions_are_used() -> None:

@@ -25,7 +25,8 @@ from render.shared.files import atomic_path
 from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.image_model import State, factors
 from sdps.refinement.modes import ASSET, MODES, left_over, terms
-from sdps.refinement.refine import problem_of, start_of
+from sdps.refinement.problems import problem_of
+from sdps.refinement.refine import start_of
 
 _SIDE, _LIGHTS, _ITERATIONS = 42, 100, 300
 _KEPT = 0.9  # share of the materials

@@ -2,7 +2,9 @@
 
 The photographs are 16-bit pictures of the object of `bench-classical`, which fills the frame but for a margin. Every
 run is a process of its own; both kinds of processor are measured (`pipelines.shared.machines`). With `--many`, a
-second folder repeats the pictures up to that number, to show that memory does not grow with them.
+second folder repeats the pictures up to that number, to show that memory does not grow with them. With `--large`,
+seven JPEG files of twelve megapixels are inferred as well, as `sdps infer` does with no flag but for its page, and each
+stage is timed.
 """
 
 import argparse
@@ -16,15 +18,17 @@ from typing import Any
 import numpy as np
 
 from pipelines.bench.bench_scenes import BenchClassicalConfig, add_size, large_object, size_from
+from pipelines.bench.large_photographs import LargeConfig, photograph_large
 from pipelines.evaluate.workbench import write_photographs
 from pipelines.shared import using
 from pipelines.shared.flags import add_models, add_out, split_list
 from pipelines.shared.machines import hold, kinds, processor
 from pipelines.shared.memory import measured, peak_gib
 from pipelines.shared.text_tables import render_text
+from render.shared.errors import InputError
 from render.shared.files import write_json
-from render.shared.progress import progress_bar
-from sdps.api import infer, load
+from render.shared.progress import listening, progress_bar
+from sdps.api import infer, load, plan
 from sdps.inference.inference_config import InferenceConfig, inference_config
 from sdps.photos import check
 
@@ -40,12 +44,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     using.add_arguments(parser)
     add_size(parser)
     parser.add_argument("--many", type=int, default=0, help="also infer a folder of this many pictures")
+    parser.add_argument("--large", action="store_true", help="also infer seven JPEG files of 12 megapixels")
+    parser.add_argument("--quick", action="store_true", help="only the large case, at one megapixel")
     add_out(parser, Path("out/bench-infer"))
 
 
 def main(args: argparse.Namespace) -> int:
     """Write the photographs, infer them with every method, print the tables and write bench_infer.json."""
     config, used = size_from(args), inference_config(args)
+    if args.quick:
+        return _large(args, LargeConfig(width=1160, height=870))
     folders = {args.images: photograph(args.out / "photographs", config)}
     if args.many:
         folders[args.many] = repeated(args.out / "many", folders[args.images], args.many)
@@ -60,7 +68,46 @@ def main(args: argparse.Namespace) -> int:
     write_json(args.out / "bench_infer.json", {"config": vars(config), "networks": used.options(), "kinds": found})
     tables = (table(rows, config, f"{processor()}, {kind}") for kind, rows in found.items())
     sys.stdout.write("\n".join(tables) + f"{args.out / 'bench_infer.json'}\n")
+    return _large(args, LargeConfig()) if args.large else 0
+
+
+def _large(args: argparse.Namespace, config: LargeConfig) -> int:
+    """Infer large photographs on this machine as it is; print what every stage took, and write bench_large.json."""
+    folder = photograph_large(args.out / "large", config)
+    found = measured(_large_work, folder, args.models, inference_config(args))
+    write_json(args.out / "bench_large.json", {"config": vars(config), **found})
+    if found["error"]:
+        raise InputError(found["error"])
+    title = (
+        f"{processor()}: {config.pictures} JPEG files of {config.width}x{config.height}, {found['pixels']:,} pixels of "
+        f"object, {found['method']}; {found['seconds'] / 60:.1f} minutes, expected {found['expected'] / 60:.1f}; peak "
+        f"{found['peak_gib']:.2f} GiB, expected {found['expected_gib']:.1f}"
+    )
+    rows = [[name, f"{seconds / 60:.2f}"] for name, seconds in found["stages"].items()]
+    sys.stdout.write(f"{render_text(title, ['stage', 'minutes'], rows)}\n{args.out / 'bench_large.json'}\n")
     return 0
+
+
+def _large_work(folder: Path, models: Path | None, config: InferenceConfig) -> dict[str, Any]:
+    """Do what `sdps infer` does but for its page; return seconds per stage, peak_gib, and what was expected."""
+    stages: dict[str, float] = {}
+    began = last = time.perf_counter()
+
+    def tell(name: str, _: float) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        stages[name], last = stages.get(name, 0.0) + now - last, now
+
+    with listening(tell), tempfile.TemporaryDirectory() as out:
+        photos = load(folder)
+        findings = tuple(check(photos))
+        expected = plan(photos, models=models, config=config)
+        result = infer(photos, models=models, config=config, findings=findings)
+        result.save(out)
+    return {
+        "stages": stages, "seconds": time.perf_counter() - began, "expected": expected.total, "peak_gib": peak_gib(),
+        "expected_gib": expected.gib, "pixels": int(photos.mask.sum()), "method": result.method,
+    }  # fmt: skip
 
 
 def photograph(folder: Path, config: BenchClassicalConfig) -> Path:

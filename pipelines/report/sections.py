@@ -20,6 +20,7 @@ from render.shared.temporary import tidy
 
 FOLDER = "report"
 _FILE = "section.json"
+_LARGE = 2**20  # pixels of a picture
 KINDS = ("", "normals", "truth", "beside")
 
 
@@ -160,7 +161,7 @@ def save_picture(picture: np.ndarray | Image.Image | Figure, path: Path) -> None
         picture.savefig(path, format="png", dpi=130)
         return
     image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
-    image.save(path, format="png", optimize=True)
+    image.save(path, format="png", optimize=image.width * image.height < _LARGE)  # which takes seconds of large ones
 
 
 def read_sections(out: Path) -> list[tuple[Path, Section]]:

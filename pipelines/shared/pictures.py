@@ -34,7 +34,11 @@ def auto_exposure(images: np.ndarray, mask: np.ndarray) -> float:
 
 def normal_map(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
     """Colour normals as (n + 1) / 2, white outside the mask."""
-    picture = ((np.clip(normals, -1, 1) + 1) * 127.5 + 0.5).astype(np.uint8)
+    scaled = np.clip(normals, -1, 1)
+    scaled += 1  # in place: large maps need not be held three times
+    scaled *= 127.5
+    scaled += 0.5
+    picture = scaled.astype(np.uint8)
     picture[~mask] = 255
     return picture
 

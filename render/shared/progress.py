@@ -2,7 +2,7 @@
 
 import itertools
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -11,7 +11,10 @@ from tqdm import tqdm
 Listener = Callable[[str, float], None]
 """Called with the name of a stage and the share of it that is done, in [0, 1]."""
 _listener: Listener | None = None
-_place = (0, 1)
+_place = (0.0, 1.0)
+"""Which part of its stage what runs now is: from where on, and how much of it."""
+_SHORT = 10.0
+"""Seconds after which a stage has a bar."""
 
 
 def progress_bar(*args: Any, **options: Any) -> "tqdm[Any]":
@@ -33,21 +36,60 @@ def listening(listener: Listener) -> Iterator[None]:
 
 
 @contextmanager
-def repeat(number: int, count: int) -> Iterator[None]:
-    """Take the stages inside for repeat `number` of `count`, so that their shares do not begin anew with each."""
+def share(start: float, stop: float) -> Iterator[None]:
+    """Take the stages inside for a part of a stage, from `start` to `stop` of it, in [0, 1]; parts may be nested."""
     global _place
-    before, _place = _place, (number, count)
+    before = _place
+    _place = (before[0] + before[1] * start, before[1] * (stop - start))
     try:
         yield
     finally:
         _place = before
 
 
+@contextmanager
+def repeat(number: int, count: int) -> Iterator[None]:
+    """Take the stages inside for repeat `number` of `count`, so that their shares do not begin anew with each."""
+    with share(number / count, (number + 1) / count):
+        yield
+
+
 def stage(name: str, done: float = 0, total: float = 1) -> None:
     """Say that `done` of `total` steps of a stage are done; costs nothing where nobody listens."""
     if _listener is not None:
-        number, count = _place
-        _listener(name, (number + done / total) / count)
+        start, part = _place
+        _listener(name, start + part * done / total)
+
+
+@contextmanager
+def bars(without: Collection[str] = ()) -> Iterator[None]:
+    """Show a bar with the time left for every stage that takes over ten seconds.
+
+    Args:
+        without: Stages that have bars of their own.
+    """
+    shown: dict[str, tqdm[Any]] = {}
+
+    def tell(name: str, done: float) -> None:
+        if name in without:
+            return
+        if name not in shown:
+            _close(shown)
+            look = {"bar_format": "{desc}: {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left", "smoothing": 0.1}
+            shown[name] = progress_bar(total=1.0, desc=name, delay=_SHORT, **look)
+        shown[name].update(max(done - shown[name].n, 0.0))
+
+    try:
+        with listening(tell):
+            yield
+    finally:
+        _close(shown)
+
+
+def _close(shown: "dict[str, tqdm[Any]]") -> None:
+    for bar in shown.values():
+        bar.close()
+    shown.clear()
 
 
 @contextmanager

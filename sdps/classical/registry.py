@@ -24,6 +24,7 @@ class ClassicalMethod:
         paper: Authors, venue and year.
         summary: One line.
         calibrated: Whether it is told the lights; otherwise it finds them.
+        by_pixel: Whether what it finds of a pixel depends on no other.
         minimum: Fewest images it works with.
         options: Fixed options of the function.
     """
@@ -33,6 +34,7 @@ class ClassicalMethod:
     paper: str
     summary: str
     calibrated: bool
+    by_pixel: bool = False
     minimum: int = 3
     options: dict[str, Any] = field(default_factory=dict)
 

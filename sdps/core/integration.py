@@ -9,11 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from render.shared.errors import InputError
+from render.shared.progress import share, stage
 from sdps.core.laplacian import laplacian, multigrid, solve
+from sdps.core.large_depth import Cycle, Edges, Slopes, bilateral_edges, measure, smooth_edges, solve_grid
 
 STEEPEST = 0.03
 """Least n_z that is believed, so that slopes stop at 33. Half a pixel inside the rim of a sphere of radius R pixels,
@@ -23,6 +26,9 @@ _ROUGH = 1e-4  # the same while weights still change
 _SETTLED = 1e-3
 _OUTWORN = 12  # steps of a solve after which the preconditioner is built anew for the changed weights
 _WEAKEST = 1e-6  # weight of an edge that both of its equations have left
+LARGE = 1_000_000
+"""Pixels above which the grid is solved in place (`sdps.core.large_depth`); a graph of so many takes 0.7 GiB."""
+_BAND = 2**18  # pixels looked at at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +115,13 @@ def integrate(
         InputError: sizes that differ, an empty mask, NaN, infinite or zero normals inside it.
     """
     started = time.perf_counter()
-    unit = checked_normals(normals, mask)
+    large = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and int(mask.sum()) > LARGE
+    unit = None if large else checked_normals(normals, mask)
     if not (sharpness > 0 and most >= 1):
         raise InputError(f"sharpness must be positive and most at least 1, got {sharpness} and {most}")
+    stage("depth")
+    if unit is None:
+        return _integrate_large(np.asarray(normals), mask, sharpness if discontinuities else 0.0, most, started)
     graph = _graph(unit, mask)
     z, weights, iterations = *_smooth(graph), 1
     if discontinuities and len(weights):
@@ -236,3 +246,75 @@ def _laid_out(graph: _Graph, mask: np.ndarray, z: np.ndarray) -> dict[str, Any]:
         "residuals": picture(np.sqrt(total / np.maximum(number, 1)), 0),
         "residual": float(np.sqrt(squared.mean())) if len(squared) else 0.0,
     }
+
+
+def _integrate_large(normals: np.ndarray, mask: np.ndarray, sharpness: float, most: int, started: float) -> Depth:
+    """Do what `integrate` does on the grid itself; `sharpness` 0 for a surface without jumps."""
+    box = tuple(slice(int(at[0]), int(at[-1]) + 1) for at in (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)))
+    inside = np.ascontiguousarray(mask[box])
+    slopes, below = _slopes(normals, mask, box)
+    edges = Edges(*(np.zeros(inside.shape, np.float32) for _ in Edges._fields))
+    z, iterations = np.zeros(inside.shape), 1
+    smooth_edges(slopes, inside, edges)
+    with share(0.0, 0.3 if sharpness else 1.0):
+        cycle = Cycle(edges.across, edges.down, inside)
+        solve_grid(edges, inside, z, cycle, tolerance=_TOLERANCE, tell=lambda done: stage("depth", done))
+        del cycle
+    if sharpness:
+        with share(0.3, 1.0):
+            iterations = _reweighted(slopes, inside, z, edges, sharpness, most)
+    return Depth(
+        mask=mask, below=below, iterations=iterations, **_laid_out_large(slopes, inside, z, edges, mask.shape, box),
+        seconds=time.perf_counter() - started,
+    )  # fmt: skip
+
+
+def _laid_out_large(
+    slopes: Slopes, inside: np.ndarray, z: np.ndarray, edges: Edges, shape: tuple[int, int], box: tuple[slice, ...]
+) -> dict[str, Any]:
+    """Do what `_laid_out` does, and tell the share of torn edges."""
+    found, components = ndimage.label(inside)
+    labels, depth, residuals = np.full(shape, -1, np.int32), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    labels[box] = found - 1
+    numbers, heights = found[inside], z[inside]
+    sums, counts = np.bincount(numbers, heights), np.bincount(numbers)
+    depth[box][inside] = heights - (sums / np.maximum(counts, 1))[numbers]
+    rows, angles = np.zeros((len(inside), 3)), np.zeros(inside.shape, np.float32)
+    measure(slopes, inside, z, edges, angles, rows)
+    residuals[box] = angles
+    squares, count, torn = rows.sum(axis=0)
+    return {
+        "z": depth, "labels": labels, "components": int(components), "residuals": residuals,
+        "residual": float(np.sqrt(squares / max(count, 1))), "torn": float(torn / max(count, 1)),
+    }  # fmt: skip
+
+
+def _slopes(normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...]) -> tuple[Slopes, float]:
+    """Return unit normals of the box, a few rows at a time, and the share that faces the camera too little."""
+    shape = mask[box].shape
+    slopes = Slopes(*(np.zeros(shape, np.float32) for _ in Slopes._fields))
+    flat = 0
+    step = max(1, _BAND // shape[1])
+    for start in range(0, shape[0], step):
+        rows = slice(box[0].start + start, min(box[0].start + start + step, box[0].stop))
+        inside = mask[rows, box[1]]
+        if not inside.any():
+            continue
+        unit = checked_normals(normals[rows, box[1]], inside)
+        flat += int((unit[:, 2] < STEEPEST).sum())
+        for part, values in zip(slopes, (unit[:, 0], unit[:, 1], np.maximum(unit[:, 2], STEEPEST)), strict=True):
+            part[start : start + step][inside] = values
+    return slopes, flat / int(mask.sum())
+
+
+def _reweighted(slopes: Slopes, inside: np.ndarray, z: np.ndarray, edges: Edges, sharpness: float, most: int) -> int:
+    """Reweight the one-sided equations as `_bilateral` does, z (h, w) in place; return the systems solved."""
+    energy, rows = np.inf, np.zeros(len(inside))
+    for number in range(most):
+        bilateral_edges(slopes, inside, z, sharpness, _WEAKEST, edges, rows)
+        last, energy = energy, float(rows.sum())
+        if number and abs(last - energy) <= _SETTLED * energy:
+            return number + 1
+        solve_grid(edges, inside, z, Cycle(edges.across, edges.down, inside), tolerance=_ROUGH)
+        stage("depth", number + 1, most)
+    return most + 1

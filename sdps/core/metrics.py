@@ -6,6 +6,7 @@ from render.shared.errors import InputError
 from sdps.core.estimate import Estimate, Score
 
 _TINY = 1e-8
+_PART = 2**20  # vectors worked on at once
 
 
 def angle_degrees(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -13,6 +14,9 @@ def angle_degrees(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
     A zero vector makes 90 degrees with everything.
     """
+    if np.size(first) > 3 * _PART and np.ndim(first) == 2 and np.shape(first) == np.shape(second):
+        parts = (slice(start, start + _PART) for start in range(0, len(first), _PART))
+        return np.concatenate([angle_degrees(first[some], second[some]) for some in parts])
     first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
     lengths = np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1)
     cosine = (first * second).sum(-1) / np.maximum(lengths, np.finfo(np.float64).tiny)

@@ -7,7 +7,7 @@ to the lights of a pixel, 16 bytes per pixel.
 Legend: L images, P pixels of the object, (h, w) the sides of what the network sees.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from render.shared.progress import stage
+from render.shared.progress import share, stage
 from sdps.core.symmetry import Symmetry
 from sdps.inference.turned_views import AnyView
 from sdps.models.base import (
@@ -32,6 +32,8 @@ from sdps.models.cnnps import predict_normals
 Autocast = Callable[[], AbstractContextManager[Any]]
 _GREY_VALUES = 2**26
 """Grey values kept at once for pixel networks (256 MiB); of more, the images are read again for further pixels."""
+_READ_SHARE, _FUSED_SHARE, _SEEN_SHARE = 0.05, 0.4, 0.9
+"""Parts of the time for normals until a network has read all images, has fused them, and has seen them one by one."""
 _PIXELS = {"cpu": 64, "cuda": 2048}
 """Pixels a pixel network sees at once: what fits the caches of a CPU is twice as fast there as more."""
 
@@ -88,23 +90,38 @@ def normal_map(
     mask = view.mask
     feature: Any = None
     kept: list[Any] = []
-    for part, images in view:
-        some = None if lights is None else lights.part(part)
-        seen = network.observe(images, mask, some, brightness)
-        with autocast():
-            if isinstance(network, KeepingNetwork):
-                kept.append(network.kept(seen))
-            else:
-                feature = _maximum(feature, network.encode(seen))
-        stage("normals", part.stop, len(view))
-    with autocast():
-        if isinstance(network, KeepingNetwork):
+    begun = _READ_SHARE if isinstance(network, KeepingNetwork) else _SEEN_SHARE
+    with share(0.0, begun):
+        for part, images in view:
+            some = None if lights is None else lights.part(part)
+            seen = network.observe(images, mask, some, brightness)
+            with autocast():
+                if isinstance(network, KeepingNetwork):
+                    kept.append(network.kept(seen))
+                else:
+                    feature = _maximum(feature, network.encode(seen))
+            stage("normals", part.stop, len(view))
+    if isinstance(network, KeepingNetwork):
+        with autocast(), share(begun, begun := _FUSED_SHARE):
             feature = network.fused(kept)
-        assert feature is not None  # a view has an image
-        features = [feature]
-        if isinstance(network, TurningNetwork) and symmetries:
-            features = [network.turned(feature, symmetry) for symmetry in symmetries]
-        return [network.regress_with_error(each) for each in features]
+        kept.clear()
+    assert feature is not None  # a view has an image
+    with share(begun, 1.0):
+        return list(_answers(network, feature, autocast, symmetries))
+
+
+def _answers(
+    network: NormalNetwork, feature: Any, autocast: Autocast, symmetries: Sequence[Symmetry]
+) -> Iterator[tuple[Tensor, Tensor | None]]:
+    """Yield the normals of a feature; of a `TurningNetwork` one after the other, as each turned scene has them."""
+    if not (isinstance(network, TurningNetwork) and symmetries):
+        with autocast():
+            yield network.regress_with_error(feature)
+        return
+    for number, symmetry in enumerate(symmetries):
+        with autocast():
+            yield network.regress_with_error(network.turned(feature, symmetry))
+        stage("normals", number + 1, len(symmetries))
 
 
 def _brightness(network: NormalNetwork, view: AnyView, lights: Lights | None) -> Tensor:

@@ -1,7 +1,7 @@
 """Using trained networks: images and a mask in, lights and normals out, in memory that many images do not fill."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -19,6 +19,7 @@ from sdps.data.augment import measure_exposure
 from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map
 from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
 from sdps.inference.inference_config import InferenceConfig
+from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES, tiles
 from sdps.inference.turned_views import (
     KeptView,
     TurnedView,
@@ -193,17 +194,31 @@ class Estimator(InferenceConfig):
         self, scene: ObjectImages, known: _Known, lit: Lights | None, diagnostics: dict[str, Any]
     ) -> np.ndarray:
         """Return the normals of the object's box, (h, w, 3) float32, zero outside the mask."""
+        multiple, halo, most = self._tiling(len(scene))
+        parts = tiles(scene.mask, most, halo, multiple)
+        largest = max(scene.mask[tile.outer_rows, tile.outer_columns].size for tile in parts)
+        view = self._view(scene, "normals", known.balance, pad_to(multiple), largest, diagnostics)
+        box = np.zeros((*scene.mask.shape, 3), np.float32)
+        for number, tile in enumerate(parts):
+            part = replace(view, images=scene.part(tile.outer_rows, tile.outer_columns))
+            with repeat(number, len(parts)):
+                normals, expected = self._normals(part, lit)  # padded
+            inside = scene.mask[tile.inner]
+            box[tile.inner][inside] = normals[0].permute(1, 2, 0).cpu().numpy()[tile.within][inside]
+            if expected is not None:
+                whole = diagnostics.setdefault("expected_error", np.zeros(scene.shape, np.float32))
+                found = expected[0, 0].cpu().numpy()[tile.within] * inside
+                whole[scene.rows, scene.columns][tile.inner] = found
+        return box
+
+    def _tiling(self, images: int) -> tuple[int, int, int]:
+        """Return of which multiple tiles are, how wide their halo is, and how many pixels they have at most."""
         model = self._normal_model()
-        multiple = 1 if model.role == "pixels" else cast(NormalNetwork, model.network).size_multiple
-        view = self._view(scene, "normals", known.balance, pad_to(multiple), scene.mask.size, diagnostics)
-        normals, expected = self._normals(view, lit)  # padded
-        rows, columns = scene.mask.shape
-        if expected is not None:
-            whole = np.zeros(scene.shape, np.float32)
-            whole[scene.rows, scene.columns] = expected[0, 0, :rows, :columns].cpu().numpy() * scene.mask
-            diagnostics["expected_error"] = whole
-        box = normals[0].permute(1, 2, 0).cpu().numpy()[:rows, :columns]
-        return np.where(scene.mask[..., None], box, np.float32(0.0))
+        if model.role == "pixels":
+            return 1, 0, TILE_BYTES // PIXEL_BYTES
+        network = cast(NormalNetwork, model.network)
+        most = TILE_BYTES // (PIXEL_BYTES + images * network.kept_bytes)
+        return network.size_multiple, network.reach, most
 
     def _estimate_lights(self, scene: ObjectImages, known: _Known, diagnostics: dict[str, Any]) -> Lights:
         """Return the lights (1, L, ...) after one or two passes; what is known stays."""

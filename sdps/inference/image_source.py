@@ -4,7 +4,7 @@ Legend: L images, (H, W) their sides, (h, w) the sides of the object's box.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from render.shared.errors import InputError
+from render.shared.progress import stage
 from render.shared.seeds import generator
 from sdps.data.augment import Exposure
 from sdps.inference.stray_light import stray_light, without
@@ -25,7 +26,8 @@ _READ_PIXELS = 2**20
 class ImageSource(Protocol):
     """Linear radiance that is read on demand: an array, a memory-mapped one, a list, or a loader of files.
 
-    It is gone through several times, in order; every image must be the same each time.
+    It is gone through several times, in order; every image must be the same each time. One that can read a part of its
+    images for less than all of them has `window(part, rows, columns)`, the same as `[part][:, rows, columns]`.
     """
 
     def __len__(self) -> int:
@@ -61,10 +63,22 @@ class ObjectImages:
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Return images of the box, (stop - start, h, w, 3) float32, without stray light, black outside the mask."""
-        images = _read(self.source, start, stop, self.shape)[:, self.rows, self.columns].astype(np.float32)
-        images = without(images, self.stray[start:stop])
+        images = np.empty((stop - start, *self.mask.shape, 3), np.float32)
+        step = _images_at_once(self.mask.shape)  # few copies of large images at a time
+        for first in range(start, stop, step):
+            last = min(first + step, stop)
+            found = _window(self.source, slice(first, last), self.rows, self.columns, self.shape)
+            images[first - start : last - start] = without(np.asarray(found, np.float32), self.stray[first:last])
         # Not a product: outside the mask there may be NaN.
-        return np.where(self.mask[..., None], images, np.float32(0.0))
+        images[:, ~self.mask] = 0.0
+        return images
+
+    def part(self, rows: slice, columns: slice) -> "ObjectImages":
+        """Return the images of a part of the box, (rows, columns) of it; exposure and stray light stay the whole's."""
+        top, left = self.rows.start, self.columns.start
+        rows_of_all = slice(top + rows.start, top + rows.stop)
+        columns_of_all = slice(left + columns.start, left + columns.stop)
+        return replace(self, rows=rows_of_all, columns=columns_of_all, mask=self.mask[rows, columns])
 
     def parts(self, count: int) -> Iterator[range]:
         """Yield `count` images after `count` images, each time as the starts of what is read at once."""
@@ -98,6 +112,7 @@ def survey(source: ImageSource, mask: np.ndarray, margin: int | None, *, stray: 
     for start in range(0, len(source), step):
         stop = min(start + step, len(source))
         inside = _read(source, start, stop, shape)[:, mask]  # (n, P, 3)
+        stage("survey", stop, len(source))
         if not np.isfinite(inside).all():
             raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
         sample[start:stop] = inside[:, chosen]
@@ -166,6 +181,14 @@ def _read(source: ImageSource, start: int, stop: int, shape: tuple[int, int] | N
             f"{stop}; crop or resize them"
         )
     return images
+
+
+def _window(source: ImageSource, part: slice, rows: slice, columns: slice, shape: tuple[int, int]) -> np.ndarray:
+    """Return rows and columns of images (n, h, w, 3), of a source that reads no more than these where it can."""
+    window = getattr(source, "window", None)
+    if window is None:
+        return _read(source, part.start, part.stop, shape)[:, rows, columns]
+    return np.asarray(window(part, rows, columns))
 
 
 def _images_at_once(shape: tuple[int, int]) -> int:

@@ -16,9 +16,10 @@ from sdps.core.baselines import constant_estimate
 from sdps.core.estimate import Estimate
 from sdps.core.metrics import score
 from sdps.inference.estimator import Estimator, default_device, load_model
-from sdps.inference.image_source import ImageSource, survey
+from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.method import CONSTANT, NONE, VIEWS, Method
+from sdps.methods.on_box import run_on_box
 from sdps.models.registry import TRUE_LIGHTS
 
 if TYPE_CHECKING:
@@ -147,11 +148,7 @@ class Runner:
                 told = lit.light_directions, lit.intensities
         if isinstance(images, np.ndarray):
             return classical.run(name, images, mask, *told)
-        scene = survey(images, mask, margin=2)
-        estimate = classical.run(name, scene.read(0, len(images)), scene.mask, *told)
-        normals = np.zeros((*mask.shape, 3), np.float32)
-        normals[scene.rows, scene.columns] = estimate.normals
-        return replace(estimate, normals=normals)
+        return run_on_box(name, images, mask, told)
 
     def _refine(
         self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any], saturation: float

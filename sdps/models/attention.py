@@ -74,7 +74,7 @@ class AttentionNet(MaxFusionNet, KeepingNetwork):
         if blocks < 0:
             raise InputError(f"blocks must not be negative, got {blocks}")
         super().__init__(6, widths=(64, 128, WIDTH), deeper=(1, 0))
-        self.division = division
+        self.division, self.kept_bytes = division, 40  # what is kept, once more while it is mixed
         self.mixing = nn.Sequential(*(LightAttention() for _ in range(blocks)))
         self.shades = nn.ModuleList([Convolution(WIDTH, 1, 1), Convolution(128, 1, 1)] if shading else [])
         initialise(self)

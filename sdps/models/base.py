@@ -146,12 +146,16 @@ class NormalNetwork(nn.Module, ABC):
         division: Images are divided by each pixel's `norm` over all lights and channels (PS-FCN (Norm.), Chen et al.,
             TPAMI 2020), or by its `max`imum (ESSENCE-Net), which takes albedo away and leaves shading.
         size_multiple: Sides of images must be multiples of it.
+        reach: Pixels around a pixel that its normal depends on, at most: the halo of tiles.
+        kept_bytes: Memory per pixel and image for what is kept until all images were seen.
     """
 
     needs_lights: bool = True
     needs_mask: bool = False
     division: Division = "none"
     size_multiple: int = 4
+    reach: int = 32
+    kept_bytes: int = 0
 
     def observe(
         self,

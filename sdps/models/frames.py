@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from render.shared.errors import InputError, unknown
+from render.shared.progress import stage
 from sdps.core.first_normals import first_normals, frames
 from sdps.core.symmetry import Symmetry
 from sdps.models.base import KeepingNetwork, Observations, TurningNetwork
@@ -87,6 +88,7 @@ class FrameNet(KeepingNetwork, TurningNetwork):
     """
 
     needs_mask = True
+    kept_bytes = 6
 
     def __init__(self, *, width: int = 64, blocks: int = 4, frame: str = "normal") -> None:
         super().__init__()
@@ -154,11 +156,22 @@ class FrameNet(KeepingNetwork, TurningNetwork):
         return seen._replace(images=seen.images.half())
 
     def fused(self, parts: list[Observations]) -> FusedMap:
-        """Return the fused map of all of a scene's images."""
-        # Autocast to bfloat16 refuses to join images of 16-bit floats.
-        with torch.autocast(parts[0].images.device.type, enabled=False):
-            seen = _joined(parts)
-        return self.encode(seen)
+        """Return the fused map of all of a scene's images, which are never copied as a whole."""
+        assert parts[0].mask is not None  # the network asks for it
+        inside = parts[0].mask[:, 0] > 0.5  # (1, H, W)
+        directions, errors = _all_lights(parts)
+        found = torch.zeros(inside.numel(), 3 + _MAP, device=inside.device)
+        places = inside.flatten().nonzero()[:, 0]
+        strips = places.split(max(1, _STRIP // directions.shape[1]))
+        for number, some in enumerate(strips):
+            # Autocast to bfloat16 refuses to join images of 16-bit floats.
+            with torch.autocast(inside.device.type, enabled=False):
+                values = torch.cat([part.images[0].flatten(2)[..., some] for part in parts])  # (Q, 3, n)
+            lights = (each.expand(len(some), *each.shape[1:]) for each in (directions, errors))
+            found[some] = self._per_pixel(Pixels(values.permute(2, 0, 1).float(), *lights)).float()
+            stage("normals", number + 1, len(strips))
+        places_of_all = found.unflatten(0, inside.shape).permute(0, 3, 1, 2)
+        return FusedMap(places_of_all[:, :3], places_of_all[:, 3:], inside[:, None].float())
 
     def _per_pixel(self, pixels: Pixels) -> Tensor:
         """Return normals and features of pixels, (N, 3 + 32)."""
@@ -184,12 +197,13 @@ class FrameNet(KeepingNetwork, TurningNetwork):
         return FusedMap(places[:, :3], places[:, 3:], inside[:, None].float())
 
 
-def _joined(parts: list[Observations]) -> Observations:
-    """Return all of a scene's images together."""
-    images = torch.cat([part.images for part in parts], dim=1)
+def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor]:
+    """Return directions (1, Q, 3) and the errors to expect of them (1, Q), as exact as the images are kept."""
     directions = torch.cat([part.directions for part in parts if part.directions is not None], dim=1)
     errors = [part.light_errors for part in parts if part.light_errors is not None]
-    return Observations(images, directions, parts[0].mask, torch.cat(errors, dim=1) if errors else None)
+    expected = torch.cat(errors, dim=1) if errors else torch.zeros_like(directions[..., 0])
+    kept = parts[0].images.dtype
+    return directions.to(kept).float(), expected.to(kept).float()
 
 
 def pooled(tokens: Tensor) -> Tensor:

@@ -46,6 +46,8 @@ class MaxFusionNet(NormalNetwork):
             deconv(half, full),  # H x W
         )
         self.normal = nn.Conv2d(full, 3, 3, padding=1, bias=False)
+        # A convolution reaches a pixel of its own size, a transposed one a pixel of what it sees.
+        self.reach = 24 + 4 * deeper[0] + 2 * deeper[1]
 
     @staticmethod
     def inputs(seen: Observations) -> Tensor:

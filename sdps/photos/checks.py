@@ -269,8 +269,8 @@ def _mask(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     if size > _LARGE_MASK:
         yield Finding(
             "warning",
-            f"The object has {size / 1e6:.0f} million pixels, which takes long and much memory. Reduce all pictures "
-            "and the mask alike to about 1000 pixels a side.",
+            f"The object has {size / 1e6:.0f} million pixels, which takes long. --scale 0.5 (in Python load(..., "
+            "scale=0.5)) halves the sides of pictures and mask as they are read.",
         )
 
 

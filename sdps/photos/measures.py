@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from render.shared.errors import InputError
-from render.shared.progress import progress_bar
+from render.shared.progress import progress_bar, stage
 from sdps.photos.evidence.colours import colour_casts
 from sdps.photos.evidence.fall_off import FallOff, block_means, fall_off
 from sdps.photos.evidence.motion import Shift, Tracker, second_look
@@ -70,6 +70,7 @@ def measure(photos: Photographs) -> Measures:
     tracker = Tracker(photos.mask)
     for number in progress_bar(range(count), desc="checking", unit="picture", delay=5):
         image = photos[number : number + 1][0]
+        stage("checks", number, count)
         grey = brightness(image)
         digests.append(hashlib.blake2b(grey.tobytes(), digest_size=16).digest())
         settings.append(_camera_settings(photos.folder / photos.files[number]))

@@ -7,16 +7,18 @@ from pathlib import Path
 import numpy as np
 
 from render.shared.errors import InputError
-from render.shared.progress import progress_bar
+from render.shared.imaging.reducing import reduced, reduced_shape
+from render.shared.progress import progress_bar, stage
 from sdps.photos.doubts import Doubts
-from sdps.photos.masks import Variation, automatic_mask, bright_part, read_mask
+from sdps.photos.masks import Variation, automatic_mask, bright_part
 from sdps.photos.picture_file import Picture, decode, misnamed, turned
 from sdps.photos.pictures.contents import judge_content, like_mask
 from sdps.photos.pictures.gamma import resolve_gamma
 from sdps.photos.pictures.listing import Listing
 from sdps.photos.pictures.picture_kinds import LOSSY, Coding
 from sdps.photos.pictures.picture_names import MASK, is_bare
-from sdps.photos.response import brightness, full_scale, to_linear
+from sdps.photos.response import full_scale
+from sdps.photos.scaling import read_reduced_mask, reduced_grey, refuse_huge, scale_note
 
 _DARK = 0.5
 """A picture named as a dark frame is one if its mean is under this share of the others' median."""
@@ -45,7 +47,9 @@ class Survey:
     left_out: str = ""
 
 
-def survey(folder: Path, listing: Listing, gamma: str | float, mask_file: Path | None, doubts: Doubts) -> Survey:
+def survey(
+    folder: Path, listing: Listing, gamma: str | float, mask_file: Path | None, doubts: Doubts, scale: float = 1.0
+) -> Survey:
     """Decode every file once: photographs of one kind and size, finite in the mask, and the mask if there is none.
 
     Args:
@@ -54,24 +58,25 @@ def survey(folder: Path, listing: Listing, gamma: str | float, mask_file: Path |
         gamma: As of `load`.
         mask_file: The mask, None for the listing's or, without one, an automatic mask.
         doubts: What becomes of faults that leave something to compute.
+        scale: What the pictures' sides are multiplied by.
 
     Raises:
         InputError: pictures that cannot be used together.
     """
     masks = _given_masks(folder, listing) if mask_file is None else _Masks(mask_file, ())
-    look = _Look(folder, listing, gamma, masked=masks.file is not None)
+    look = _Look(folder, listing, gamma, doubts, scale, masked=masks.file is not None)
     look.through(judging=True)
     if len(look.kept) < len(look.dropped):  # what most pictures look like is their nature
-        look = _Look(folder, listing, gamma, masked=masks.file is not None)
+        look = _Look(folder, listing, gamma, doubts, scale, masked=masks.file is not None)
         look.through(judging=False)
     left = [f"{name} ({why})" for name, why in look.dropped.items()]
     left_out = f"left out: {', '.join(left)}; --images takes what it names" if left else ""
     _check_fit(folder, look, left_out)
     assert look.first is not None and look.variation is not None  # two pictures fit
     notes = [note for note in (left_out, *masks.notes, *look.suspicious, *look.kinds(), look.why) if note]
-    notes += _orientation_note(look.first.orientation, look.turns)
+    notes += [*_orientation_note(look.first.orientation, look.turns), *scale_note(look.full, look.shape)]
     if masks.file is not None:
-        mask, said = read_mask(masks.file, look.broken.shape), f"the mask is {masks.file.name}"
+        mask, said = read_reduced_mask(masks.file, look.full, look.shape), f"the mask is {masks.file.name}"
     else:
         if not look.variation.changes().any():
             doubts.stop(
@@ -95,6 +100,8 @@ class _Look:
     folder: Path
     listing: Listing
     asked: str | float
+    doubts: Doubts
+    scale: float
     masked: bool
     kept: list[str] = field(default_factory=list)
     dropped: dict[str, str] = field(default_factory=dict)
@@ -105,6 +112,8 @@ class _Look:
     first: Picture | None = None
     gamma: str | float = "linear"
     why: str = ""
+    full: tuple[int, int] = (0, 0)  # sides of the pictures, once turned
+    shape: tuple[int, int] = (0, 0)  # and reduced
     variation: Variation | None = None
     broken: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))  # first picture with a value not finite
     levels: list[float] = field(default_factory=list)
@@ -113,13 +122,14 @@ class _Look:
         """Decode all files; `judging` leaves out those that look like no photograph."""
         listing = self.listing
         order = [name for name in listing.files if name not in listing.dark] + list(listing.dark)
-        for name in progress_bar(order, desc="photographs", unit="picture", delay=5):
+        for number, name in enumerate(progress_bar(order, desc="photographs", unit="picture", delay=5), start=1):
             picture = decode(self.folder / name)
             why = self._no_photograph(name, picture) if judging else ""
             if why:
                 self.dropped[name] = why
             else:
                 self._keep(name, picture)
+            stage("reading", number, len(order))
 
     def kinds(self) -> list[str]:
         """Say which files are of another kind than their names tell, and which layers of EXR files were read."""
@@ -157,24 +167,27 @@ class _Look:
         if picture.coding.kind == "EXR":
             self.layers.setdefault(picture.layer, []).append(name)
         if self.first is None:
-            self._begin(picture)
+            self._begin(name, picture)
         assert self.first is not None and self.variation is not None
         if (shape, picture.coding) != (self.first.pixels.shape[:2], self.first.coding):
             return  # refused when all are known
         self.turns.add(picture.orientation)
         pixels = turned(picture.pixels, self.first.orientation)
         if picture.coding.floating:
-            self.broken[(self.broken < 0) & ~np.isfinite(pixels).all(-1)] = len(self.kept) - 1
+            touched = reduced((~np.isfinite(pixels).all(-1)).astype(np.float32), self.shape) > 0
+            self.broken[(self.broken < 0) & touched] = len(self.kept) - 1
         if not self.masked:
-            self.variation.add(brightness(to_linear(pixels, self.gamma)))
+            self.variation.add(reduced_grey(pixels, self.gamma, self.shape))
 
-    def _begin(self, picture: Picture) -> None:
+    def _begin(self, name: str, picture: Picture) -> None:
         """Settle what the first photograph decides."""
-        shape = turned(picture.pixels, picture.orientation).shape[:2]
+        self.full = turned(picture.pixels, picture.orientation).shape[:2]
+        self.shape = reduced_shape(self.full, self.scale)
+        refuse_huge(self.folder / name, self.full, self.shape, self.doubts)
         self.first = picture
         self.gamma, self.why = resolve_gamma(self.asked, picture.coding, self.listing.places)
-        self.variation = Variation(shape)
-        self.broken = np.full(shape, -1, np.int32)
+        self.variation = Variation(self.shape)
+        self.broken = np.full(self.shape, -1, np.int32)
 
 
 @dataclass(frozen=True)

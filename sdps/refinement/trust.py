@@ -4,6 +4,7 @@ The formulas were fitted on rendered scenes of shapes and lights that no network
 `docs/scripts/refinement_study.py --fit`; docs/studies/refinement.md shows expected against actual errors.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ _FLAT = 0.1
 """An object is taken to be flat if its normals spread by less, root mean square."""
 _WINDOW = 5  # pixels that a residual is averaged over
 _BEST, _LEAST = 0.008, 0.001  # the residual of a perfect model, and the least above it that is told apart
+_PART = 2**20  # pixels worked on at once
 _UPRIGHT, _STILL, _FAINT = 0.1, 0.3, 0.003
 _GIVEN = 0.8  # share of the error that is left where light directions are given and no network tells what it expects
 
@@ -63,13 +65,13 @@ def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = Fa
         given: The light directions were given: less is expected to be off, of lights nothing is said, and the start is
             kept for no error that is expected.
     """
-    of_normals, of_lights, moved = features(found, mask, start)
-    plain = np.exp(of_normals[:, : len(NORMAL)] @ NORMAL)
-    expected = np.zeros(mask.shape, np.float32)
-    if "expected_error" in start.diagnostics:
-        expected[mask] = np.exp(of_normals @ NORMAL_TOLD)
-    else:
-        expected[mask] = _GIVEN * plain if given else plain
+    of_lights, moved, parts = _features(found, mask, start)
+    told, plainly, values = "expected_error" in start.diagnostics, [], []
+    for of_normals in parts:
+        plainly.append(np.exp(of_normals[:, : len(NORMAL)] @ NORMAL))
+        values.append(np.exp(of_normals @ NORMAL_TOLD) if told else (_GIVEN if given else 1.0) * plainly[-1])
+    expected, plain = np.zeros(mask.shape, np.float32), np.concatenate(plainly)
+    expected[mask] = np.concatenate(values)
     of_start, mean = float(np.exp(moved @ START)), float(plain.mean())
     doubt = _doubt(mask, start.normals, start.light_directions)
     # What a network tells raises both sides, so it is left out here.
@@ -83,27 +85,42 @@ def features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.ndar
     """Return what `NORMAL` (P, 7) or `NORMAL_TOLD` (P, 9), `LIGHT` (L, 6) and `START` (3,) are multiplied with;
     arguments as of `trust`.
     """
+    of_lights, moved, parts = _features(found, mask, start)
+    return np.concatenate(list(parts)), of_lights, moved
+
+
+def _features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.ndarray, np.ndarray, Iterator[np.ndarray]]:
+    """Return the features of lights, start and pixels, these a part at a time."""
     normals, lights = start.normals, start.light_directions
-    pixels, images = int(mask.sum()), len(lights)
+    images = len(lights)
     residual = float(found.pixel_residual[mask].mean())
     misfit, count = np.log(max(residual - _BEST, _LEAST)), np.log(images)
     spread = 0.5 * np.log(max(found.light_directions.var(axis=0).sum(), _LEAST))
     share = ndimage.uniform_filter(mask.astype(np.float32), _WINDOW)[mask]
     around = ndimage.uniform_filter(np.where(mask, found.pixel_residual, 0.0), _WINDOW)[mask] / share
     turned = angle_degrees(found.normals[mask], normals[mask])
-    of_normals = [
-        np.ones(pixels), np.full(pixels, misfit), np.full(pixels, count), np.full(pixels, spread),
-        np.log((around + _FAINT) / residual), np.log(np.maximum(found.normals[mask][:, 2], _UPRIGHT)),
-        np.log(turned + _STILL),
-    ]  # fmt: skip
+    own = start.diagnostics.get("expected_error")
+    told, facing = None if own is None else own[mask], found.normals[..., 2][mask]
+
+    def of_normals(part: slice) -> np.ndarray:
+        pixels = len(turned[part])
+        columns = [
+            np.ones(pixels), np.full(pixels, misfit), np.full(pixels, count), np.full(pixels, spread),
+            np.log((around[part] + _FAINT) / residual), np.log(np.maximum(facing[part], _UPRIGHT)),
+            np.log(turned[part] + _STILL),
+        ]  # fmt: skip
+        if told is not None:
+            columns += [np.log(told[part] + _STILL), np.full(pixels, np.log(told.mean() + _STILL))]
+        return np.stack(columns, axis=1)
+
     shifted = angle_degrees(found.light_directions, lights)
     of_lights = np.stack([
         np.ones(images), np.full(images, misfit), np.full(images, count), np.full(images, spread),
         np.log(found.image_residual / residual), np.log(shifted + _STILL),
     ], axis=1)  # fmt: skip
-    if (own := start.diagnostics.get("expected_error")) is not None:
-        of_normals += [np.log(own[mask] + _STILL), np.full(pixels, np.log(own[mask].mean() + _STILL))]
-    return np.stack(of_normals, axis=1), of_lights, np.array([1.0, misfit, np.log(turned.mean() + _STILL)])
+    parts = (slice(begin, begin + _PART) for begin in range(0, len(turned), _PART))
+    moved = np.array([1.0, misfit, np.log(turned.mean() + _STILL)])
+    return of_lights, moved, (of_normals(part) for part in parts)
 
 
 def _doubt(mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> str:

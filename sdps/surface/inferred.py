@@ -15,18 +15,20 @@ from render.records.shards import write_exr
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, write_json
 from render.shared.images import quantise, write_png
+from render.shared.progress import stage
 from sdps.core.estimate import Estimate
 from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
-from sdps.surface.meshing import mesh, write_mesh
-from sdps.surface.relight import Residuals, fit_albedo, relit, residuals
+from sdps.surface.meshing import mesh, step_of, write_mesh
+from sdps.surface.relight import Residuals, fit_albedo, lit, relit, residuals
 from sdps.surface.verdict import give_verdict
 
 RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
          "grazing": (-0.85, 0.45, 0.25)}  # fmt: skip
+_PART = 2**20  # pixels worked on at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,15 +111,29 @@ class Inference:
 
     def relit(self) -> dict[str, np.ndarray]:
         """Return the object under lights of our choice, by name, (H, W, 3) float32 linear in [0, 1]."""
-        return self._relit
+        return {name: self.relit_view(name) for name in RELIT}
+
+    def relit_view(self, name: str, part: tuple[slice, ...] = ()) -> np.ndarray:
+        """Return one of `relit`, or some of its rows and columns."""
+        white = np.ones((1, 1, 1), np.float32)
+        albedo = (self.albedo[part] if self.albedo is not None else white) * self._exposure
+        view = relit(self.normals[part], albedo, np.array(RELIT[name]), free=self._shadows[name][part])
+        return np.clip(view, 0.0, 1.0, out=view)
 
     @cached_property
-    def _relit(self) -> dict[str, np.ndarray]:
-        albedo = self.albedo if self.albedo is not None else np.ones((*self.photos.shape, 3), np.float32)
-        inside = albedo[self.photos.mask]
-        albedo = albedo * (0.9 / max(float(np.percentile(inside, 99)), 1e-9))
-        views = {name: relit(self.normals, albedo, np.array(light), depth=self.depth) for name, light in RELIT.items()}
-        return {name: np.clip(view, 0.0, 1.0) for name, view in views.items()}
+    def _exposure(self) -> float:
+        """What brings the brightest percent of the albedo to 0.9."""
+        inside = np.ones(1, np.float32) if self.albedo is None else self.albedo[self.photos.mask]
+        return 0.9 / max(float(np.percentile(inside, 99)), 1e-9)
+
+    @cached_property
+    def _shadows(self) -> dict[str, np.ndarray]:
+        """What each light of `relit` reaches, (H, W) bool."""
+        found = {}
+        for number, (name, light) in enumerate(RELIT.items(), start=1):
+            found[name] = lit(self.depth, np.array(light, np.float64))
+            stage("relit pictures", number, len(RELIT))
+        return found
 
     def summary(self) -> dict[str, Any]:
         """Return what a reader needs to judge the result, JSON ready."""
@@ -129,6 +145,7 @@ class Inference:
             "terms": pretrained.terms(self.files.values()),
             "images": len(photos),
             "size": list(photos.shape),
+            "scale": photos.scale,
             "bits": photos.bits,
             "gamma": photos.gamma,
             "mask": photos.mask_origin,
@@ -139,6 +156,7 @@ class Inference:
             "frame": "x right, y up, z to the camera; lights from the surface to the light",
             "depth": {"unit": "pixels towards the camera", "components": self.depth.components,
                       "residual_degrees": round(self.depth.residual, 3)},
+            "mesh": {"every": step_of(photos.mask)},
             "seconds": round(self.seconds, 2),
             "notes": list(photos.notes),
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
@@ -191,7 +209,7 @@ class Inference:
         channels = {f"normal.{axis}": np.ascontiguousarray(normals[..., k]) for k, axis in enumerate("XYZ")}
         header = {"ps:frame": "x right, y up, z to the camera", "ps:method": self.method}
         write_exr(folder / "normal.exr", [("normal", header, {**channels, "mask": mask.astype(np.float32)})])
-        write_png(folder / "normal.png", quantise((normals.astype(np.float64) + 1.0) / 2.0, 16))
+        write_png(folder / "normal.png", _coded(normals))
         write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
         if len(self.light_directions):
             write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains)
@@ -204,12 +222,16 @@ class Inference:
             _save_array(folder / "expected-error.npy", self.expected_error)
         _save_array(folder / "depth.npy", self.depth.z)
         colour = None if self.albedo is None else _display(self.albedo, mask)
-        surface = mesh(self.depth, colour=colour, normals=normals)
-        for suffix in ("ply", "obj", "glb"):
+        stage("meshes")
+        surface = mesh(self.depth, colour=colour, normals=normals, every=step_of(mask))
+        for number, suffix in enumerate(("ply", "obj", "glb"), start=1):
             write_mesh(surface, folder / f"mesh.{suffix}")
+            stage("meshes", number, 3)
+        del surface, colour
         (folder / "relit").mkdir()
-        for name, view in self.relit().items():
-            write_png(folder / "relit" / f"{name}.png", display(view))
+        for name in RELIT:
+            write_png(folder / "relit" / f"{name}.png", display(self.relit_view(name)))
+            stage("relit pictures", 1, 1)
         write_json(folder / "result.json", self.summary())
 
 
@@ -249,6 +271,13 @@ def _about_refined(diagnostics: dict[str, Any], photos: Photographs) -> dict[str
         "modes": refined.modes.round(4).tolist(),
         "lobes": {"amplitudes": refined.amplitudes.round(4).tolist(), "sharpness": refined.sharpness.round(1).tolist()},
     }
+
+
+def _coded(normals: np.ndarray) -> np.ndarray:  # (H, W, 3) uint16
+    """Return normals as colours, (n + 1) / 2, a few rows at a time."""
+    step = max(1, _PART // normals.shape[1])
+    rows = (normals[start : start + step].astype(np.float64) for start in range(0, len(normals), step))
+    return np.concatenate([quantise((some + 1.0) / 2.0, 16) for some in rows])
 
 
 def _save_array(path: Path, array: np.ndarray) -> None:

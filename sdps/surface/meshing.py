@@ -17,6 +17,9 @@ from sdps.photos.response import to_linear
 
 FORMATS = (".ply", ".obj", ".glb")
 
+MOST_VERTICES = 1_500_000
+"""Of the meshes in files. A vertex takes about 700 bytes while they are written, and 200 in the file."""
+
 _MATT = {
     "name": "matt",
     "pbrMetallicRoughness": {"baseColorFactor": [1.0] * 4, "metallicFactor": 0.0, "roughnessFactor": 1.0},
@@ -29,6 +32,11 @@ def unit_scale(shape: tuple[int, int]) -> float:
     return 2.0 / max(shape)
 
 
+def step_of(mask: np.ndarray) -> int:
+    """Return every how manyth pixel is a vertex of the object's files, so that they have at most 1.5 million."""
+    return max(1, int(np.ceil(np.sqrt(int(mask.sum()) / MOST_VERTICES))))
+
+
 def mesh(
     depth: Depth | np.ndarray,
     mask: np.ndarray | None = None,
@@ -36,6 +44,7 @@ def mesh(
     colour: np.ndarray | None = None,
     normals: np.ndarray | None = None,
     steepest: float | None = None,
+    every: int = 1,
 ) -> trimesh.Trimesh:
     """Triangulate the masked pixels: a vertex at each pixel's centre, two triangles between four, one between three.
 
@@ -50,32 +59,40 @@ def mesh(
         normals: (H, W, 3), normals of the vertices, not those of the triangles around them.
         steepest: Leave out triangles with an edge that rises by more pixels than this per pixel, such as walls across
             discontinuities; None keeps all.
+        every: Take every so manyth pixel of every so manyth row alone (`step_of`).
 
     Raises:
         InputError: sizes or types that do not fit, depth that is not finite, or no triangle.
     """
     z, mask = _checked(depth, mask, colour, normals)
+    height, width = mask.shape
+    few = slice(None, None, every), slice(None, None, every)
+    z, mask = z[few] / np.float32(every), mask[few]
     index = np.full(mask.shape, -1, np.int64)
     index[mask] = np.arange(mask.sum())
     faces = _triangles(z, index)
     rows, columns = np.nonzero(mask)
     if steepest is not None:
-        corners = np.stack([columns, rows, z[mask]], axis=-1).astype(np.float64)[faces]  # (f, 3, 3)
-        edges = corners - np.roll(corners, 1, axis=1)
-        faces = faces[(np.abs(edges[..., 2]) <= steepest * np.linalg.norm(edges[..., :2], axis=-1)).all(axis=1)]
+        faces = _no_walls(faces, np.stack([columns, rows, z[mask]], axis=-1).astype(np.float64), steepest)
     if not len(faces):
         raise InputError("no three neighbouring mask pixels make a triangle; mark a larger object, or raise steepest")
     used, faces = np.unique(faces, return_inverse=True)
     rows, columns = rows[used], columns[used]
-    height, width = mask.shape
-    vertices = np.stack([columns - (width - 1) / 2, (height - 1) / 2 - rows, z[rows, columns]], axis=-1)
+    places = every * columns - (width - 1) / 2, (height - 1) / 2 - every * rows, every * z[rows, columns]
     return trimesh.Trimesh(
-        vertices=vertices * unit_scale(mask.shape),
+        vertices=np.stack(places, axis=-1) * unit_scale((height, width)),
         faces=faces.reshape(-1, 3),
-        vertex_normals=None if normals is None else np.asarray(normals, np.float64)[rows, columns],
-        vertex_colors=None if colour is None else colour[rows, columns],
+        vertex_normals=None if normals is None else np.asarray(normals[few][rows, columns], np.float64),
+        vertex_colors=None if colour is None else colour[few][rows, columns],
         process=False,
     )
+
+
+def _no_walls(faces: np.ndarray, corners: np.ndarray, steepest: float) -> np.ndarray:
+    """Return the triangles (f, 3) without an edge that is steeper; corners (v, 3) in pixels."""
+    found = corners[faces]  # (f, 3, 3)
+    edges = found - np.roll(found, 1, axis=1)
+    return faces[(np.abs(edges[..., 2]) <= steepest * np.linalg.norm(edges[..., :2], axis=-1)).all(axis=1)]
 
 
 def write_mesh(surface: trimesh.Trimesh, path: str | Path) -> None:

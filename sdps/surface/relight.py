@@ -14,12 +14,15 @@ import cv2
 import numpy as np
 
 from render.shared.errors import InputError
+from render.shared.progress import stage
 from sdps.core.integration import Depth, checked_normals
 
 if TYPE_CHECKING:
     from sdps.inference.image_source import ImageSource
 
 _READ_PIXELS = 2**20  # read at once, whole images
+_PART = 2**20  # pixels worked on at once
+_TRACED = 2**20  # pixels of the box above which shadows are traced on a coarser grid
 _LEAST = 0.02  # of a pixel's brightness: smaller residuals do not gain more weight
 _LIFT = 1.0  # pixels by which an occluder must rise above a ray, since the depth has errors of its own
 
@@ -67,18 +70,21 @@ def fit_albedo(
         raise InputError(f"passes must be at least 1, got {passes}")
     unit, lights, intensities = _checked(images, mask, normals, lights, intensities)
     albedo = smallest = None
-    for _ in range(passes):
+    for number in range(passes):
         above, below = np.zeros((2, len(unit), 3), np.float32)
         for part, observed in _read(images, mask):
             for light, intensity, values in zip(lights[part], intensities[part], observed, strict=True):
-                model = _shading(unit, light)[:, None] * intensity  # (n, C)
-                weighted = model
-                if albedo is not None and smallest is not None:
-                    off = np.abs((values - model * albedo).mean(axis=1))
-                    weighted = model / np.maximum(off, smallest)[:, None]
-                above += weighted * values
-                below += weighted * model
-        albedo = np.maximum(above, 0.0) / np.maximum(below, np.finfo(np.float32).tiny)
+                for some in _parts(len(unit)):
+                    model = _shading(unit[some], light)[:, None] * intensity  # (p, C)
+                    weighted = model
+                    if albedo is not None and smallest is not None:
+                        off = np.abs((values[some] - model * albedo[some]).mean(axis=1))
+                        weighted = model / np.maximum(off, smallest[some])[:, None]
+                    above[some] += weighted * values[some]
+                    below[some] += weighted * model
+            stage("albedo", number * len(images) + part.stop, passes * len(images))
+        albedo = np.maximum(above, 0.0, out=above)
+        albedo /= np.maximum(below, np.finfo(np.float32).tiny, out=below)
         smallest = np.maximum(_LEAST * albedo.mean(axis=1), 1e-12)
     picture = np.zeros((*mask.shape, 3), np.float32)
     picture[mask] = albedo
@@ -86,8 +92,9 @@ def fit_albedo(
 
 
 def relit(
-    normals: np.ndarray, albedo: np.ndarray | float, direction: np.ndarray, *, depth: Depth | None = None
-) -> np.ndarray:
+    normals: np.ndarray, albedo: np.ndarray | float, direction: np.ndarray, *, depth: Depth | None = None,
+    free: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Return the object under one light of intensity 1, (H, W, 3) float32 linear radiance, without highlights.
 
     Args:
@@ -95,6 +102,7 @@ def relit(
         albedo: (H, W, 3) of `fit_albedo`, or (H, W, 1) or a number.
         direction: (3,) from the surface to the light, of any length.
         depth: Of `integrate`; adds cast shadows.
+        free: (H, W) bool, what `lit` found of them before.
 
     Raises:
         InputError: a direction that is none.
@@ -103,30 +111,54 @@ def relit(
     length = np.linalg.norm(direction)
     if direction.shape != (3,) or not (np.isfinite(length) and length > 0):
         raise InputError(f"a light direction must be three finite numbers, not all zero, got {direction.tolist()}")
-    shading = np.maximum(normals @ (direction / length), 0.0)
-    if depth is not None:
-        shading = shading * lit(depth, direction)
-    return np.broadcast_to(shading[..., None] * albedo, (*shading.shape, 3)).astype(np.float32)
+    free = lit(depth, direction) if free is None and depth is not None else free
+    albedo = np.broadcast_to(albedo, (*normals.shape[:2], np.shape(albedo)[-1] if np.ndim(albedo) else 1))
+    picture = np.empty((*normals.shape[:2], 3), np.float32)
+    step = max(1, _PART // normals.shape[1])
+    for rows in (slice(start, start + step) for start in range(0, len(normals), step)):
+        shading = np.maximum(normals[rows] @ (direction / length), 0.0)
+        if free is not None:
+            shading = shading * free[rows]
+        picture[rows] = shading[..., None] * albedo[rows]
+    return picture
 
 
 def lit(depth: Depth, direction: np.ndarray) -> np.ndarray:
     """Return which pixels see a distant light over the depth map, (H, W) bool; nothing outside the mask occludes.
 
-    Rays march in steps of a pixel. Between components, and behind what the camera sees, shadows are a guess.
+    Rays march in steps of a pixel; of objects whose box has more than a million, of some, between as many pixels.
+    Between components, and behind what the camera sees, shadows are a guess.
     """
+    box = tuple(slice(int(at[0]), int(at[-1]) + 1) for at in (np.flatnonzero(depth.mask.any(axis=k)) for k in (1, 0)))
+    inside = depth.mask[box]
+    every = int(np.ceil(np.sqrt(inside.size / _TRACED)))
+    few = tuple(slice(min(every // 2, side - 1), None, every) for side in inside.shape)
+    found = np.zeros(depth.mask.shape, bool)
+    if not inside[few].any():
+        found[box] = inside
+        return found
+    free = _marched(depth.z[box][few] / every if every > 1 else depth.z[box], inside[few], direction)
+    if every > 1:
+        free = cv2.resize(free.astype(np.float32), inside.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
+    found[box] = free & inside
+    return found
+
+
+def _marched(z: np.ndarray, mask: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Do what `lit` does for depth z (H, W) in pixels, pixel by pixel."""
     across, towards = np.asarray(direction[:2], np.float64), float(direction[2])
     length = np.linalg.norm(across)
     if length < 1e-9 * max(abs(towards), 1e-300):
-        return depth.mask.copy()
+        return mask.copy()
     step = across / length * (1.0, -1.0)  # columns and rows to the light
-    inside = depth.z[depth.mask]
+    inside = z[mask]
     lowest = float(inside.min()) - 1e4
-    z = np.where(depth.mask, depth.z, np.float32(lowest))
+    z = np.where(mask, z, np.float32(lowest))
     rise = towards / length  # of the ray, per pixel
-    farthest = np.hypot(*depth.mask.shape)
+    farthest = np.hypot(*mask.shape)
     if rise > 0:
         farthest = min(farthest, float(np.ptp(inside)) / rise)
-    free = depth.mask.copy()
+    free = mask.copy()
     for distance in range(1, int(farthest) + 2):
         shift = np.array([[1.0, 0.0, -step[0] * distance], [0.0, 1.0, -step[1] * distance]])
         ahead = cv2.warpAffine(z, shift, z.shape[::-1], flags=cv2.INTER_LINEAR, borderValue=lowest)
@@ -146,13 +178,18 @@ def residuals(
     if albedo.shape != (*mask.shape, 3):
         raise InputError(f"albedo must be {(*mask.shape, 3)} like the mask, got {albedo.shape}")
     inside = albedo[mask].astype(np.float32)
-    wrong, power = np.zeros((2, len(lights))), np.zeros((2, len(unit)))
+    wrong, power = (
+        np.zeros((2, len(lights))),
+        np.zeros((2, len(unit)), np.float64 if len(unit) <= _PART else np.float32),
+    )
     for part, observed in _read(images, mask):
         for number, values in zip(range(part.start, part.stop), observed, strict=True):
-            model = _shading(unit, lights[number])[:, None] * intensities[number] * inside
-            off, squared = ((values - model) ** 2).sum(axis=1), (values**2).sum(axis=1)  # (n,)
-            wrong[:, number] = off.sum(dtype=np.float64), squared.sum(dtype=np.float64)
-            power += off, squared
+            for some in _parts(len(unit)):
+                model = _shading(unit[some], lights[number])[:, None] * intensities[number] * inside[some]
+                off, squared = ((values[some] - model) ** 2).sum(axis=1), (values[some] ** 2).sum(axis=1)  # (p,)
+                wrong[:, number] += off.sum(dtype=np.float64), squared.sum(dtype=np.float64)
+                power[:, some] += off, squared
+        stage("residuals", part.stop, len(lights))
     picture = np.zeros(mask.shape, np.float32)
     picture[mask] = _relative(*power)
     return Residuals(_relative(*wrong), picture, float(_relative(*wrong.sum(axis=1, keepdims=True))[0]))
@@ -171,7 +208,7 @@ def _checked(
     images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return normals (n, 3), lights (L, 3) and intensities (L, 3), all float32."""
-    unit = checked_normals(normals, mask)
+    unit = _unit(normals, mask)
     lights, intensities = np.asarray(lights, np.float32), np.asarray(intensities, np.float32)
     count = len(images)
     if lights.shape != (count, 3) or intensities.shape not in ((count,), (count, 3)):
@@ -181,7 +218,21 @@ def _checked(
         )
     if not (count and np.isfinite(lights).all() and np.isfinite(intensities).all()):
         raise InputError("there must be images, and their lights and intensities must be finite")
-    return unit.astype(np.float32), lights, np.broadcast_to(intensities.reshape(count, -1), (count, 3))
+    return unit, lights, np.broadcast_to(intensities.reshape(count, -1), (count, 3))
+
+
+def _unit(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return the mask's unit normals (n, 3) float32, in double precision a few rows at a time."""
+    step = max(1, _PART // mask.shape[-1]) if mask.size > _PART else mask.size
+    bands = [slice(start, start + step) for start in range(0, len(mask), step)]
+    if len(bands) < 2:
+        return checked_normals(normals, mask).astype(np.float32)
+    found = [checked_normals(normals[rows], mask[rows]).astype(np.float32) for rows in bands if mask[rows].any()]
+    return np.concatenate(found) if found else checked_normals(normals, mask).astype(np.float32)
+
+
+def _parts(count: int) -> list[slice]:
+    return [slice(start, start + _PART) for start in range(0, count, _PART)]
 
 
 def _read(images: "ImageSource", mask: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
@@ -192,7 +243,7 @@ def _read(images: "ImageSource", mask: np.ndarray) -> Iterator[tuple[slice, np.n
         observed = np.asarray(images[part])
         if observed.shape != (part.stop - start, *mask.shape, 3):
             raise InputError(f"images must be (L, {mask.shape[0]}, {mask.shape[1]}, 3), got {observed.shape}")
-        observed = observed[:, mask].astype(np.float32)
+        observed = observed[:, mask].astype(np.float32, copy=False)
         if not np.isfinite(observed).all():
             raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
         yield part, observed

@@ -1,6 +1,7 @@
 """Grey pictures of a depth map seen from the front and from the sides."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -53,9 +54,8 @@ def turned(depth: Depth, degrees: float, height: int, *, colour: np.ndarray | No
     if not (-90 < degrees < 90 and height >= 8):
         raise InputError(f"degrees must be between -90 and 90 and height at least 8, got {degrees:g} and {height}")
     size = _FINER * height
-    rows, columns = (np.flatnonzero(depth.mask.any(axis=axis)) for axis in (1, 0))
-    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    mask, z = depth.mask[box], depth.z[box].astype(np.float64)
+    depth, colour = _of_the_box(depth, colour, _FINER * size)
+    mask, z = depth.mask, depth.z.astype(np.float64)
     x = np.broadcast_to(np.arange(mask.shape[1]) - (mask.shape[1] - 1) / 2, mask.shape)
     z = z - (z[mask].min() + z[mask].max()) / 2
     # The same scale at every angle: the box's diagonal in the plane of the turn fits.
@@ -66,11 +66,20 @@ def turned(depth: Depth, degrees: float, height: int, *, colour: np.ndarray | No
     shown = np.rint((np.arange(size) - (size - 1) / 2) / scale + (mask.shape[0] - 1) / 2).astype(int)
     inside = np.flatnonzero((shown >= 0) & (shown < mask.shape[0]))
     lines = shown[inside]
-    shades = _shades(depth, angle, colour)[box]
+    shades = _shades(depth, angle, colour)
     picture = np.full((size, size, 3), 1.0)
     picture[inside] = _draw(across[lines] + (size - 1) / 2, towards[lines], mask[lines], shades[lines], size)
     linear = picture.reshape(height, _FINER, height, _FINER, 3).mean(axis=(1, 3))
     return (255 * linear ** (1 / 2.2) + 0.5).astype(np.uint8)
+
+
+def _of_the_box(depth: Depth, colour: np.ndarray | None, side: int) -> tuple[Depth, np.ndarray | None]:
+    """Return depth and colour of the mask's box, thinned to sides of about `side` pixels where they are twice that."""
+    rows, columns = (np.flatnonzero(depth.mask.any(axis=axis)) for axis in (1, 0))
+    every = max(1, int(max(np.ptp(rows), np.ptp(columns))) // side)
+    few = slice(rows[0], rows[-1] + 1, every), slice(columns[0], columns[-1] + 1, every)
+    z = depth.z[few] if every == 1 else depth.z[few] / np.float32(every)
+    return replace(depth, z=z, mask=depth.mask[few]), None if colour is None else colour[few]
 
 
 def strip(

@@ -36,7 +36,7 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
     albedo, strength, lobes = _reflectance(result)
     scale = 0.9 / max(float(np.percentile(albedo[mask], 99)), 1e-9)
     peak, shine = float(albedo.max()) or 1.0, float(strength.max()) or 1.0
-    unit = np.where(mask[..., None], normals, 0.0)[few]
+    unit = np.where(mask[few][..., None], normals[few], 0.0)
     parts = [
         np.rint(unit * 32767).astype("<i2"), np.rint(albedo[few] / peak * _FULL).astype("<u2"),
         np.rint(strength[few] / shine * _FULL).astype("<u2"),
@@ -117,7 +117,7 @@ def _observations(
 ) -> None:  # fmt: skip
     """Write what every shown pixel measures in every photograph, and what the model says it should."""
     count = len(result.photos)
-    observed = np.stack([_grey(result.photos[k : k + 1][0][few]) for k in range(count)], axis=-1)
+    observed = np.stack([_grey(result.photos.window(slice(k, k + 1), *few)[0]) for k in range(count)], axis=-1)
     np.save(folder / "observed.npy", observed.astype(np.float16))
     if not len(result.light_directions):
         return
@@ -144,5 +144,5 @@ def _mesh(result: "Inference", path: Path) -> None:
     albedo = result.albedo
     colour = None
     if albedo is not None:
-        colour = pictures.tone_map(albedo / max(float(np.percentile(albedo[mask], 99)), 1e-9))[few]
+        colour = pictures.tone_map(albedo[few] / max(float(np.percentile(albedo[mask], 99)), 1e-9))
     write_mesh(mesh(z[few] / step, mask[few], colour=colour, normals=result.normals[few]), path)

@@ -27,6 +27,7 @@ from render.shared.files import atomic_path
 
 PHOTOS, PAINTED = "photos", "painted.png"
 _GAMMAS = ("auto", "linear", "srgb", "2.2")
+_SCALES = ("1", "0.5", "0.25")
 _TASKS = ("example", "check", "infer")
 _MOST_MASK = 32 * 2**20
 _MOST_RUNS = 20
@@ -124,6 +125,7 @@ async def start(request: Request) -> Response:
         run.mkdir(parents=True)
         arguments |= {"number": latest, "method": str(asked.get("method", "auto"))[:80]}
         arguments |= {key: asked.get(key) is True for key in ("refine", "anyway", "discontinuities")}
+        arguments["scale"] = float(_one_of(asked, "scale", _SCALES))
     try:
         return queued(request, task, **arguments)
     except Refused:

@@ -21,7 +21,10 @@ PHOTOS, VIEW, PAINTED, TRUTH = "photos", "view", "painted.png", "truth.npy"
 _EXAMPLE = {"shape": "bunny", "material": "red-phenolic", "lights": "near-uniform:48", "size": 256, "spp": 32}
 _THUMBNAIL, _PICTURE = 112, 640
 _CHECKING = {"reading": 2.0, "checks": 1.0, "pictures": 1.0}
-_INFERRING = {"reading": 1.0, "lights": 5.0, "normals": 30.0, "refinement": 0.0, "surface": 3.0, "files": 2.0}
+_INFERRING = {
+    "reading": 1.0, "lights": 5.0, "normals": 30.0, "refinement": 0.0, "albedo": 1.0, "depth": 1.0, "surface": 1.0,
+    "meshes": 1.0, "relit pictures": 1.0, "page": 1.0,
+}  # fmt: skip
 """Stages and about how long each takes with the recommended method."""
 
 
@@ -110,7 +113,7 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
         number: Of the run.
         refine: Refine where `sdps.infer` does by default.
         method, anyway, discontinuities: As of `sdps.infer`.
-        options: As of `check`.
+        options: As of `check`, and `scale` of `sdps.load`.
 
     Returns:
         What the page shows of the run.
@@ -128,16 +131,12 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
     with together(shares), _ShortPaths(folder):
         stage("reading")
         photos = _load(folder, anyway=anyway, **options)
-        stage("lights")
         result = sdps.infer(
             photos, method, refine=None if refine else False, anyway=anyway, discontinuities=discontinuities
         )
-        stage("surface")
         (run / "view").mkdir(parents=True, exist_ok=True)
         shown = object_view.write(result, run / "view")
-        stage("files")
         result.save(run / "files")
-        stage("files", 1, 2)
         write_page(run / "files" / "report.html", result)
     shown |= {"number": number, "error": _error(folder, result.normals, photos.mask)}
     write_json(run / "view" / "view.json", shown)
@@ -158,16 +157,20 @@ def _error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float | None:
     from sdps.core.metrics import normal_mae
 
     truth = np.load(folder / TRUTH)
+    if truth.shape != normals.shape:  # at another scale
+        return None
     return round(normal_mae(normals, truth, mask & (np.linalg.norm(truth, axis=-1) > 0.5)), 2)
 
 
-def _load(folder: Path, *, anyway: bool, gamma: str = "auto", frame: str = "y-up", lights: bool = False) -> Any:
+def _load(
+    folder: Path, *, anyway: bool, gamma: str = "auto", frame: str = "y-up", lights: bool = False, scale: float = 1.0
+) -> Any:  # fmt: skip
     import sdps
 
     painted = folder / PAINTED
     return sdps.load(
         folder / PHOTOS, mask=painted if painted.is_file() else None, lights="folder" if lights else None,
-        frame=frame, gamma=gamma, anyway=anyway,
+        frame=frame, gamma=gamma, anyway=anyway, scale=scale,
     )  # fmt: skip
 
 

@@ -29,7 +29,8 @@ export function showError(box, error) {
 
 const STAGES = {
   "": "starting", reading: "reading the photographs", checks: "checking them", pictures: "making thumbnails", lights: "finding the lights",
-  normals: "finding the normals", refinement: "refining", surface: "building the surface", files: "writing files",
+  normals: "finding the normals", refinement: "refining", depth: "building the surface", albedo: "finding the colours", surface: "drawing the surface", meshes: "writing meshes",
+  "relit pictures": "relighting", page: "writing the report",
 };
 
 export function seconds(value) {

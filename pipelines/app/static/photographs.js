@@ -118,6 +118,7 @@ async function infer(event) {
   $("start").disabled = true;
   const asked = { ...options(), method: $("method").value };
   for (const name of ["refine", "discontinuities", "anyway"]) asked[name] = $(name).checked;
+  asked.scale = $("scale").value;
   try {
     if (!$("mask-use").disabled) await ask(inSet("mask"), { method: "PUT", body: await painter.blob() });
     const found = await follow(await post(inSet("start/infer"), asked), $("run-status"), "Surface");

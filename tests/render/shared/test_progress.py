@@ -1,6 +1,9 @@
 """Stages reach who listens, as shares of the whole."""
 
-from render.shared.progress import listening, repeat, stage, together
+import pytest
+
+from render.shared import progress
+from render.shared.progress import bars, listening, repeat, share, stage, together
 
 
 def test_stages_are_told_to_who_listens_and_to_nobody_else() -> None:
@@ -24,3 +27,33 @@ def test_stages_of_a_job_are_shares_of_it() -> None:
     assert told == [("lights", 0.125), ("normals", 0.5), ("normals", 1.0)]
     with together({"lights": 1.0}):
         stage("lights")
+
+
+def test_parts_of_a_stage_may_be_nested() -> None:
+    told: list[tuple[str, float]] = []
+    with listening(lambda *values: told.append(values)), repeat(1, 4):
+        with share(0.0, 0.5), repeat(1, 2):
+            stage("normals", 1, 2)
+        with share(0.5, 1.0):
+            stage("normals", 1, 1)
+    stage("normals")
+    assert told == [("normals", 0.25 + 0.25 * 0.375), ("normals", 0.5)]
+
+
+def test_long_stages_have_a_bar_with_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setattr(progress, "_SHORT", 0.0)
+    monkeypatch.setattr(progress.sys.stderr, "isatty", lambda: True, raising=False)  # or lines come every 20 seconds
+    with bars(without=("reading",)):
+        stage("reading", 1, 2)
+        for number in range(3):
+            stage("normals", number + 1, 4)
+        stage("depth", 1, 1)
+    shown = capsys.readouterr().err
+    assert "normals:  75%" in shown and "left" in shown and "depth: 100%" in shown and "reading" not in shown
+
+
+def test_short_stages_have_none(capsys) -> None:
+    with bars():
+        stage("normals", 1, 2)
+        stage("normals", 2, 2)
+    assert capsys.readouterr().err == ""

@@ -226,3 +226,19 @@ def test_what_is_clipped_is_left_out() -> None:
         for saturation in (float(level), float("inf"))
     ]  # fmt: skip
     assert found[0][0] < 0.6 * found[1][0], found
+
+
+def test_tiles_find_what_the_whole_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    normals, mask = bumpy(96)
+    images, lights, intensities = lit(normals, 12, 3, gloss=0.4)
+    start = turned(normals, 8.0, 4) * mask[..., None]
+    config = RefineConfig(coarse_pixels=700, iterations=200, iterations_before=100, fine_iterations=40)
+    whole = refine(images, mask, start, lights, intensities, config=config)
+    monkeypatch.setattr("sdps.refinement.refine.TILE_BYTES", 70**2 * (1200 + 20 * 12))
+    cut = refine(images, mask, start, lights, intensities, config=config)
+    np.testing.assert_allclose(cut.light_directions, whole.light_directions, atol=1e-6)
+    moved = angle_degrees(cut.normals[mask], whole.normals[mask])
+    assert moved.mean() < 0.1 * angle_degrees(whole.normals[mask], start[mask]).mean()
+    np.testing.assert_allclose(cut.image_residual, whole.image_residual, rtol=0.03)
+    np.testing.assert_allclose(cut.albedo[mask].mean(axis=0), whole.albedo[mask].mean(axis=0), rtol=0.02)
+    assert not cut.normals[~mask].any()

@@ -1,0 +1,243 @@
+"""What an inference will take, in minutes and memory, before it begins; a rough model of every stage.
+
+Seconds are those of one core of a server (AMD EPYC, AVX-512), times how fast a convolution is here. Files, disks and
+what else runs on the machine may double them.
+"""
+
+import time
+from dataclasses import dataclass
+from functools import cache
+from math import ceil
+
+import numpy as np
+import torch
+
+from render.shared.errors import InputError
+from sdps.classical import registry as classical
+from sdps.core.integration import LARGE
+from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES
+from sdps.methods.on_box import observed_bytes
+from sdps.methods.runner import Runner
+from sdps.models.frames import FrameNet
+from sdps.photos import Photographs
+from sdps.refinement import refine
+from sdps.surface.meshing import MOST_VERTICES
+
+LIMIT = 4.0
+"""GiB that an inference may take."""
+LONG = 600.0
+"""Seconds from which on a smaller scale is proposed."""
+_SCALES = (0.5, 0.4, 0.3, 0.25, 0.2, 0.15, 0.1, 0.05)
+_GIB = 2.0**30
+_BASE = 0.45  # GiB: python, torch, weights, kernels
+_NETWORK, _FRAMES, _VIEW = 1.2e-6, 2.1e-6, 2.0e-6
+"""Seconds per pixel and image; the same of `frames`, and of each of its views per pixel."""
+_CONVOLUTION = 0.0103
+"""Seconds of the convolution that the above were measured with."""
+_DECODED = {"JPEG": 12e-9}
+_DECODED_ELSE = 45e-9  # PNG, TIFF, EXR
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much there is to do.
+
+    Attributes:
+        pixels: Of the object.
+        box: Of the rectangle around it.
+        frame: Of a picture, once reduced.
+        file: Of a picture in its file.
+        pictures: How many.
+    """
+
+    pixels: float
+    box: float
+    frame: float
+    file: float
+    pictures: int
+
+    def reduced(self, scale: float) -> "Size":
+        """Return what is left at a scale, relative to this one."""
+        less = scale**2
+        return Size(less * self.pixels, less * self.box, less * self.frame, self.file, self.pictures)
+
+
+@dataclass(frozen=True)
+class Workload:
+    """What an inference will take.
+
+    Attributes:
+        size: How much there is to do.
+        shape: (H, W) of a picture.
+        scale: At which the pictures are read.
+        seconds: By stage, about.
+        gib: Most memory at once, about.
+        smaller: The largest scale proposed where this takes long or much, and what that takes; else None.
+    """
+
+    size: Size
+    shape: tuple[int, int]
+    scale: float
+    seconds: dict[str, float]
+    gib: float
+    smaller: "tuple[float, float, float] | None" = None
+
+    @property
+    def total(self) -> float:
+        """Seconds of all stages."""
+        return sum(self.seconds.values())
+
+    def describe(self) -> str:
+        """Return one line: pixels, pictures, minutes, memory, and a proposal where it takes long or much."""
+        text = (
+            f"{_count(self.size.pixels)} pixels of object in {self.size.pictures} pictures of {self.shape[1]}x"
+            f"{self.shape[0]}: about {_duration(self.total)}, up to {self.gib:.1f} GiB of memory"
+        )
+        if self.smaller is None:
+            return text
+        scale, seconds, gib = self.smaller
+        return f"{text}; --scale {scale:g} would take about {_duration(seconds)} and {gib:.1f} GiB"
+
+    def check(self) -> None:
+        """Refuse what does not fit in memory.
+
+        Raises:
+            InputError: with the scale that fits.
+        """
+        if self.gib > LIMIT:
+            scale = "a smaller --scale" if self.smaller is None else f"--scale {self.smaller[0]:g}"
+            raise InputError(
+                f"{_count(self.size.pixels)} pixels of object in {self.size.pictures} pictures would take about "
+                f"{self.gib:.1f} GiB of memory, more than {LIMIT:g}; give {scale} (in Python load(..., scale=...)), "
+                "fewer pictures, or --anyway"
+            )
+
+
+def workload(photos: Photographs, runner: Runner, *, discontinuities: bool = False) -> Workload:
+    """Estimate what an inference will take.
+
+    Args:
+        photos: What is looked at.
+        runner: The method, with its networks loaded.
+        discontinuities: Depth may jump, which takes dozens of solutions.
+    """
+    mask = photos.mask
+    sides = [int(np.ptp(np.flatnonzero(mask.any(axis=axis)))) + 31 for axis in (1, 0)]
+    frame = float(mask.size)
+    box = float(min(sides[0], mask.shape[0]) * min(sides[1], mask.shape[1]))
+    size = Size(float(mask.sum()), box, frame, frame / photos.scale**2, len(photos))
+    kind = photos.coding.kind
+    seconds, gib = _seconds(size, runner, kind, photos.scale < 1, discontinuities), _memory(size, runner)
+    smaller = None
+    if sum(seconds.values()) > LONG or gib > LIMIT:
+        for scale in _SCALES:
+            less = size.reduced(scale)
+            took = sum(_seconds(less, runner, kind, True, discontinuities).values())
+            smaller = (round(scale * photos.scale, 3), took, _memory(less, runner))
+            if smaller[2] <= LIMIT:
+                break
+    return Workload(size, photos.shape, photos.scale, seconds, gib, smaller)
+
+
+def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuities: bool) -> dict[str, float]:
+    """Return about how long each stage takes."""
+    threads, images = max(1, torch.get_num_threads()), size.pictures
+    once = images * (size.file * (_DECODED.get(kind, _DECODED_ELSE) + 30e-9 * reduces) + 15e-9 * size.frame)
+    found = {"reading": 2 * once + 70e-9 * images * size.frame}
+    estimator, slower = runner.estimator, _slower(runner)
+    if estimator is not None and estimator.lighting is not None:
+        views = runner.config.light_views or 1
+        found["lights"] = 2 * once + images * (40e-9 * size.box + 4e-3 * views * slower)
+    normals = runner.method.normals
+    if normals in classical.METHODS:
+        found["normals"] = 8e-7 * size.pixels * images + 1e-5 * size.pixels
+    elif estimator is not None and estimator.normals is not None:
+        found["normals"] = _normal_seconds(size, runner, slower) + once * _tile_count(size, runner)
+    if runner.method.refined:
+        coarse = 1500 * (1.5e-3 + 2800 * (0.6e-6 + 55e-9 * images))
+        fine = 120 * size.pixels * (0.6e-6 + 55e-9 * images)
+        found["refinement"] = (coarse + fine) / threads + 3 * once
+    found["depth"] = (1.2e-6 if size.pixels > LARGE else 5e-6) * size.pixels * (60 if discontinuities else 1)
+    found["albedo"] = 4 * once + 60e-9 * images * size.pixels
+    thin = size.box / ceil((size.box / 2**20) ** 0.5) ** 2
+    found["relit pictures"] = 8e-9 * thin**1.5 + 3e-7 * size.frame
+    found["files"] = 7e-6 * size.pixels / _step(size) ** 2 + 0.8e-6 * size.frame
+    found["page"] = 3.0 + 7e-6 * min(size.box, 2e6)
+    return found
+
+
+def _normal_seconds(size: Size, runner: Runner, slower: float) -> float:
+    """Return about how long the networks take for the normals."""
+    assert runner.estimator is not None and runner.estimator.normals is not None
+    network, views = runner.estimator.normals.network, runner.config.normal_views or 1
+    if isinstance(network, FrameNet):
+        return slower * (_FRAMES * size.pictures * size.pixels + _VIEW * views * size.box)
+    return slower * _NETWORK * views * size.pictures * size.box
+
+
+def _tile_count(size: Size, runner: Runner) -> int:
+    return max(1, ceil(1.3 * size.box / _tile_pixels(size, runner)))
+
+
+def _tile_pixels(size: Size, runner: Runner) -> float:
+    assert runner.estimator is not None and runner.estimator.normals is not None
+    kept = getattr(runner.estimator.normals.network, "kept_bytes", 0)
+    return TILE_BYTES / (PIXEL_BYTES + size.pictures * kept)
+
+
+def _memory(size: Size, runner: Runner) -> float:
+    """Return about how many GiB are in use at most."""
+    kept = 29.0 * size.frame  # normals, mask, error to expect, and what they are cut from
+    stages = [16.0 * size.file + 30.0 * size.frame, 70.0 * size.frame]
+    if runner.method.normals in classical.METHODS:
+        stages.append(observed_bytes(runner.method.normals, size.pictures, size.box))
+    elif runner.estimator is not None:
+        tile = min(size.box, _tile_pixels(size, runner)) if runner.estimator.normals is not None else 0.0
+        stages.append(kept + tile * TILE_BYTES / _tile_pixels(size, runner) if tile else kept)
+    if runner.method.refined:
+        kept += 44.0 * size.frame
+        each = 1200 + 20 * size.pictures
+        stages.append(kept + min(each * size.box, refine.TILE_BYTES) + 12 * size.pixels)
+    stages.append(kept + (700 if size.pixels <= LARGE else 80) * size.pixels)
+    kept += 25.0 * size.frame  # depth and albedo
+    stages.append(kept + 55 * size.pixels)
+    stages.append(kept + 750 * size.pixels / _step(size) ** 2)
+    return _BASE + max(stages) / _GIB
+
+
+def _step(size: Size) -> int:
+    return max(1, ceil((size.pixels / MOST_VERTICES) ** 0.5))
+
+
+@cache
+def _convolution(precision: str, device: str) -> float:
+    """Return the seconds of a convolution here: the median of a few, after kernels were made."""
+    layer = torch.nn.Conv2d(64, 64, 3, padding=1).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    images, took = torch.zeros(1, 64, 256, 256, device=device).to(memory_format=torch.channels_last), []
+    with torch.inference_mode(), torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16"):
+        for _ in range(6):
+            began = time.perf_counter()
+            float(layer(images)[0, 0, 0, 0])
+            took.append(time.perf_counter() - began)
+    return float(np.median(took[1:]))
+
+
+def _slower(runner: Runner) -> float:
+    """Return how many times as long networks take here as where they were measured."""
+    if runner.estimator is None:
+        return 1.0
+    chosen = runner.estimator.arithmetic
+    return _convolution(chosen.precision, chosen.device) / _CONVOLUTION
+
+
+def _count(pixels: float) -> str:
+    return f"{pixels / 1e6:.1f} million" if pixels >= 1e6 else f"{pixels:,.0f}"
+
+
+def _duration(seconds: float) -> str:
+    """Say about how long that is, no more exactly than it is known."""
+    if seconds < 90:
+        return f"{max(5, round(seconds / 5) * 5)} seconds"
+    if seconds < 5400:
+        return f"{round(seconds / 60)} minutes"
+    return f"{seconds / 3600:.1f} hours" if seconds < 36000 else f"{round(seconds / 3600)} hours"
