@@ -9,7 +9,7 @@ from sdps_scenes import hemisphere_lights
 
 from render.shared.errors import InputError
 from render.shared.imaging.reducing import reduced_shape
-from sdps.photos import check, load, reading
+from sdps.photos import check, load, scaling
 
 LIGHTS = hemisphere_lights(5, np.random.default_rng(0))
 
@@ -86,7 +86,7 @@ def test_scales_that_are_none(tmp_path: Path, scale: object) -> None:
 
 
 def test_pictures_that_would_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "MOST_PIXELS", 5000)
+    monkeypatch.setattr(scaling, "MOST_PIXELS", 5000)
     images, mask = folders.matte(LIGHTS)
     folders.write_folder(tmp_path, images, mask)
     with pytest.raises(InputError, match=r"1\.png: is 104x104 pixels; .* give --scale 0\.65 "):
