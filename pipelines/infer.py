@@ -66,21 +66,22 @@ def main(args: argparse.Namespace) -> int:
     if args.folder is None:
         raise InputError("name a folder of photographs, or use --self-test")
     with bars(without=("reading", "checks", "refinement")):  # these have their own
-        result = infer_folder(args)
+        result, said = infer_folder(args)
         made = result.save(args.out)
         page = write_page(args.out / "report.html", result)
     if args.self_test:
         from pipelines.evaluate.self_test import compare
 
         sys.stdout.write(compare(args.folder, result, args.out))
+    sys.stdout.write(describe(result.findings[said:]))
     sys.stdout.write(f"{result.method}: {result.seconds:.1f} s; {', '.join(path.name for path in made)}\n{page}\n")
     if result.verdict:
         sys.stdout.write(f"{_MARKS['error']} {result.verdict}\n")
     return 0
 
 
-def infer_folder(args: argparse.Namespace) -> "Inference":
-    """Read the photographs, say what was found about them, and run the method."""
+def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:
+    """Read the photographs, say what was found about them, and run the method; also return how many findings were said."""
     from sdps.api import check_out, infer, load, plan
     from sdps.inference.inference_config import inference_config
     from sdps.photos import check
@@ -99,9 +100,7 @@ def infer_folder(args: argparse.Namespace) -> "Inference":
     if args.anyway or not any(finding.level == "error" for finding in findings):
         sys.stdout.write(f"{plan(photos, args.method, **options).describe()}\n")
         sys.stdout.flush()
-    result = infer(photos, args.method, findings=findings, anyway=args.anyway, **options)
-    sys.stdout.write(describe(result.findings[len(findings) :]))
-    return result
+    return infer(photos, args.method, findings=findings, anyway=args.anyway, **options), len(findings)
 
 
 def describe(findings: "Sequence[Finding]") -> str:
