@@ -105,21 +105,36 @@ def _propose(part: np.ndarray, fields: np.ndarray) -> tuple[int, int] | None:
 
 
 def _judge(part: np.ndarray, fields: np.ndarray, place: tuple[int, int]) -> Votes:
-    """Let the tiles choose between the surroundings of no shift and those of a place."""
+    """Let the tiles choose between the surroundings of no shift and those of a place, or of a better one close by."""
+    votes = _poll(part, fields, place)
+    if votes.agree < _FEWEST:
+        return votes
+    return _poll(part, fields, (votes.rows, votes.columns), bracketed=True)
+
+
+def _poll(part: np.ndarray, fields: np.ndarray, place: tuple[int, int], *, bracketed: bool = False) -> Votes:
+    """Count votes, those at the rim of the surroundings only while the place is not known: there, tiles ask for more.
+
+    A smooth gradient, of a highlight or a near lamp, is explained the better the farther it is moved.
+    """
     tiles = _Tiles(part.shape, (abs(place[0]) + _AROUND, abs(place[1]) + _AROUND))
     if len(tiles) < _FEWEST:
         return Votes(*place)
     shifts = np.array(sorted({*_square((0, 0), _AROUND), *_square(place, _AROUND)}))
     best, telling = tiles.best(part, fields, shifts)
     still = np.abs(best).max(1) <= 1
-    near = [telling & ~still & (np.abs(best - shift).max(1) <= 1) for shift in _square(place, 2)]
+    free = telling & ~still
+    if bracketed:
+        free &= np.abs(best - place).max(1) < _AROUND
+    near = [free & (np.abs(best - shift).max(1) <= 1) for shift in _square(place, 2)]
     counts = [np.count_nonzero(one) if np.hypot(*shift) >= _SHORTEST else 0
               for one, shift in zip(near, _square(place, 2), strict=True)]  # fmt: skip
     most = int(np.argmax(counts))
+    against, voters = np.count_nonzero(still & telling), np.count_nonzero(telling)
     if not counts[most]:
-        return Votes(*place, 0, np.count_nonzero(still & telling), np.count_nonzero(telling))
+        return Votes(*place, 0, against, voters)
     rows, columns = np.rint(np.median(best[near[most]], axis=0)).astype(int).tolist()
-    return Votes(rows, columns, counts[most], np.count_nonzero(still & telling), np.count_nonzero(telling))
+    return Votes(rows, columns, counts[most], against, voters)
 
 
 class _Tiles:

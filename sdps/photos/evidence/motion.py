@@ -46,7 +46,7 @@ WHOLE_OF_FEW = (6, 0.6, 4.0)
 SUSPICIOUS = (3, 0.17, 1.0)
 """Votes by which an image is worth a second look."""
 
-BESIDE_EDGES = (3, 0.2, 1.0)
+BESIDE_EDGES = (4, 0.25, 2.0)
 """Votes that must come to edges and silhouette."""
 
 _FEW = 7  # images
