@@ -1,6 +1,7 @@
 """RGL `.bsdf` files: reading with its errors, writing any BRDF for Mitsuba's `measured`, evaluation in kernels."""
 
 import re
+from collections import defaultdict
 from functools import partial
 
 import numpy as np
@@ -228,7 +229,7 @@ def test_exchanging_files_compiles_nothing_again(tmp_path, packed):
         dr.eval(dr.while_loop(state, lambda k, _: k < count, lambda k, v: (k + 1, v + family.eval(k, wi, wo))))
 
     total(packed)
-    hashes, pieces, sets = set(), set(), [["nickel", "nylon"], ["brass", "teflon", "pvc"], ["steel", "delrin"]] * 4
+    compiled, sets = defaultdict(set), [["nickel", "nylon"], ["brass", "teflon", "pvc"], ["steel", "delrin"]] * 4
     for number, names in enumerate(sets):
         folder = tmp_path / str(number)
         family = rgl_bsdf.PackedRgl([rgl.write(folder / f"{name}.bsdf", brdf(name)) for name in names])
@@ -236,11 +237,12 @@ def test_exchanging_files_compiles_nothing_again(tmp_path, packed):
             dr.kernel_history_clear()
             total(family)
             kernels = dr.kernel_history([dr.KernelType.JIT])
-        hashes |= {kernel["hash"] for kernel in kernels}
-        pieces.update(*(re.findall(r"define fastcc .*@(func_\w+)", kernel["ir"].getvalue()) for kernel in kernels))
+        for kernel in kernels:
+            compiled[tuple(re.findall(r"define fastcc .*@(func_\w+)", kernel["ir"].getvalue()))].add(kernel["hash"])
     # Mitsuba leaves `m_reduction` of isotropic files unset, so each is one of three pieces of code: below 2, 4, others.
-    # A kernel that switches among files holds one, two or all three of them.
-    assert 1 <= len(pieces) <= 3 and len(hashes) <= 2 ** len(pieces) - 1 < len(sets)
+    # Which of them a kernel switches among, and in which order, is left to chance; nothing else may tell kernels apart.
+    assert 1 <= len({piece for pieces in compiled for piece in pieces}) <= 3
+    assert all(len(hashes) == 1 for hashes in compiled.values()), compiled
 
 
 @pytest.mark.parametrize(("number", "incidence"), [(0, 30), (1, 75), (2, 45)])
