@@ -43,7 +43,9 @@ def fresh(name: str, **options: Any) -> TrainedModel:
 
 def stage_of(name: str, role: str) -> Stage:
     """Return the stage that trains a model on true lights where it is told lights, in few steps."""
-    settings = COMMON | (LIGHTING if role in ("lighting", "second") else NORMALS) | {"steps": QUICK.get(name, STEPS[role])}
+    settings = (
+        COMMON | (LIGHTING if role in ("lighting", "second") else NORMALS) | {"steps": QUICK.get(name, STEPS[role])}
+    )
     if role == "pixels":
         # All lights at every step: with random subsets of them the observation maps of a pixel never repeat.
         settings |= {
