@@ -57,7 +57,7 @@ def test_a_lambertian_pixel_is_fitted_exactly_but_for_the_ridge():
     found, scale, error = first_normals(shading[..., None] * colour[:, None], lights)
     angles = torch.rad2deg((found * normals).sum(-1).clamp(-1.0, 1.0).acos())
     assert angles.mean() < 0.5
-    torch.testing.assert_close(scale, colour, rtol=0.03, atol=0.01)
+    torch.testing.assert_close(scale, colour, rtol=0.06, atol=0.02)
     assert error.max() < 0.03
 
 
