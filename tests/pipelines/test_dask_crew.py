@@ -37,6 +37,7 @@ from render.shared.errors import InputError
 
 distributed = pytest.importorskip("distributed")
 LIGHTS = ((0.0, 0.0, 1.0), (0.6, 0.0, 0.8))
+HANGS = 3.0  # seconds, which no other scene takes, however busy the machine
 
 
 def planned(materials: list[list[str]]) -> list[SceneSpec]:
@@ -90,8 +91,8 @@ def rendering(address: str) -> int:
 
 def test_books_and_bytes_are_those_of_a_local_run(tmp_path, address):
     scenes = planned([["ok", "raise", "ok"], ["ok", "hang"], ["die", "ok"], ["ok", "quit"], ["ok"] * 4])
-    here = render_supervised(scenes, tmp_path / "a", RunOptions(workers=2, timeout=0.5), serve=pretend)
-    there = run(scenes, tmp_path / "b", address, timeout=0.5)
+    here = render_supervised(scenes, tmp_path / "a", RunOptions(workers=2, timeout=HANGS), serve=pretend)
+    there = run(scenes, tmp_path / "b", address, timeout=HANGS)
     assert (there.scenes, there.done, len(there.failed)) == (here.scenes, here.done, len(here.failed)) == (13, 9, 4)
     assert files(tmp_path / "a") == files(tmp_path / "b") and failures(tmp_path / "a") == failures(tmp_path / "b")
     assert len(ledger.survey(tmp_path / "b", scenes).lines) == 9  # all in the ledger, once
@@ -99,7 +100,7 @@ def test_books_and_bytes_are_those_of_a_local_run(tmp_path, address):
     assert rendering(address) == 0  # the cluster is left clean
     again = run(scenes, tmp_path / "b", address)
     assert (again.done, again.skipped, again.lines) == (9, 4, [])
-    assert run(scenes, tmp_path / "b", address, timeout=0.5, retry_failed=True).failed[0]["attempt"] == 2
+    assert run(scenes, tmp_path / "b", address, timeout=HANGS, retry_failed=True).failed[0]["attempt"] == 2
 
 
 @pytest.mark.parametrize("name", ["sdps", "fitted materials", "code of the renderer"])
@@ -179,7 +180,7 @@ def test_interrupt_cancels_what_is_out_and_keeps_what_is_back(tmp_path, address,
     with pytest.raises(KeyboardInterrupt):
         run(scenes, tmp_path, address)
     assert set(files(tmp_path)) == {"s0-m0.exr"}
-    end = time.monotonic() + 10
+    end = time.monotonic() + 60
     while rendering(address) and time.monotonic() < end:
         time.sleep(0.2)
     assert rendering(address) == 0
@@ -256,9 +257,9 @@ def test_a_scheduler_that_stays_away_ends_the_run(tmp_path, monkeypatch):
     def lose(ledger: Ledger, line: dict) -> None:
         add(ledger, line)
         stack.close()
+        monkeypatch.setattr(link, "ANSWER", 0.5)  # not before: the first connection may take longer
 
     monkeypatch.setattr(Ledger, "add", lose)
-    monkeypatch.setattr(link, "ANSWER", 0.5)
     with pytest.raises(InputError, match=r"no scheduler for 1 s; .*go on \(\d+ scenes of this run are finished and"):
         run(scenes, tmp_path, address, patience=1.0)
     assert 0 < len(files(tmp_path)) < 16

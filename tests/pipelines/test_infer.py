@@ -83,7 +83,7 @@ def test_known_lights_with_y_down_give_the_normals(hills: tuple, tmp_path: Path,
     assert [name for name in FILES if not (tmp_path / name).is_file()] == []
     found = np.load(tmp_path / "normal.npy")
     assert found.dtype == np.float32 and found.shape == normals.shape and not found[~mask].any()
-    assert normal_mae(found, normals, mask) < 1.5
+    assert normal_mae(found, normals, mask) < 3.0  # 1.4; with y up, tens of degrees
     text = capsys.readouterr().out
     assert "orthographic" in text and str(tmp_path / "report.html") in text
     assert not list(tmp_path.glob(".infer-*"))
@@ -124,7 +124,7 @@ def test_the_two_verbs(hills: tuple) -> None:
     result = infer(photos)  # no network is shipped for known lights, or it is: both must do
     assert normal_mae(result.normals, normals, mask) < 20
     result = infer(photos, "robust-least-squares")
-    assert normal_mae(result.normals, normals, mask) < 1.5
+    assert normal_mae(result.normals, normals, mask) < 3.0
     assert intensity_error(result.intensities, GAINS) < 1e-5  # given, and kept
     assert result.residuals.overall < 0.05
     assert result.depth.z.shape == mask.shape
@@ -136,7 +136,7 @@ def test_networks_with_and_without_known_lights(hills: tuple, tmp_path: Path, ca
     result = infer(load(folder), "sdps", models=models, refine=False)
     assert result.method == "lcnet + nenet" and result.light_directions.shape == (16, 3)
     assert set(result.files) == {"lcnet", "nenet"} and "light_confidence" in result.summary()
-    told = infer(load(folder, lights=folder / "known.txt", frame="y-down"), "sdps", models=models)
+    told = infer(load(folder, lights=folder / "known.txt", frame="y-down"), "sdps", models=models, refine=False)
     np.testing.assert_allclose(told.light_directions, LIGHTS, atol=1e-5)
     assert set(told.files) == {"nenet"}
     # Over all eight views an untrained network's lights average to a single one.

@@ -39,6 +39,7 @@ class Case:
 
     Mirror-like materials need more samples before `path` meets their highlights, and shapes without flat spots: where a
     highlight falls on one, the values of `path` are so rarely drawn that no t-test holds (docs/studies/renderer.md).
+    They also need all repeats of `path`; the others do with half of them.
     """
 
     shape: str
@@ -54,6 +55,10 @@ class Case:
     def seed(self) -> int:
         return CASES.index(self)
 
+    @property
+    def repeats_of_path(self) -> int:
+        return REPEATS if self.spp > 1000 else REPEATS // 2
+
     def __str__(self) -> str:
         words = f"{self.shape} {self.material} {self.bounces} bounces"
         return words + " near lights" * bool(self.near) + " perspective" * bool(self.camera)
@@ -61,15 +66,15 @@ class Case:
 
 NEAR = (2.2, 2.6, 3.4)
 CASES = [
-    Case("bowl", "lambertian:0.9", 2),
+    Case("bowl", "lambertian:0.9", 2, spp=324),  # a density 10 % too high must show
     Case("bowl", "gold-metallic-paint", 2),
     Case("sculpture:5", "white-acrylic", 2),
     Case("sphere", "lambertian:0.8/0.3/0.1", 0),
     Case("sphere", "chrome", 0, 8, 2048),
-    Case("bowl", "steel", 1, 8, 2048),
+    Case("bowl", "steel", 1, 8, 2048, slow=True),
     Case("blobby:8", "nickel", 2, 8, 1024),
-    Case("bowl", "black-obsidian", 1, 8, 2048),
-    Case("bowl", "aluminium", 2, 8, 1024),
+    Case("bowl", "black-obsidian", 1, 8, 2048, slow=True),
+    Case("bowl", "aluminium", 2, 8, 1024, slow=True),
     Case("bowl", "chrome", 1, 8, 2048),
     Case("blobby:4", "white-fabric", 3),
     Case("blobby:5", "blue-acrylic", 1),
@@ -94,7 +99,7 @@ CASES = [
     Case("bowl", "chrome", 1, 8, 2048, near=NEAR, slow=True),
     Case("blobby:8", "nickel", 2, 8, 1024, camera=2.5, near=NEAR, slow=True),
     Case("bowl", "procedural:tiles:5", 2),
-    Case("blobby:4", "procedural:weave:2", 1, spp=576),
+    Case("blobby:4", "procedural:weave:2", 1, spp=900),
     Case("sculpture:4", "procedural:noise:3", 2),
     Case("bowl", "procedural:print:4:gold-metallic-paint+lambertian:0.8", 2),
     Case("bowl", "maps:rough", 2),
@@ -102,6 +107,9 @@ CASES = [
     Case("composition:0", "parts:1:lambertian:0.9+white-acrylic", 2, near=NEAR),
 ]
 load = cache(shapes.load)
+ALSO_EQUAL = 6  # comparisons below that must not be told apart either
+LEVEL = -np.expm1(np.log1p(-FAMILY_SIGNIFICANCE) / (len(CASES) + ALSO_EQUAL))
+"""Sidak once more, over everything that must agree. What differs must lie far below, at 1e-4 or less."""
 
 
 @pytest.fixture(scope="module")
@@ -158,14 +166,14 @@ def ours(
 
 @cache
 def expected(case: Case, name: str) -> np.ndarray:
-    """Render a case with `path`, REPEATS seeds for each light."""
+    """Render a case with `path`, `repeats_of_path` seeds for each light."""
     mesh, view, directions = parts(case)
-    repeated = np.tile(directions, (REPEATS, 1))
+    repeated = np.tile(directions, (case.repeats_of_path, 1))
     shape = None if case.shape == "bowl" else case.shape
     options = {"size": case.size, "spp": case.spp, "bounces": case.bounces, "seed": 1000, "shape": shape}
-    options["distances"] = np.tile(case.near, REPEATS) if case.near else None
+    options["distances"] = np.tile(case.near, case.repeats_of_path) if case.near else None
     stack = np.stack(list(reference.render_each_light(mesh, view, name, repeated, **options)))
-    return stack.mean(-1).reshape(REPEATS, len(directions), *stack.shape[1:3])
+    return stack.mean(-1).reshape(case.repeats_of_path, len(directions), *stack.shape[1:3])
 
 
 def p_value(first: np.ndarray, second: np.ndarray) -> float:
@@ -181,8 +189,7 @@ def p_value(first: np.ndarray, second: np.ndarray) -> float:
 @pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.slow] * case.slow) for case in CASES], ids=str)
 def test_agrees_with_path(case, material):
     name = material(case.material)
-    level = -np.expm1(np.log1p(-FAMILY_SIGNIFICANCE) / len(CASES))  # Sidak once more, over the scenes
-    assert p_value(ours(case, name), expected(case, name)) > level
+    assert p_value(ours(case, name), expected(case, name)) > LEVEL
 
 
 class Changed:
@@ -298,7 +305,7 @@ def test_notices_what_is_wrong_with_near_lights_and_perspective(mutation, monkey
 def test_an_unchanged_family_passes_without_the_fast_path():
     """The general kernel, which tables and bounces take, gives what the one for fitted materials gives."""
     case = CASES[1]
-    assert p_value(ours(case, case.material, change=with_family(Changed)), expected(case, case.material)) > 0.01
+    assert p_value(ours(case, case.material, change=with_family(Changed)), expected(case, case.material)) > LEVEL
 
 
 @pytest.mark.parametrize("case", [CASES[4], CASES[28]], ids=str)
@@ -383,7 +390,7 @@ def test_notices_what_is_wrong_with_a_composition(mutation, monkeypatch):
         monkeypatch.setattr(bounces, "_FULL", 0.5)  # or few would end: nine tenths of the light go on here
         unweighted = partial(without_weight, real=bounces.roulette)
         weighted = ours(COMPOSED, name, scene_parts=(mesh, view, directions))
-        assert p_value(weighted, expected(COMPOSED, COMPOSED.material)) > 0.01
+        assert p_value(weighted, expected(COMPOSED, COMPOSED.material)) > LEVEL
         monkeypatch.setattr(bounces, "roulette", unweighted)
     if mutation == "strangers share shadows":
         monkeypatch.setattr(visibility, "cells", shuffled)
@@ -396,9 +403,9 @@ def test_surfaces_with_relief_share_rays_with_others():
     """Frames of their own change no expectation: a textured surface beside a plain one and another textured one."""
     case = TEXTURED
     others = ("gold-metallic-paint", "procedural:wood:1", "lambertian:0.9")
-    assert p_value(ours(case, case.material, extra=others), expected(case, case.material)) > 0.01
+    assert p_value(ours(case, case.material, extra=others), expected(case, case.material)) > LEVEL
     plain = ours(CASES[0], "lambertian:0.9", extra=("procedural:wood:1", "gold-metallic-paint"))
-    assert p_value(plain, expected(CASES[0], "lambertian:0.9")) > 0.01
+    assert p_value(plain, expected(CASES[0], "lambertian:0.9")) > LEVEL
 
 
 @pytest.mark.parametrize("index", [0, 1])
@@ -406,4 +413,4 @@ def test_sharing_rays_does_not_change_the_expectation(index):
     """Two materials on one view: each has the image it has alone, though bounces are drawn from both."""
     case, name = CASES[0], ("lambertian:0.9", "gold-metallic-paint")[index]
     both = ours(case, "lambertian:0.9", index=index, extra=("gold-metallic-paint",))
-    assert p_value(both, expected(case, name)) > 0.01
+    assert p_value(both, expected(case, name)) > LEVEL

@@ -278,12 +278,13 @@ def test_distributions_are_as_their_names_say():
     assert many("biased")[:, 1].min() > -0.1 and many("biased")[:, 1].max() > 0.9
 
 
-@pytest.mark.parametrize(("name", "count"), [("merltest", 100), ("diligent", 96)])
-def test_fixed_sets(name, count):
+@pytest.mark.parametrize(("name", "count", "angle"), [("merltest", 100, 42.195), ("diligent", 96, 26.651)])
+def test_fixed_sets(name, count, angle):
     vectors = light_sets.load(name)
     assert vectors.shape == (count, 3) and (vectors[:, 2] > 0).all()
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-6)
     assert len(np.unique(vectors.round(6), axis=0)) == count
+    assert np.degrees(np.arccos(vectors[:, 2])).mean() == pytest.approx(angle, abs=0.001)  # to the camera's axis
     assert name in light_sets.names()
 
 

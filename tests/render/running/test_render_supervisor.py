@@ -86,12 +86,12 @@ def test_what_a_crew_waits_for_is_told_once_and_taken_back(tmp_path, capsys):
 def test_failing_hanging_and_dying_scenes_cost_only_themselves(tmp_path):
     scenes = planned([["ok", "raise", "ok"], ["ok", "hang"], ["die", "ok"], ["ok", "quit"]])
     (tmp_path / "shards").mkdir()
-    summary = run(scenes, tmp_path, timeout=0.5)
+    summary = run(scenes, tmp_path, timeout=3)  # which no other scene takes, however busy the machine
     assert (summary.scenes, summary.done, len(summary.failed), summary.skipped) == (9, 5, 4, 0)
     assert files(tmp_path) == {f"{scene.id}.exr" for scene in scenes if scene.material == "ok"}
     lines = {line["material"]: line for line in failures(tmp_path)}
     assert lines["raise"]["reason"] == "ValueError: no" and "Traceback" in lines["raise"]["traceback"]
-    assert lines["hang"]["reason"] == "timed out after 0.5 s"
+    assert lines["hang"]["reason"] == "timed out after 3 s"
     assert "in pretend" in lines["hang"]["traceback"]  # the fault handler tells where it hung
     assert lines["die"]["reason"] == "worker died, signal 11"
     assert lines["quit"]["reason"] == "worker died, exit code 3"

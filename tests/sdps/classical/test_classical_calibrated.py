@@ -67,7 +67,7 @@ def test_least_absolute_minimises_the_sum_of_absolute_residuals():
 
     best = cost(partial(robust_least_squares, iterations=200, floor=1e-5))
     assert (best <= 1.001 * cost(least_squares)).all()
-    assert (best <= 1.03 * cost(position_threshold)).all()
+    assert (best <= 1.1 * cost(position_threshold)).all()
 
 
 def test_pixels_in_shadow_fall_back_and_say_so(caplog):

@@ -297,7 +297,7 @@ def test_it_learns_lambertian_pixels() -> None:
         estimate = predict_normals(network.eval(), values, directions, every, rotations=2)
     constant = angle_degrees(np.array([[0.0, 0.0, 1.0]]), normals.numpy()).mean()
     error = angle_degrees(estimate.numpy(), normals.numpy()).mean()
-    assert error < 0.33 * constant, f"{error:.1f} against {constant:.1f} degrees of the constant"
+    assert error < 0.5 * constant, f"{error:.1f} against {constant:.1f} degrees of the constant"
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Refinement: the fused term against the plain one, recovery of lights and normals, ambiguity, damage."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -16,7 +18,7 @@ from sdps.refinement.modes import MODES
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.refined import Refined
 
-QUICK = RefineConfig(coarse_pixels=700, iterations=600, fine_iterations=0)
+QUICK = RefineConfig(coarse_pixels=700, iterations=600, bounces=0, fine_iterations=0)  # nothing here shades itself
 
 
 def bumpy(side: int = 64) -> tuple[np.ndarray, np.ndarray]:
@@ -107,19 +109,23 @@ def test_lights_and_normals_ten_degrees_off_are_found(gloss: float) -> None:
     start = turned(normals, 10.0, seed=2) * mask[..., None]
     found = refine(images, mask, start, turned(lights, 10.0, seed=3), np.ones(40), config=QUICK)
     of_normals, of_lights = errors(found, normals, mask, lights)
-    assert of_normals < 2.0 and of_lights < 2.0
+    assert of_normals < 3.0 and of_lights < 3.0  # over seeds, up to 1.9 and 1.4
     share = found.intensities.mean(axis=1) / intensities
     assert np.std(share) / np.mean(share) < 0.03
 
 
-def test_a_bas_relief_transform_of_a_glossy_object_is_undone() -> None:
+def test_a_bas_relief_transform_is_undone_by_gloss_alone() -> None:
+    """A matte object looks the same before and after, so what is left of the error there is the yardstick."""
     normals, mask = bumpy()
-    images, lights, intensities = lit(normals, 40, seed=1, gloss=1.0)
-    bent, moved = bas_relief(normals, lights, mask)
-    before = float(angle_degrees(bent[mask], normals[mask]).mean())
-    found = refine(images, mask, bent, moved, intensities, config=QUICK)
-    after, of_lights = errors(found, normals, mask, lights)
-    assert before > 4.0 and after < 0.45 * before and of_lights < 3.2
+    left = []
+    for gloss in (1.0, 0.0):
+        images, lights, intensities = lit(normals, 40, seed=1, gloss=gloss)
+        bent, moved = bas_relief(normals, lights, mask)
+        found = refine(images, mask, bent, moved, intensities, config=QUICK)
+        before = np.array([angle_degrees(bent[mask], normals[mask]).mean(), angle_degrees(moved, lights).mean()])
+        left.append(np.array(errors(found, normals, mask, lights)) / before)
+    # Over seeds: normals 0.32 to 0.57 and lights 0.30 to 0.50 if glossy, normals 0.97 to 1.02 if matte.
+    assert left[0].max() < 0.75 and left[1][0] > 0.85, left
 
 
 def test_given_directions_stay_and_intensities_are_found() -> None:
@@ -142,7 +148,7 @@ def test_a_corrupted_image_among_good_ones_does_not_matter_and_is_told() -> None
     found = refine(images, mask, start, turned(lights, 8.0, seed=3), np.ones(24), config=QUICK)
     good, begun = np.arange(24) != 7, turned(lights, 8.0, seed=3)
     without = refine(images[good], mask, start, begun[good], np.ones(23), config=QUICK)
-    assert float(angle_degrees(found.normals[mask], without.normals[mask]).mean()) < 1.2
+    assert float(angle_degrees(found.normals[mask], without.normals[mask]).mean()) < 2.0  # 0.8 to 1.1
     assert found.image_residual.argmax() == 7
 
 
@@ -155,7 +161,7 @@ def test_the_same_twice() -> None:
     assert np.array_equal(first.light_directions, second.light_directions)
 
 
-def test_every_pixel_is_no_worse_than_the_coarse_grid() -> None:
+def test_every_pixel_is_better_than_the_coarse_grid() -> None:
     normals, mask = bumpy(96)
     images, lights, _ = lit(normals, 24, seed=7, gloss=0.5)
     start, begun = turned(normals, 8.0, seed=2) * mask[..., None], turned(lights, 8.0, seed=3)
@@ -166,9 +172,9 @@ def test_every_pixel_is_no_worse_than_the_coarse_grid() -> None:
         start,
         begun,
         np.ones(24),
-        config=RefineConfig(coarse_pixels=700, iterations=600, fine_iterations=120),
+        config=replace(QUICK, fine_iterations=120),
     )
-    assert errors(fine, normals, mask, lights)[0] < errors(coarse, normals, mask, lights)[0] + 0.05
+    assert errors(fine, normals, mask, lights)[0] < errors(coarse, normals, mask, lights)[0]  # 0.05 and 0.25
 
 
 @pytest.mark.parametrize(
@@ -195,7 +201,7 @@ def test_what_cannot_be_refined_is_refused_in_one_line(change: dict, message: st
 def test_any_method_that_gives_normals_is_refined_by_its_name() -> None:
     method = parse("true+least-squares+refine", pretrained.require)
     assert method.refined and method.name == "least-squares, true lights, refined"
-    normals, mask = bumpy()
+    normals, mask = bumpy(40)
     images, lights, intensities = lit(normals, 16, seed=8, gloss=1.0)
     estimate = Runner(method, pretrained.require).estimate(images, mask, lights, intensities)
     start = estimate.diagnostics["start"]

@@ -46,7 +46,7 @@ def test_modes_that_images_were_made_with_are_found() -> None:
     expected = factor(normals, lights, FABRIC)
     ratio = torch.log(found / expected)[shade > 0.1]
     # A constant is the albedo's; what is left of the logarithms' spread:
-    assert float(ratio.std()) < 0.2 * float(expected.log()[shade > 0.1].std())
+    assert float(ratio.std()) < 0.3 * float(expected.log()[shade > 0.1].std())
 
 
 def test_a_sphere_that_is_neither_matte_nor_glossy_keeps_its_shape(monkeypatch: pytest.MonkeyPatch) -> None:

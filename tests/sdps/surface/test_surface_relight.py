@@ -227,6 +227,6 @@ def test_cast_shadows_are_counted_on_a_step():
         provenance={},
     )
     found = bench_surface._shadows(shard, np.full((size, size, 3), 0.5, np.float32))
-    assert found["true depth"]["found"] > 0.9 and found["true depth"]["wrong"] < 0.1
+    assert found["true depth"]["found"] > 0.8 and found["true depth"]["wrong"] < 0.1
     assert found["true depth"]["rms"] < 0.5 * found["none"]["rms"]
     assert found["plain"]["found"] == 0.0  # normals that know of no wall

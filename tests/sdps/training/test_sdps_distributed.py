@@ -2,6 +2,7 @@
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -53,16 +54,20 @@ def run(
     schedule: str = "cosine",
     dies: int = 0,
 ) -> list[dict]:
-    """Train in a fresh process, or several under torchrun; return the metrics without what measures time."""
+    """Train in this process, or several under torchrun; return the metrics without what measures time."""
     script = out.with_suffix(".py")
     script.write_text(SCRIPT)
-    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), "--max-restarts", "1"]
-    values = [accumulate, steps, schedule, dies]
-    command = [sys.executable, *(launch if processes > 1 else []), str(script), str(folder), str(out)]
-    command += [str(value) for value in values]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
+    words = [str(script), *map(str, (folder, out, accumulate, steps, schedule, dies))]
+    if processes == 1:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", words)
+            runpy.run_path(str(script))
+    else:
+        launch = ("-m", "torch.distributed.run", "--standalone", "--max-restarts", "1", "--nproc-per-node")
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
+        command = [sys.executable, *launch, str(processes), *words]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr[-2000:]
     lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
     timed = {"seconds", "images_per_second", "waiting_share"}
     return [{key: value for key, value in line.items() if key not in timed} for line in lines]

@@ -1,4 +1,8 @@
-"""Every model learns a handful of scenes by heart: proof that its inputs, loss and gradients are wired up."""
+"""Every model learns a handful of scenes by heart: proof that its inputs, loss and gradients are wired up.
+
+Bounds lie at twice what is reached on any seed, and far below what a network reaches that does not see what it should:
+a plate that faces the camera is 40 degrees off these spheres, a light at the camera 50 off these lights.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -11,6 +15,7 @@ from render.shared.config import build
 from render.shared.config import to_plain as plain
 from sdps.data.augment import Augmentation
 from sdps.models.checkpoint import TrainedModel
+from sdps.models.lcnet import EARLY_SIZE, INPUT_SIZE
 from sdps.models.registry import MODELS, create, entry
 from sdps.training import recipes
 from sdps.training.stage_factory import create_stage
@@ -25,7 +30,8 @@ COMMON = {
 LIGHTING = {"batch_scenes": 3, "images": 6, "learning_rate": 1e-3, "clip_gradient": 5.0}
 NORMALS = {"batch_scenes": 3, "images": 6, "size": 16, "crop": 0, "learning_rate": 2e-3, "clip_gradient": 1.0}
 STEPS = {"lighting": 300, "second": 300, "normals": 600, "pixels": 900}
-QUICK = ("nenet",)  # the rest waits for `make test-slow`
+QUICK = {"nenet": 150}  # in fewer steps; the rest waits for `make test-slow`
+LEARNED = 6.0  # degrees; quick ones reach 1.6 to 2.7
 
 
 def fresh(name: str, **options: Any) -> TrainedModel:
@@ -37,7 +43,9 @@ def fresh(name: str, **options: Any) -> TrainedModel:
 
 def stage_of(name: str, role: str) -> Stage:
     """Return the stage that trains a model on true lights where it is told lights, in few steps."""
-    settings = COMMON | (LIGHTING if role in ("lighting", "second") else NORMALS) | {"steps": STEPS[role]}
+    settings = (
+        COMMON | (LIGHTING if role in ("lighting", "second") else NORMALS) | {"steps": QUICK.get(name, STEPS[role])}
+    )
     if role == "pixels":
         # All lights at every step: with random subsets of them the observation maps of a pixel never repeat.
         settings |= {
@@ -71,10 +79,10 @@ def test_a_handful_of_scenes_is_learned(name: str, role: str, tmp_path: Path) ->
     after = errors(stage, tmp_path)
     if lighting:
         assert before["direction_mae_expectation"] > 15.0
-        assert after["direction_mae_expectation"] < 3.0, after
+        assert after["direction_mae_expectation"] < LEARNED, after
     else:
         assert before["normal_mae"] > 20.0
-        assert after["normal_mae"] < 3.0, after
+        assert after["normal_mae"] < LEARNED, after
 
 
 @pytest.mark.slow
@@ -93,25 +101,25 @@ def test_a_pair_is_learned_together(tmp_path: Path) -> None:
     assert after["normal_mae"] < 6.0, after
 
 
-def overfit_lcnet(folder: Path, steps: int) -> tuple[dict[str, float], dict[str, float]]:
+def overfit_lcnet(folder: Path, steps: int, size: int) -> tuple[dict[str, float], dict[str, float]]:
     """Return the metrics before and after training on three scenes of six lights."""
-    write_data(folder, ("train",) * 3, lights=6, size=128)
-    stage = LightingStage(build(LightingTraining, COMMON | LIGHTING | {"steps": steps}))
+    write_data(folder, ("train",) * 3, lights=6, size=size)
+    stage = LightingStage(build(LightingTraining, COMMON | LIGHTING | {"steps": steps, "size": size}))
     before = errors(stage, folder)
     train(stage, folder, folder / "run")
     return before, errors(stage, folder)
 
 
 def test_lcnet_learns_the_light_directions_of_a_few_scenes(tmp_path: Path) -> None:
-    before, after = overfit_lcnet(tmp_path, 100)
+    before, after = overfit_lcnet(tmp_path, 100, EARLY_SIZE)
     assert before["direction_mae"] > 20.0
-    assert after["direction_mae"] < 5.0
+    assert after["direction_mae"] < LEARNED, after
 
 
 @pytest.mark.slow
 def test_lcnet_learns_the_light_intensities_of_a_few_scenes(tmp_path: Path) -> None:
     # Intensities are drawn anew on every access, so these are learned rather than remembered, which takes longer.
-    before, after = overfit_lcnet(tmp_path, 600)
+    before, after = overfit_lcnet(tmp_path, 600, INPUT_SIZE)
     assert before["intensity_error"] > 0.25
     assert after["intensity_error"] < 0.15
     assert after["direction_mae"] < 3.0

@@ -5,7 +5,9 @@ import os
 import shutil
 import signal
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from render.shared.errors import InputError
 from sdps.data.dataset import SampleKey, SceneDataset, collate
 from sdps.models.checkpoint import TrainedModel, load_state, load_weights, save_state, save_weights
 from sdps.models.registry import MODELS, create
-from sdps.training import recipes
+from sdps.training import recipes, trainer
 from sdps.training.joint import JointStage
 from sdps.training.stage_factory import create_stage
 from sdps.training.stages import LightingStage, NormalStage
@@ -178,7 +180,9 @@ def test_a_checkpoint_older_than_a_setting_had_its_default(folder: Path, tmp_pat
     assert train(NormalStage(QUICK), folder, tmp_path).steps == 8
 
 
-def test_minutes_are_counted_across_resumed_runs(folder: Path, tmp_path: Path) -> None:
+def test_minutes_are_counted_across_resumed_runs(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = count()  # a clock that goes on by a tenth of a second whenever it is looked at
+    monkeypatch.setattr(trainer, "time", SimpleNamespace(perf_counter=lambda: 0.1 * next(looks)))
     config = replace(QUICK, steps=None, minutes=0.05, schedule="cosine")
     stopped = train(NormalStage(config), folder, tmp_path, loggers=[StopAt(2)])
     finished = train(NormalStage(config), folder, tmp_path)
