@@ -81,7 +81,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:
-    """Read the photographs, say what was found about them, and run the method; also return how many findings were said."""
+    """Read the photographs, say what was found about them, and run the method; also return how many were said."""
     from sdps.api import check_out, infer, load, plan
     from sdps.inference.inference_config import inference_config
     from sdps.photos import check

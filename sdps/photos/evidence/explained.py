@@ -94,9 +94,9 @@ def _propose(part: np.ndarray, fields: np.ndarray) -> tuple[int, int] | None:
         return None
     shifts = np.array(_square((0, 0), _REACH))
     best, telling = tiles.best(part, fields, shifts)
-    counts = np.zeros((2 * _REACH + 1, 2 * _REACH + 1), np.float32)
-    np.add.at(counts, tuple((best[telling] + _REACH).T), 1)
-    counts = cv2.boxFilter(counts, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    cast = np.zeros((2 * _REACH + 1, 2 * _REACH + 1), np.float32)
+    np.add.at(cast, tuple((best[telling] + _REACH).T), 1)
+    counts = np.asarray(cv2.boxFilter(cast, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
     counts[_REACH - 1 : _REACH + 2, _REACH - 1 : _REACH + 2] = 0
     if counts.max() < max(2, 0.1 * np.count_nonzero(telling)):
         return None
@@ -127,10 +127,10 @@ def _poll(part: np.ndarray, fields: np.ndarray, place: tuple[int, int], *, brack
     if bracketed:
         free &= np.abs(best - place).max(1) < _AROUND
     near = [free & (np.abs(best - shift).max(1) <= 1) for shift in _square(place, 2)]
-    counts = [np.count_nonzero(one) if np.hypot(*shift) >= _SHORTEST else 0
+    counts = [int(np.count_nonzero(one)) if np.hypot(*shift) >= _SHORTEST else 0
               for one, shift in zip(near, _square(place, 2), strict=True)]  # fmt: skip
     most = int(np.argmax(counts))
-    against, voters = np.count_nonzero(still & telling), np.count_nonzero(telling)
+    against, voters = int(np.count_nonzero(still & telling)), int(np.count_nonzero(telling))
     if not counts[most]:
         return Votes(*place, 0, against, voters)
     rows, columns = np.rint(np.median(best[near[most]], axis=0)).astype(int).tolist()
@@ -158,8 +158,8 @@ class _Tiles:
             moved = window[corner[0] + shifts[:, 0], corner[1] + shifts[:, 1]].reshape(len(shifts), -1)
             weights = moved @ basis
             left[number] = np.einsum("sp,sp->s", moved, moved) - np.einsum("sk,sk->s", weights, weights)
-        left = np.maximum(left, 0) / self._side**2 + _NOISE**2
-        return shifts[left.argmin(1)], np.median(left, axis=1) > _TELLING * left.min(1)
+        spread = np.maximum(left, 0) / self._side**2 + _NOISE**2
+        return shifts[spread.argmin(1)], np.median(spread, axis=1) > _TELLING * spread.min(1)
 
     def _bases(self, fields: np.ndarray) -> np.ndarray:  # (T, p, k)
         """Return orthonormal bases of what the fields (M, h, w) show in the tiles, zero where there is only noise."""
