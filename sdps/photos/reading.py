@@ -150,8 +150,7 @@ def load(
         folder=folder, files=seen.files, shape=seen.mask.shape, bits=seen.coding.bits, gamma=seen.gamma,
         mask=seen.mask, mask_origin=seen.origin, light_directions=known.directions, intensities=known.intensities,
         lights_name=known.name, lights_frame=known.frame, notes=(*listing.notes, *seen.notes, *known.notes),
-        coding=seen.coding, orientation=seen.orientation,
-        overridden=tuple(doubts.overridden), scale=scale,
+        coding=seen.coding, orientation=seen.orientation, overridden=tuple(doubts.overridden), scale=scale,
     )  # fmt: skip
     if photos.mask_origin == "automatic" and photos.mask.all():
         _LOG.warning("%s", next(note for note in photos.notes if "whole frame" in note))

@@ -189,7 +189,7 @@ def test_folders_and_methods_that_do_not_fit_are_one_line(hills: tuple, tmp_path
     assert "no such weights" in fails(capsys, folder, "--method", "lcnet-reg+nenet", "--models", tmp_path, "--out", out)
     assert "--self-test" in fails(capsys, "--out", out)
     (tmp_path / "file").write_text("")
-    flags = ["--lights", folder / "known.txt", "--method", "least-squares"]
+    flags = ["--lights", folder / "known.txt", "--frame", "y-down", "--method", "least-squares"]
     assert "cannot be written" in fails(capsys, folder, *flags, "--out", tmp_path / "file" / "x")
     assert not out.exists()
 

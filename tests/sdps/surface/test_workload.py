@@ -44,7 +44,7 @@ def test_one_line_says_pixels_pictures_minutes_and_memory(photos: Photographs) -
 @pytest.mark.parametrize("method", ["sdps-frames", "sdps-frames+refine", "sdps", "lcnet+robust-least-squares"])
 @pytest.mark.parametrize(("height", "width", "count"), [(4000, 6000, 100), (4000, 6000, 8), (3000, 4000, 1000)])
 def test_any_ordinary_camera_fits(photos: Photographs, method: str, height: int, width: int, count: int) -> None:
-    runner = _runner(method, False, None, None, None)
+    runner = _runner(method, (False, False), None, None, None)
     found = workload(larger(photos, height, width, count), runner)
     assert found.gib <= LIMIT
     found.check()
