@@ -92,6 +92,7 @@ def judge(still: Still) -> Iterator[dict]:
     part = parts[int(rng.choice(many))]
     few = rng.permutation(len(part))[: max(1, len(part) // 4)]
     yield _row(still, "a quarter, each by 4 pixels its own way", part, {int(k): _step(rng, 4) for k in few})
+    yield _row(still, "all, each its own way", part, {k: _step(rng, 5) for k in range(len(part))})
     for size in set(parts) & {4, 6}:
         yield _row(still, f"one of {size} by 4 pixels", parts[size], {int(rng.integers(size)): _step(rng, 4)})
 

@@ -21,6 +21,7 @@ note: worth knowing.
 _FEWEST, _FEW = 3, 8
 _SATURATED = 0.02
 _MANY_SATURATED = 0.5
+_SHARED = 3  # pictures with one highest value
 _BLACK, _DARK = 0.01, 0.05
 _NOTHING = 1e-3  # of full scale: a quarter of a code of 8 linear bits
 _SAME, _ALIKE = 0.02, 0.1
@@ -96,8 +97,19 @@ def _brightness(photos: Photographs, measures: Measures) -> Iterator[Finding]:
 
 
 def _saturation(photos: Photographs, measures: Measures) -> Iterator[Finding]:
+    clipped = _clipped(photos, measures)
+    if clipped.any():
+        names = _named(photos, clipped)
+        yield Finding(
+            "warning",
+            f"Clipped before it was saved: up to {measures.topped[clipped].max():.0%} of the object has one highest "
+            f"value, {measures.tops.max():.4g}, in {_pictures(names)}. Expose less, or develop the pictures without "
+            "cutting off the bright end.",
+            names,
+        )
     if photos.coding.floating:
-        yield Finding("note", "Floating-point files have no full scale, so overexposure was not looked for.")
+        if not clipped.any():
+            yield Finding("note", "Floating-point files have no full scale; nothing else looks overexposed.")
         return
     ruined = measures.saturated > _MANY_SATURATED
     much = (measures.saturated > _SATURATED) & ~ruined
@@ -111,6 +123,18 @@ def _saturation(photos: Photographs, measures: Measures) -> Iterator[Finding]:
                 "highlights of a glossy object may clip, the rest must not.",
                 names,
             )
+
+
+def _clipped(photos: Photographs, measures: Measures) -> np.ndarray:  # (L,) bool
+    """Find pictures that share a highest value, on many pixels, below full scale.
+
+    Values of 8 bits repeat by chance, and so do all pixels of a flat object that was computed.
+    """
+    if photos.coding.bits == 8 or measures.tops.max() >= photos.saturation:
+        return np.zeros(len(photos), bool)
+    much = (measures.topped > _SATURATED) & (measures.topped < _MANY_SATURATED)
+    clipped = much & np.isclose(measures.tops, measures.tops.max(), rtol=1e-6)
+    return clipped if clipped.sum() >= _SHARED else np.zeros_like(clipped)
 
 
 def _movement(photos: Photographs, measures: Measures) -> Iterator[Finding]:
@@ -222,9 +246,8 @@ def _colour(photos: Photographs, measures: Measures) -> Iterator[Finding]:
 
 def _camera(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     for name in ("exposure time", "aperture", "ISO", "focal length"):
-        told = [settings.get(name) for settings in measures.settings]
-        values = [value for value in told if value is not None]
-        if len(values) < len(told) or len({round(value, 6) for value in values}) == 1:
+        values = [settings[name] for settings in measures.settings if name in settings]
+        if not values or max(values) - min(values) <= 1e-3 * max(values):
             continue
         level = "warning" if name == "focal length" else "note"
         effect = (

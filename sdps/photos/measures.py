@@ -36,6 +36,8 @@ class Measures:
         peaks: (L,) its maximum.
         outside: Mean brightness outside the mask over that inside; 0 where the mask is the frame.
         saturated: (L,) share of the pixels with a channel at full scale.
+        tops: (L,) the highest value of a channel.
+        topped: (L,) share of the pixels with a channel at it.
         casts: (L,) change of the light's colour, see `colour_casts`.
         digests: (L,) of the brightness of all pixels.
         settings: (L,) what the camera wrote about its exposure, by name.
@@ -48,6 +50,8 @@ class Measures:
     peaks: np.ndarray
     outside: float
     saturated: np.ndarray
+    tops: np.ndarray
+    topped: np.ndarray
     casts: np.ndarray
     digests: list[bytes]
     settings: list[dict[str, float]]
@@ -65,7 +69,7 @@ def measure(photos: Photographs) -> Measures:
     pixels = np.flatnonzero(photos.mask)
     sample = pixels[np.unique(np.linspace(0, len(pixels) - 1, _PIXELS).round().astype(int))]
     observations = np.empty((count, len(sample), 3), np.float32)
-    levels, peaks, saturated, outside = np.empty(count), np.empty(count), np.empty(count), np.zeros(count)
+    levels, peaks, saturated, tops, topped, outside = np.zeros((6, count))
     digests, settings, shifts, blocks = [], [], [], []
     tracker = Tracker(photos.mask)
     for number in progress_bar(range(count), desc="checking", unit="picture", delay=5):
@@ -78,8 +82,9 @@ def measure(photos: Photographs) -> Measures:
         blocks.append(block_means(grey))
         observations[number] = image.reshape(-1, 3)[sample]
         inside, bright = image[photos.mask], grey[photos.mask]  # (Q, 3), (Q,)
-        full = (inside >= photos.saturation).any(-1)
-        saturated[number], levels[number], peaks[number] = full.mean(), np.percentile(bright, 95), bright.max()
+        highest = inside.max(-1)
+        levels[number], peaks[number], tops[number] = np.percentile(bright, 95), bright.max(), highest.max()
+        saturated[number], topped[number] = (highest >= photos.saturation).mean(), (highest >= tops[number]).mean()
         if len(pixels) < grey.size:
             rest = (grey.sum(dtype=np.float64) - bright.sum(dtype=np.float64)) / (grey.size - len(pixels))
             outside[number] = rest / max(float(bright.mean()), 1e-6)
@@ -87,8 +92,9 @@ def measure(photos: Photographs) -> Measures:
     casts = _casts(photos, observations)
     dimming = fall_off(np.stack(blocks), photos.shape) if photos.mask.mean() >= _WHOLE else FallOff()
     return Measures(
-        observations, levels, peaks, float(np.median(outside)), saturated, casts, digests, settings, moved, dimming
-    )
+        observations, levels, peaks, float(np.median(outside)), saturated, tops, topped, casts, digests, settings,
+        moved, dimming,
+    )  # fmt: skip
 
 
 def _casts(photos: Photographs, observations: np.ndarray) -> np.ndarray:  # (L,)

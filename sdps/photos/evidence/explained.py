@@ -152,24 +152,24 @@ class _Tiles:
 
     def best(self, part: np.ndarray, fields: np.ndarray, shifts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the best of the shifts (S, 2) for every tile, (T, 2), and which tiles can tell, (T,) bool."""
-        window = np.lib.stride_tricks.sliding_window_view(part, (self._side, self._side))
+        side = (self._side, self._side)
+        window = np.lib.stride_tricks.sliding_window_view(part, side)
+        seen = np.lib.stride_tricks.sliding_window_view(fields, side, axis=(1, 2))
         left = np.empty((len(self), len(shifts)), np.float32)
-        for number, (corner, basis) in enumerate(zip(self._corners, self._bases(fields), strict=True)):
-            moved = window[corner[0] + shifts[:, 0], corner[1] + shifts[:, 1]].reshape(len(shifts), -1)
-            weights = moved @ basis
+        for number, (row, column) in enumerate(self._corners):
+            moved = window[row + shifts[:, 0], column + shifts[:, 1]].reshape(len(shifts), -1)
+            weights = moved @ _basis(seen[:, row, column].reshape(len(fields), -1))
             left[number] = np.einsum("sp,sp->s", moved, moved) - np.einsum("sk,sk->s", weights, weights)
         spread = np.maximum(left, 0) / self._side**2 + _NOISE**2
         return shifts[spread.argmin(1)], np.median(spread, axis=1) > _TELLING * spread.min(1)
 
-    def _bases(self, fields: np.ndarray) -> np.ndarray:  # (T, p, k)
-        """Return orthonormal bases of what the fields (M, h, w) show in the tiles, zero where there is only noise."""
-        window = np.lib.stride_tricks.sliding_window_view(fields, (self._side, self._side), axis=(1, 2))
-        seen = np.stack([window[:, row, column].reshape(len(fields), -1) for row, column in self._corners])
-        values, vectors = np.linalg.eigh(seen @ seen.transpose(0, 2, 1))
-        values, vectors = values[:, ::-1][:, :_RANK], vectors[..., ::-1][..., :_RANK]
-        good = (values > _NOISE**2 * self._side**2) & (values > 1e-5 * values[:, :1])
-        scaled = vectors * (good / np.sqrt(np.maximum(values, 1e-12)))[:, None]
-        return seen.transpose(0, 2, 1) @ scaled
+
+def _basis(seen: np.ndarray) -> np.ndarray:  # (p, k)
+    """Return an orthonormal basis of the rows of (M, p), zero where there is only noise."""
+    values, vectors = np.linalg.eigh(seen @ seen.T)
+    values, vectors = values[::-1][:_RANK], vectors[:, ::-1][:, :_RANK]
+    good = (values > _NOISE**2 * seen.shape[1]) & (values > 1e-5 * values[0])
+    return seen.T @ (vectors * (good / np.sqrt(np.maximum(values, 1e-12))))
 
 
 def _square(middle: tuple[int, int], reach: int) -> list[tuple[int, int]]:

@@ -237,7 +237,8 @@ def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np
 
     All that still look moved are taken out first, then each is measured against the rest: images that moved together
     would speak for each other. Where the rest are few, what they do not convict goes back, and whoever is left is
-    measured once more.
+    measured once more. Of a camera held in the hand nothing is left as a rest, and the first look stands, in which
+    every image was laid on the others as they lie.
 
     Args:
         tracker: Has taken in all images.
@@ -247,6 +248,8 @@ def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np
     Returns:
         A shift per image, of zero length unless it moved.
     """
+    if _wanders(shifts):
+        return list(shifts)
     apart = []
     for number in tracker.suspects:
         if len(tracker) <= START:
@@ -264,6 +267,13 @@ def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np
                 tracker.take(number, tracker.view(image(number)), Shift())
         found = _believed(tracker, list(found), image)
     return [found.get(number, Shift()) for number in range(len(shifts))]
+
+
+def _wanders(shifts: list[Shift]) -> bool:
+    """Whether most images moved, each to a place of its own."""
+    places = np.array([(shift.rows, shift.columns) for shift in shifts if shift.length])
+    lengths = np.hypot(*places.T) if len(places) else np.zeros(0)
+    return len(places) > len(shifts) / 2 and bool(places.std(0).max() > 0.25 * lengths.mean())
 
 
 def _believed(tracker: Tracker, numbers: list[int], image: Callable[[int], np.ndarray]) -> dict[int, Shift]:

@@ -117,6 +117,21 @@ def test_saturated_and_black_pictures_are_named(tmp_path: Path, bits: int) -> No
     )
 
 
+@pytest.mark.parametrize("suffix", [".exr", ".png"])
+def test_values_cut_off_below_full_scale(tmp_path: Path, suffix: str) -> None:
+    """EXR files made of 8-bit ones, and RAW developed with the white level too low, look in range."""
+    images, mask = folders.matte(AROUND)
+    assert not said(findings(tmp_path / "good", images * 0.9, mask, suffix=suffix), "Clipped")
+    found = said(findings(tmp_path / "cut", np.minimum(1.5 * images, 0.8), mask, suffix=suffix), "Clipped")
+    assert found[0].level == "warning" and len(found[0].images) >= 3
+
+
+def test_a_computed_flat_object_is_not_clipped(tmp_path: Path) -> None:
+    flat = np.tile(0.7 * AROUND[:, 2, None, None, None], (1, 40, 40, 3)).astype(np.float32)
+    flat[:, :, :20] *= 0.4
+    assert not said(findings(tmp_path, flat, np.ones((40, 40), bool), suffix=".exr"), "Clipped")
+
+
 def test_dark_and_black_folders(tmp_path: Path) -> None:
     images, mask = folders.matte(AROUND)
     assert said(findings(tmp_path / "dim", images * 0.04, mask), "very dark")
@@ -274,6 +289,9 @@ def test_what_the_camera_changed(tmp_path: Path) -> None:
     assert said(found, "exposure time")[0].level == "note"
     assert said(found, "focal length")[0].level == "warning"
     assert not said(found, "ISO")
+    Image.fromarray(coded[5]).save(tmp_path / "5.jpg", quality=95)  # without a header: the others tell all the same
+    found = photos.check(photos.load(tmp_path))
+    assert said(found, "exposure time") and said(found, "focal length") and not said(found, "ISO")
 
 
 def test_suspicious_gamma(tmp_path: Path) -> None:

@@ -57,6 +57,13 @@ def test_a_knock_in_the_middle_of_a_relief() -> None:
     assert set(moved(knocked)) == set(range(7, 12))
 
 
+def test_a_camera_held_in_the_hand_before_a_relief() -> None:
+    frame = folders.plate(AROUND, distance=3.0, shape=(116, 148)).mean(-1)
+    steps = np.random.default_rng(5).integers(-6, 7, (len(frame), 2))
+    series = [image[8 - r : 108 - r, 8 - c : 140 - c] for image, (r, c) in zip(frame, steps, strict=True)]
+    assert len(moved(np.stack(series))) > 6
+
+
 def test_few_pictures_of_a_smooth_glossy_object_are_no_movement() -> None:
     """Nothing of it stays in its place but the outline, of which each picture shows another half."""
     normals, mask = scenes.sphere(72)
