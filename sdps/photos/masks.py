@@ -160,7 +160,7 @@ def _ground_is_lit(variation: Variation, mask: np.ndarray, above: np.ndarray) ->
     follows, bright = (
         float(np.median(field[outside]) / max(float(np.median(field[mask])), 1e-9)) for field in (deviation, mean)
     )
-    scattered = np.count_nonzero(above & ~mask) / max(np.count_nonzero(above), 1)
+    scattered = float((above & ~mask).sum() / max(int(above.sum()), 1))
     if scattered > _SCATTERED and follows > _FOLLOWS:
         return f"what changes most lies all over the frame, and the rest changes too, {follows:.0%} as much"
     if bright > _AS_BRIGHT and follows > _AS_MUCH:
