@@ -2,6 +2,7 @@
 
     python docs/scripts/motion_study.py out/near out/far --photographs ball cat
     python docs/scripts/motion_study.py out/near --every 5 --json study.json
+    python docs/scripts/motion_study.py --reliefs out/reliefs       # writes meshes of six reliefs, to be rendered
 
 The folders are data folders of rendered scenes (`sdps regenerate`), of which those whose object fills the frame are
 whole frames, and folders of photographs that are known to be still. Each set is looked at whole and in random subsets
@@ -18,6 +19,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import trimesh
+from scipy import ndimage
 
 from pipelines.shared.text_tables import render_text
 from render.records.manifest import read_manifest
@@ -46,12 +49,39 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--photographs", nargs="*", type=Path, default=[], help="folders of still photographs")
     parser.add_argument("--every", type=int, default=1, help="take every so many sets")
     parser.add_argument("--json", type=Path, help="write the rows there")
+    parser.add_argument("--reliefs", type=Path, help="write meshes of six reliefs into this folder first")
     args = parser.parse_args(argv)
+    if args.reliefs:
+        write_reliefs(args.reliefs)
     rows = [row for still in _sets(args.folders, args.photographs, args.every) for row in judge(still)]
     if args.json:
         args.json.write_text(json.dumps(rows))
     sys.stdout.write(_table(rows))
     return 0
+
+
+def write_reliefs(folder: Path, side: int = 256) -> None:
+    """Write plates that fill the frame once rendered with `--set test.scale=1.55`, as PLY files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side))
+
+    def smooth(width: float, seed: int) -> np.ndarray:
+        field = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=x.shape), width)
+        return field / field.std()
+
+    bumps, rng = np.zeros_like(x), np.random.default_rng(0)
+    for column, row, radius in rng.uniform((-1, -1, 0.08), (1, 1, 0.2), (22, 3)):
+        squared = radius**2 - (x - column) ** 2 - (y - row) ** 2
+        bumps = np.maximum(bumps, 0.6 * np.sqrt(np.maximum(squared, 0)))
+    letters = ndimage.gaussian_filter((smooth(6, 4) > 0.5).astype(float), 1.2)
+    heights = {"flat": np.zeros_like(x), "plate": 0.006 * smooth(2.5, 1), "bumps": bumps, "letters": 0.05 * letters,
+               "stones": 0.05 * abs(smooth(8, 2)) + 0.01 * smooth(3, 3), "waves": 0.06 * smooth(20, 5)}  # fmt: skip
+    corner = np.arange(side * side).reshape(side, side)
+    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)])
+    for name, height in heights.items():
+        points = np.stack([x, y, height], axis=-1).reshape(-1, 3)
+        trimesh.Trimesh(points, faces, process=False).export(folder / f"{name}.ply")
 
 
 def _sets(folders: Sequence[Path], photographs: Sequence[Path], every: int) -> Iterator[Still]:

@@ -94,9 +94,9 @@ def _propose(part: np.ndarray, fields: np.ndarray) -> tuple[int, int] | None:
         return None
     shifts = np.array(_square((0, 0), _REACH))
     best, telling = tiles.best(part, fields, shifts)
-    cast = np.zeros((2 * _REACH + 1, 2 * _REACH + 1), np.float32)
-    np.add.at(cast, tuple((best[telling] + _REACH).T), 1)
-    counts = np.asarray(cv2.boxFilter(cast, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
+    votes = np.zeros((2 * _REACH + 1, 2 * _REACH + 1), np.float32)
+    np.add.at(votes, tuple((best[telling] + _REACH).T), 1)
+    counts = cv2.boxFilter(votes, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
     counts[_REACH - 1 : _REACH + 2, _REACH - 1 : _REACH + 2] = 0
     if counts.max() < max(2, 0.1 * np.count_nonzero(telling)):
         return None
@@ -126,15 +126,14 @@ def _poll(part: np.ndarray, fields: np.ndarray, place: tuple[int, int], *, brack
     free = telling & ~still
     if bracketed:
         free &= np.abs(best - place).max(1) < _AROUND
-    near = [free & (np.abs(best - shift).max(1) <= 1) for shift in _square(place, 2)]
-    counts = [int(np.count_nonzero(one)) if np.hypot(*shift) >= _SHORTEST else 0
-              for one, shift in zip(near, _square(place, 2), strict=True)]  # fmt: skip
-    most = int(np.argmax(counts))
-    against, voters = int(np.count_nonzero(still & telling)), int(np.count_nonzero(telling))
-    if not counts[most]:
+    against, voters = int((still & telling).sum()), int(telling.sum())
+    middles = [shift for shift in _square(place, 2) if np.hypot(*shift) >= _SHORTEST]
+    near = [free & (np.abs(best - shift).max(1) <= 1) for shift in middles]
+    most = max(near, key=lambda one: int(one.sum()))
+    if not most.any():
         return Votes(*place, 0, against, voters)
-    rows, columns = np.rint(np.median(best[near[most]], axis=0)).astype(int).tolist()
-    return Votes(rows, columns, counts[most], against, voters)
+    rows, columns = np.rint(np.median(best[most], axis=0)).astype(int).tolist()
+    return Votes(rows, columns, int(most.sum()), against, voters)
 
 
 class _Tiles:
@@ -160,8 +159,8 @@ class _Tiles:
             moved = window[row + shifts[:, 0], column + shifts[:, 1]].reshape(len(shifts), -1)
             weights = moved @ _basis(seen[:, row, column].reshape(len(fields), -1))
             left[number] = np.einsum("sp,sp->s", moved, moved) - np.einsum("sk,sk->s", weights, weights)
-        spread = np.maximum(left, 0) / self._side**2 + _NOISE**2
-        return shifts[spread.argmin(1)], np.median(spread, axis=1) > _TELLING * spread.min(1)
+        squares = np.maximum(left, 0) / self._side**2 + _NOISE**2
+        return shifts[squares.argmin(1)], np.median(squares, axis=1) > _TELLING * squares.min(1)
 
 
 def _basis(seen: np.ndarray) -> np.ndarray:  # (p, k)
