@@ -256,14 +256,14 @@ def _integrate_large(normals: np.ndarray, mask: np.ndarray, sharpness: float, mo
     edges = Edges(*(np.zeros(inside.shape, np.float32) for _ in Edges._fields))
     z, iterations = np.zeros(inside.shape), 1
     smooth_edges(slopes, inside, edges)
-    right, weights = right_side(edges), edges[:2]
+    right, weights = right_side(edges), (edges.across, edges.down)
     del edges  # half of it is not needed any more
     with share(0.0, 0.3 if sharpness else 1.0):
         cycle = Cycle(*weights, inside)
         solve_grid(cycle, right, z, tolerance=_TOLERANCE, tell=lambda done: stage("depth", done))
         del cycle, right
     if sharpness:
-        weights = ()
+        del weights
         with share(0.3, 1.0):
             iterations, weights = _reweighted(slopes, inside, z, sharpness, most)
     return Depth(
@@ -276,7 +276,7 @@ def _laid_out_large(
     slopes: Slopes,
     inside: np.ndarray,
     z: np.ndarray,
-    weights: tuple[np.ndarray, ...],
+    weights: tuple[np.ndarray, np.ndarray],
     shape: tuple[int, int],
     box: tuple[slice, ...],
 ) -> dict[str, Any]:
@@ -288,7 +288,7 @@ def _laid_out_large(
     sums, counts = np.bincount(numbers, heights), np.bincount(numbers)
     depth[box][inside] = heights - (sums / np.maximum(counts, 1))[numbers]
     rows, angles = np.zeros((len(inside), 3)), np.zeros(inside.shape, np.float32)
-    measure(slopes, inside, z, *weights, angles, rows)
+    measure(slopes, inside, z, weights[0], weights[1], angles, rows)
     residuals[box] = angles
     squares, count, torn = rows.sum(axis=0)
     return {
@@ -317,7 +317,7 @@ def _slopes(normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...]) -> tu
 
 def _reweighted(
     slopes: Slopes, inside: np.ndarray, z: np.ndarray, sharpness: float, most: int
-) -> tuple[int, tuple[np.ndarray, ...]]:
+) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
     """Reweight the one-sided equations as `_bilateral` does, z (h, w) in place.
 
     Returns:
@@ -329,7 +329,7 @@ def _reweighted(
         bilateral_edges(slopes, inside, z, sharpness, _WEAKEST, edges, rows)
         last, energy = energy, float(rows.sum())
         if number and abs(last - energy) <= _SETTLED * energy:
-            return number + 1, edges[:2]
-        solve_grid(Cycle(*edges[:2], inside), right_side(edges), z, tolerance=_ROUGH)
+            return number + 1, (edges.across, edges.down)
+        solve_grid(Cycle(edges.across, edges.down, inside), right_side(edges), z, tolerance=_ROUGH)
         stage("depth", number + 1, most)
-    return most + 1, edges[:2]
+    return most + 1, (edges.across, edges.down)
