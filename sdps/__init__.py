@@ -13,7 +13,7 @@ from render.shared import lazy_names
 
 if TYPE_CHECKING:
     from render.shared.errors import InputError
-    from sdps.api import available_methods, estimate, infer, train
+    from sdps.api import available_methods, estimate, infer, plan, train
     from sdps.core.estimate import Estimate
     from sdps.core.integration import integrate
     from sdps.core.metrics import score
@@ -28,7 +28,7 @@ else:
         __name__,
         {
             "render.shared.errors": ("InputError",),
-            "sdps.api": ("available_methods", "estimate", "infer", "train"),
+            "sdps.api": ("available_methods", "estimate", "infer", "plan", "train"),
             "sdps.core.estimate": ("Estimate",),
             "sdps.core.metrics": ("score",),
             "sdps.inference.estimator": ("load_estimator",),
@@ -53,6 +53,7 @@ __all__ = [
     "load",
     "load_estimator",
     "mesh",
+    "plan",
     "relit",
     "score",
     "train",

@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_size(parser)
     parser.add_argument("--many", type=int, default=0, help="also infer a folder of this many pictures")
     parser.add_argument("--large", action="store_true", help="also infer seven JPEG files of 12 megapixels")
-    parser.add_argument("--quick", action="store_true", help="only the large case, at one megapixel")
+    parser.add_argument("--quick", action="store_true", help="only the large case, at half a megapixel")
     add_out(parser, Path("out/bench-infer"))
 
 
@@ -53,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
     """Write the photographs, infer them with every method, print the tables and write bench_infer.json."""
     config, used = size_from(args), inference_config(args)
     if args.quick:
-        return _large(args, LargeConfig(width=1160, height=870))
+        return _large(args, LargeConfig(width=800, height=600))
     folders = {args.images: photograph(args.out / "photographs", config)}
     if args.many:
         folders[args.many] = repeated(args.out / "many", folders[args.images], args.many)

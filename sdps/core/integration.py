@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from render.shared.errors import InputError
 from render.shared.progress import share, stage
 from sdps.core.laplacian import laplacian, multigrid, solve
-from sdps.core.large_depth import Cycle, Edges, Slopes, bilateral_edges, measure, smooth_edges, solve_grid
+from sdps.core.large_depth import Cycle, Edges, Slopes, bilateral_edges, measure, right_side, smooth_edges, solve_grid
 
 STEEPEST = 0.03
 """Least n_z that is believed, so that slopes stop at 33. Half a pixel inside the rim of a sphere of radius R pixels,
@@ -256,21 +256,29 @@ def _integrate_large(normals: np.ndarray, mask: np.ndarray, sharpness: float, mo
     edges = Edges(*(np.zeros(inside.shape, np.float32) for _ in Edges._fields))
     z, iterations = np.zeros(inside.shape), 1
     smooth_edges(slopes, inside, edges)
+    right, weights = right_side(edges), (edges.across, edges.down)
+    del edges  # half of it is not needed any more
     with share(0.0, 0.3 if sharpness else 1.0):
-        cycle = Cycle(edges.across, edges.down, inside)
-        solve_grid(edges, inside, z, cycle, tolerance=_TOLERANCE, tell=lambda done: stage("depth", done))
-        del cycle
+        cycle = Cycle(*weights, inside)
+        solve_grid(cycle, right, z, tolerance=_TOLERANCE, tell=lambda done: stage("depth", done))
+        del cycle, right
     if sharpness:
+        del weights
         with share(0.3, 1.0):
-            iterations = _reweighted(slopes, inside, z, edges, sharpness, most)
+            iterations, weights = _reweighted(slopes, inside, z, sharpness, most)
     return Depth(
-        mask=mask, below=below, iterations=iterations, **_laid_out_large(slopes, inside, z, edges, mask.shape, box),
+        mask=mask, below=below, iterations=iterations, **_laid_out_large(slopes, inside, z, weights, mask.shape, box),
         seconds=time.perf_counter() - started,
     )  # fmt: skip
 
 
 def _laid_out_large(
-    slopes: Slopes, inside: np.ndarray, z: np.ndarray, edges: Edges, shape: tuple[int, int], box: tuple[slice, ...]
+    slopes: Slopes,
+    inside: np.ndarray,
+    z: np.ndarray,
+    weights: tuple[np.ndarray, np.ndarray],
+    shape: tuple[int, int],
+    box: tuple[slice, ...],
 ) -> dict[str, Any]:
     """Do what `_laid_out` does, and tell the share of torn edges."""
     found, components = ndimage.label(inside)
@@ -280,7 +288,7 @@ def _laid_out_large(
     sums, counts = np.bincount(numbers, heights), np.bincount(numbers)
     depth[box][inside] = heights - (sums / np.maximum(counts, 1))[numbers]
     rows, angles = np.zeros((len(inside), 3)), np.zeros(inside.shape, np.float32)
-    measure(slopes, inside, z, edges, angles, rows)
+    measure(slopes, inside, z, weights[0], weights[1], angles, rows)
     residuals[box] = angles
     squares, count, torn = rows.sum(axis=0)
     return {
@@ -307,14 +315,21 @@ def _slopes(normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...]) -> tu
     return slopes, flat / int(mask.sum())
 
 
-def _reweighted(slopes: Slopes, inside: np.ndarray, z: np.ndarray, edges: Edges, sharpness: float, most: int) -> int:
-    """Reweight the one-sided equations as `_bilateral` does, z (h, w) in place; return the systems solved."""
+def _reweighted(
+    slopes: Slopes, inside: np.ndarray, z: np.ndarray, sharpness: float, most: int
+) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
+    """Reweight the one-sided equations as `_bilateral` does, z (h, w) in place.
+
+    Returns:
+        The systems solved, and the weights of the edges.
+    """
+    edges = Edges(*(np.zeros(inside.shape, np.float32) for _ in Edges._fields))
     energy, rows = np.inf, np.zeros(len(inside))
     for number in range(most):
         bilateral_edges(slopes, inside, z, sharpness, _WEAKEST, edges, rows)
         last, energy = energy, float(rows.sum())
         if number and abs(last - energy) <= _SETTLED * energy:
-            return number + 1
-        solve_grid(edges, inside, z, Cycle(edges.across, edges.down, inside), tolerance=_ROUGH)
+            return number + 1, (edges.across, edges.down)
+        solve_grid(Cycle(edges.across, edges.down, inside), right_side(edges), z, tolerance=_ROUGH)
         stage("depth", number + 1, most)
-    return most + 1
+    return most + 1, (edges.across, edges.down)

@@ -110,14 +110,14 @@ def bilateral_edges(
 
 @numba.njit(parallel=True, cache=True)
 def measure(
-    slopes: Slopes, mask: np.ndarray, z: np.ndarray, edges: Edges, residuals: np.ndarray, rows: np.ndarray
-) -> None:
+    slopes: Slopes, mask: np.ndarray, z: np.ndarray, across: np.ndarray, down: np.ndarray, residuals: np.ndarray,
+    rows: np.ndarray,
+) -> None:  # fmt: skip
     """Write how far each pixel's edges are from its tangent planes, RMS in degrees (h, w) float32.
 
     `rows` (h, 3): of each row's edges, the sum of the squares, their number, and how many are torn.
     """
     nx, ny, nz = slopes
-    across, down, _, _ = edges
     height, width = mask.shape
     for r in numba.prange(height):
         for c in range(width):
@@ -145,10 +145,15 @@ def measure(
             residuals[r, c] = np.sqrt(total / max(count, 1))
 
 
+def right_side(edges: Edges) -> np.ndarray:
+    """Return what flows into each pixel, (h, w) float64."""
+    right = np.empty(edges.across.shape)
+    _right_side(edges.flow_across, edges.flow_down, right)
+    return right
+
+
 @numba.njit(parallel=True, cache=True)
-def _right_side(edges: Edges, right: np.ndarray) -> None:
-    """Write what flows into each pixel (h, w)."""
-    _, _, flow_across, flow_down = edges
+def _right_side(flow_across: np.ndarray, flow_down: np.ndarray, right: np.ndarray) -> None:
     height, width = right.shape
     for r in numba.prange(height):
         for c in range(width):
@@ -291,34 +296,32 @@ def _matrix(across: np.ndarray, down: np.ndarray, mask: np.ndarray) -> Any:
 
 
 def solve_grid(
-    edges: Edges, mask: np.ndarray, z: np.ndarray, cycle: Callable[[np.ndarray], np.ndarray], *, tolerance: float,
-    most: int = 300, tell: Callable[[float], None] = lambda share: None,
+    cycle: "Cycle", rest: np.ndarray, z: np.ndarray, *, tolerance: float, most: int = 300,
+    tell: Callable[[float], None] = lambda share: None,
 ) -> int:  # fmt: skip
     """Move z (h, w) float64 to the least sum of weights (step - wanted)^2, in place; return the number of steps.
 
     Args:
-        edges: Weights and flows.
-        mask: (h, w) bool.
+        cycle: Of the edges' weights: the equations, and the preconditioner.
+        rest: (h, w) float64, `right_side` of the edges; overwritten.
         z: Where to start.
-        cycle: The preconditioner.
         tolerance: Of the residual, as a share of the right side.
         most: Steps.
         tell: Called with the share that is done.
     """
-    rest, product = np.empty(mask.shape), np.empty(mask.shape)
-    _right_side(edges, rest)
+    across, down, product = cycle.across, cycle.down, np.empty(z.shape)
     goal = tolerance * float(np.sqrt(_dot(rest, rest)))
-    _apply(edges.across, edges.down, z, product)
+    _apply(across, down, z, product)
     rest -= product
     first = left = float(np.sqrt(_dot(rest, rest)))
-    way, slope = np.zeros(mask.shape), np.inf
+    way, slope, scaled = np.zeros(z.shape), np.inf, np.empty(z.shape, np.float32)
     for number in range(most):
         if left <= max(goal, _FEWEST):
             return number
-        guess = cycle((rest / left).astype(np.float32))  # so that float32 holds it, however small it becomes
+        guess = cycle(np.multiply(rest, 1.0 / left, out=scaled, casting="same_kind"))  # or float32 would not hold it
         before, slope = slope, left * _dot(guess, rest)
         _turn(way, guess, left, slope / before)
-        _apply(edges.across, edges.down, way, product)
+        _apply(across, down, way, product)
         _move(z, rest, way, product, slope / max(_dot(way, product), _FEWEST))
         left = float(np.sqrt(_dot(rest, rest)))
         if first > goal > 0.0:

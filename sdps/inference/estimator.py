@@ -19,7 +19,7 @@ from sdps.data.augment import measure_exposure
 from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map
 from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
 from sdps.inference.inference_config import InferenceConfig
-from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES, tiles
+from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES, give_back, tiles
 from sdps.inference.turned_views import (
     KeptView,
     TurnedView,
@@ -209,6 +209,9 @@ class Estimator(InferenceConfig):
                 whole = diagnostics.setdefault("expected_error", np.zeros(scene.shape, np.float32))
                 found = expected[0, 0].cpu().numpy()[tile.within] * inside
                 whole[scene.rows, scene.columns][tile.inner] = found
+            if len(parts) > 1:
+                del normals, expected
+                give_back()
         return box
 
     def _tiling(self, images: int) -> tuple[int, int, int]:

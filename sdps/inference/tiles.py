@@ -4,6 +4,8 @@ A tile's outer part has a halo as wide as the network sees, and begins at a mult
 that the inner parts together are what the whole would have given.
 """
 
+import ctypes
+import sys
 from collections.abc import Iterator
 from math import ceil
 from typing import NamedTuple
@@ -36,6 +38,13 @@ class Tile(NamedTuple):
         pairs = ((self.rows, self.outer_rows), (self.columns, self.outer_columns))
         rows, columns = (slice(own.start - outer.start, own.stop - outer.start) for own, outer in pairs)
         return rows, columns
+
+
+def give_back() -> None:
+    """Return memory that was freed to the system, where the C library (glibc) would keep up to a gigabyte of it."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
 
 
 def tiles(mask: np.ndarray, most: int, halo: int, multiple: int = 1) -> list[Tile]:

@@ -84,21 +84,11 @@ def pictures(scene: ObjectImages, parts: Iterable[tuple[Tile, Problem, State]], 
     strength, residual = np.zeros((2, *scene.shape), np.float32)
     by_image, made = torch.zeros(len(scene)), factors(state)
     for tile, problem, own in parts:
-        found, inside = factors(own), scene.mask[tile.inner]
-        inner = np.zeros(problem.mask.shape, bool)
-        inner[tile.within] = True
-        chosen = torch.from_numpy(inner[problem.mask])
-        by_pixel, images = torch.empty(len(problem.images)), problem.explained(found, own)
-        for part in parts_of(len(by_pixel)):
-            some = found._replace(
-                normals=found.normals[part], albedo=found.albedo[part], strength=found.strength[part]
-            )  # fmt: skip
-            gaps = difference(some, images[part], problem.kept[part] == 0.0)
-            by_pixel[part] = gaps.mean(dim=(1, 2))
-            by_image += gaps[chosen[part]].mean(dim=1).sum(dim=0)
-        values = (found.normals, found.albedo, found.strength, by_pixel)
-        for picture, of_pixels in zip((normals, albedo, strength, residual), values, strict=True):
-            picture[scene.rows, scene.columns][tile.inner][inside] = of_pixels[chosen].numpy()
+        found, of_images = _inner(tile, problem, own, scene.mask[tile.inner])
+        del problem, own  # before the next tile is made
+        by_image += of_images
+        for picture, values in zip((normals, albedo, strength, residual), found, strict=True):
+            picture[scene.rows, scene.columns][tile.inner][scene.mask[tile.inner]] = values
     return Refined(
         normals=normals,
         light_directions=made.directions.numpy(),
@@ -112,3 +102,19 @@ def pictures(scene: ObjectImages, parts: Iterable[tuple[Tile, Problem, State]], 
         pixel_residual=residual,
         image_residual=(by_image / int(scene.mask.sum())).numpy(),
     )
+
+
+def _inner(tile: Tile, problem: Problem, state: State, inside: np.ndarray) -> tuple[list[np.ndarray], Tensor]:
+    """Return normals, albedo, strength and residual of the inner part's pixels, and residuals summed over them (L,)."""
+    made, inner = factors(state), np.zeros(problem.mask.shape, bool)
+    inner[tile.within] = inside
+    chosen = torch.from_numpy(inner[problem.mask])
+    by_pixel, by_image = torch.empty(len(problem.images)), torch.zeros(problem.images.shape[2])
+    images = problem.explained(made, state)
+    for part in parts_of(len(by_pixel)):
+        some = made._replace(normals=made.normals[part], albedo=made.albedo[part], strength=made.strength[part])
+        gaps = difference(some, images[part], problem.kept[part] == 0.0)
+        by_pixel[part] = gaps.mean(dim=(1, 2))
+        by_image += gaps[chosen[part]].mean(dim=1).sum(dim=0)
+    found = (made.normals, made.albedo, made.strength, by_pixel)
+    return [values[chosen].numpy() for values in found], by_image

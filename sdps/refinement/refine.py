@@ -17,7 +17,7 @@ from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
 from sdps.core.integration import integrate
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
-from sdps.inference.tiles import Tile, tiles
+from sdps.inference.tiles import Tile, give_back, tiles
 from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.fine import finer, pictures
 from sdps.refinement.image_model import LOBES, SHAPES, State, factors
@@ -123,12 +123,17 @@ def _every_pixel(
     full: np.ndarray, settle: Callable[[Problem, State], State],
 ) -> Iterator[tuple[Tile, Problem, State]]:  # fmt: skip
     """Yield every pixel, tile by tile; `values` are all pixels' where one tile holds them."""
+
+    def found(tile: Tile) -> tuple[Tile, Problem, State]:  # keeps nothing of one tile while the next is made
+        part = scene.part(tile.outer_rows, tile.outer_columns)
+        own = values if len(parts) == 1 else gathered(part, part.mask)
+        problem, begun = finer(own, scene, tile, coarse, stride, state, full)
+        return tile, problem, settle(problem, begun)
+
     for tile in parts:
+        yield found(tile)
         if len(parts) > 1:
-            part = scene.part(tile.outer_rows, tile.outer_columns)
-            values = gathered(part, part.mask)
-        problem, begun = finer(values, scene, tile, coarse, stride, state, full)
-        yield tile, problem, settle(problem, begun)
+            give_back()
 
 
 def _advance(bar: Any) -> Callable[[], None]:

@@ -19,6 +19,7 @@ from render.shared.progress import stage
 from sdps.core.estimate import Estimate
 from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import angle_degrees
+from sdps.inference.tiles import give_back
 from sdps.methods import pretrained
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
@@ -116,15 +117,15 @@ class Inference:
     def relit_view(self, name: str, part: tuple[slice, ...] = ()) -> np.ndarray:
         """Return one of `relit`, or some of its rows and columns."""
         white = np.ones((1, 1, 1), np.float32)
-        albedo = (self.albedo[part] if self.albedo is not None else white) * self._exposure
+        albedo = (self.albedo[part] if self.albedo is not None else white) * (0.9 / self._brightest)
         view = relit(self.normals[part], albedo, np.array(RELIT[name]), free=self._shadows[name][part])
         return np.clip(view, 0.0, 1.0, out=view)
 
     @cached_property
-    def _exposure(self) -> float:
-        """What brings the brightest percent of the albedo to 0.9."""
+    def _brightest(self) -> float:
+        """Where the brightest percent of the albedo begins; 1 where there is none."""
         inside = np.ones(1, np.float32) if self.albedo is None else self.albedo[self.photos.mask]
-        return 0.9 / max(float(np.percentile(inside, 99)), 1e-9)
+        return max(float(np.percentile(inside, 99, overwrite_input=True)), 1e-9)
 
     @cached_property
     def _shadows(self) -> dict[str, np.ndarray]:
@@ -221,16 +222,21 @@ class Inference:
         if self.expected_error is not None:
             _save_array(folder / "expected-error.npy", self.expected_error)
         _save_array(folder / "depth.npy", self.depth.z)
-        colour = None if self.albedo is None else _display(self.albedo, mask)
+        colour = None
+        if self.albedo is not None:  # for a screen, the brightest percent at white
+            colour = np.concatenate([display(self.albedo[rows] / self._brightest) for rows in _bands(mask)])
         stage("meshes")
+        give_back()
         surface = mesh(self.depth, colour=colour, normals=normals, every=step_of(mask))
         for number, suffix in enumerate(("ply", "obj", "glb"), start=1):
             write_mesh(surface, folder / f"mesh.{suffix}")
             stage("meshes", number, 3)
         del surface, colour
+        give_back()
         (folder / "relit").mkdir()
         for name in RELIT:
-            write_png(folder / "relit" / f"{name}.png", display(self.relit_view(name)))
+            shown = [display(self.relit_view(name, (rows,))) for rows in _bands(mask)]
+            write_png(folder / "relit" / f"{name}.png", np.concatenate(shown))
             stage("relit pictures", 1, 1)
         write_json(folder / "result.json", self.summary())
 
@@ -254,13 +260,13 @@ def _about_refined(diagnostics: dict[str, Any], photos: Photographs) -> dict[str
     """Say how far refinement went, what to expect of it, and which photographs it explains worst; JSON ready."""
     refined, start, expected = diagnostics["refined"], diagnostics["start"], diagnostics["trust"]
     mask, residual = photos.mask, refined.image_residual
-    moved = angle_degrees(refined.normals[mask], start.normals[mask])
+    moved = _mean_angle(refined.normals, start.normals, mask)
     turned = angle_degrees(refined.light_directions, start.light_directions)
     limit = 2.0 * float(np.median(residual))
     return {
         "kept": not expected.doubt,
         "doubt": expected.doubt,
-        "normals_moved_degrees": round(float(moved.mean()), 2),
+        "normals_moved_degrees": round(moved, 2),
         "lights_moved_degrees": round(float(turned.mean()), 2),
         "expected_normal_error_degrees": round(float(expected.normals[mask].mean()), 2),
         # How far given directions are off, nobody knows; it is not 0.
@@ -275,16 +281,22 @@ def _about_refined(diagnostics: dict[str, Any], photos: Photographs) -> dict[str
 
 def _coded(normals: np.ndarray) -> np.ndarray:  # (H, W, 3) uint16
     """Return normals as colours, (n + 1) / 2, a few rows at a time."""
-    step = max(1, _PART // normals.shape[1])
-    rows = (normals[start : start + step].astype(np.float64) for start in range(0, len(normals), step))
-    return np.concatenate([quantise((some + 1.0) / 2.0, 16) for some in rows])
+    parts = (normals[rows].astype(np.float64) for rows in _bands(normals[..., 0]))
+    return np.concatenate([quantise((some + 1.0) / 2.0, 16) for some in parts])
+
+
+def _bands(picture: np.ndarray) -> list[slice]:
+    """Return the rows of a picture (H, W) that are worked on at once."""
+    step = max(1, _PART // picture.shape[1])
+    return [slice(start, start + step) for start in range(0, len(picture), step)]
+
+
+def _mean_angle(first: np.ndarray, second: np.ndarray, mask: np.ndarray) -> float:
+    """Return the mean angle in degrees between vectors (H, W, 3) inside the mask."""
+    parts = [angle_degrees(first[rows][mask[rows]], second[rows][mask[rows]]) for rows in _bands(mask)]
+    return float(np.concatenate(parts).mean())
 
 
 def _save_array(path: Path, array: np.ndarray) -> None:
     with atomic_path(path) as temporary, temporary.open("wb") as handle:
         np.save(handle, np.ascontiguousarray(array, np.float32))
-
-
-def _display(albedo: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
-    """Return colours for a screen, the brightest percent at white."""
-    return display(albedo / max(float(np.percentile(albedo[mask], 99)), 1e-9))

@@ -17,7 +17,7 @@ from sdps.photos.response import to_linear
 
 FORMATS = (".ply", ".obj", ".glb")
 
-MOST_VERTICES = 1_500_000
+MOST_VERTICES = 1_000_000
 """Of the meshes in files. A vertex takes about 700 bytes while they are written, and 200 in the file."""
 
 _MATT = {
@@ -33,7 +33,7 @@ def unit_scale(shape: tuple[int, int]) -> float:
 
 
 def step_of(mask: np.ndarray) -> int:
-    """Return every how manyth pixel is a vertex of the object's files, so that they have at most 1.5 million."""
+    """Return every how manyth pixel is a vertex of the object's files, so that they have at most a million."""
     return max(1, int(np.ceil(np.sqrt(int(mask.sum()) / MOST_VERTICES))))
 
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from render.shared.errors import InputError
-from render.shared.progress import stage
+from render.shared.progress import repeat, stage
 from sdps.core.integration import Depth, checked_normals
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 _READ_PIXELS = 2**20  # read at once, whole images
 _PART = 2**20  # pixels worked on at once
+_BAND = 2**22  # pixels of the frame, above which images are read some rows at a time, and more often
 _TRACED = 2**20  # pixels of the box above which shadows are traced on a coarser grid
 _LEAST = 0.02  # of a pixel's brightness: smaller residuals do not gain more weight
 _LIFT = 1.0  # pixels by which an occluder must rise above a ray, since the depth has errors of its own
@@ -68,6 +69,13 @@ def fit_albedo(
     """
     if passes < 1:
         raise InputError(f"passes must be at least 1, got {passes}")
+    if len(bands := _bands(mask)) > 1:
+        picture = np.zeros((*mask.shape, 3), np.float32)
+        for number, rows in enumerate(bands):
+            with repeat(number, len(bands)):
+                few = _Rows(images, rows, mask.shape)
+                picture[rows] = fit_albedo(few, mask[rows], normals[rows], lights, intensities, passes=passes)
+        return picture
     unit, lights, intensities = _checked(images, mask, normals, lights, intensities)
     albedo = smallest = None
     for number in range(passes):
@@ -174,14 +182,26 @@ def residuals(
 
     Highlights, cast shadows and interreflections add to the residual as much as wrong normals and lights do.
     """
-    unit, lights, intensities = _checked(images, mask, normals, lights, intensities)
     if albedo.shape != (*mask.shape, 3):
         raise InputError(f"albedo must be {(*mask.shape, 3)} like the mask, got {albedo.shape}")
+    picture, wrong, bands = np.zeros(mask.shape, np.float32), np.zeros((2, len(images))), _bands(mask)
+    for number, rows in enumerate(bands):
+        with repeat(number, len(bands)):
+            some = images if len(bands) == 1 else _Rows(images, rows, mask.shape)
+            sums, of_pixels = _sums(some, mask[rows], normals[rows], lights, intensities, albedo[rows])
+        wrong += sums
+        picture[rows][mask[rows]] = _relative(*of_pixels)
+    return Residuals(_relative(*wrong), picture, float(_relative(*wrong.sum(axis=1, keepdims=True))[0]))
+
+
+def _sums(
+    images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray,
+    albedo: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the squared differences and the squared images, summed over each image (2, L) and each pixel (2, n)."""
+    unit, lights, intensities = _checked(images, mask, normals, lights, intensities)
     inside = albedo[mask].astype(np.float32)
-    wrong, power = (
-        np.zeros((2, len(lights))),
-        np.zeros((2, len(unit)), np.float64 if len(unit) <= _PART else np.float32),
-    )
+    wrong, power = np.zeros((2, len(lights))), np.zeros((2, len(unit)))
     for part, observed in _read(images, mask):
         for number, values in zip(range(part.start, part.stop), observed, strict=True):
             for some in _parts(len(unit)):
@@ -190,9 +210,7 @@ def residuals(
                 wrong[:, number] += off.sum(dtype=np.float64), squared.sum(dtype=np.float64)
                 power[:, some] += off, squared
         stage("residuals", part.stop, len(lights))
-    picture = np.zeros(mask.shape, np.float32)
-    picture[mask] = _relative(*power)
-    return Residuals(_relative(*wrong), picture, float(_relative(*wrong.sum(axis=1, keepdims=True))[0]))
+    return wrong, power
 
 
 def _relative(off: np.ndarray, power: np.ndarray) -> np.ndarray:
@@ -219,6 +237,31 @@ def _checked(
     if not (count and np.isfinite(lights).all() and np.isfinite(intensities).all()):
         raise InputError("there must be images, and their lights and intensities must be finite")
     return unit, lights, np.broadcast_to(intensities.reshape(count, -1), (count, 3))
+
+
+class _Rows:
+    """Some rows of images."""
+
+    def __init__(self, images: "ImageSource", rows: slice, shape: tuple[int, ...]) -> None:
+        self.images, self.rows, self.shape = images, rows, shape
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, part: slice, /) -> np.ndarray:
+        window = getattr(self.images, "window", None)
+        if window is not None:
+            return np.asarray(window(part, self.rows, slice(0, self.shape[1])))
+        return np.asarray(self.images[part])[:, self.rows]
+
+
+def _bands(mask: np.ndarray) -> list[slice]:
+    """Return the rows that are worked on at once: all, or those of some million pixels with any of the object."""
+    if mask.size <= _BAND:
+        return [slice(0, len(mask))]
+    step = max(1, _BAND // mask.shape[1])
+    bands = [slice(start, start + step) for start in range(0, len(mask), step)]
+    return [rows for rows in bands if mask[rows].any()] or bands
 
 
 def _unit(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ from pipelines.infer import write_page
 from pipelines.shared.machines import HERE, kinds
 from render.shared.config import to_plain
 from render.shared.errors import InputError
+from render.shared.progress import listening
 from sdps import api
 from sdps.api import infer, load
 from sdps.core.metrics import direction_mae, intensity_error, normal_mae
@@ -244,6 +245,59 @@ def test_many_photographs_do_not_need_more_memory(tmp_path: Path) -> None:
     assert peaks[1000] < 3.0
 
 
+def test_a_scale_takes_less_of_everything(hills: tuple, tmp_path: Path, capsys) -> None:
+    folder, _, _ = hills
+    flags = ["--method", "lcnet+least-squares", "--scale", "0.5", "--out", str(tmp_path / "half")]
+    assert main(["infer", str(folder), *flags]) == 0, capsys.readouterr().err
+    text = capsys.readouterr().out
+    assert "photographs of 32x32" in text and "reduced from 64x64 to 32x32" in text
+    line = next(line for line in text.splitlines() if "pixels of object in 16 pictures of 32x32: about" in line)
+    assert "GiB of memory" in line and "--scale" not in line
+    assert np.load(tmp_path / "half" / "normal.npy").shape == (32, 32, 3)
+    assert json.loads((tmp_path / "half" / "result.json").read_text())["scale"] == 0.5
+
+
+@pytest.mark.parametrize("scale", ["0", "1.5", "-1", "nan", "half", "0,5", ""])
+def test_a_scale_that_is_none_is_one_line(hills: tuple, tmp_path: Path, capsys, scale: str) -> None:
+    assert "scale" in fails(capsys, hills[0], f"--scale={scale}", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_does_not_fit_stops_before_it_starts(hills: tuple, tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("sdps.surface.workload.LIMIT", 0.2)
+    folder, flags = hills[0], ["--method", "pf14", "--out", tmp_path / "out"]
+    assert re.search(r"GiB of memory, more than 0\.2; give --scale", fails(capsys, folder, *flags))
+    assert main(["infer", str(folder), *map(str, flags), "--anyway"]) == 0
+
+
+def test_every_stage_tells_how_far_it_is(hills: tuple, tmp_path: Path) -> None:
+    folder, _, _ = hills
+    told: dict[str, list[float]] = {}
+    with listening(lambda name, share: told.setdefault(name, []).append(share)):
+        photos = load(folder)
+        result = infer(photos, "sdps-frames", refine=True)
+        result.save(tmp_path)
+        write_page(tmp_path / "report.html", result)
+    stages = (
+        "reading",
+        "checks",
+        "lights",
+        "normals",
+        "refinement",
+        "depth",
+        "albedo",
+        "meshes",
+        "relit pictures",
+        "page",
+    )
+    for name in stages:
+        assert name in told, name
+        assert min(told[name]) >= 0.0 and max(told[name]) <= 1.0 + 1e-9
+    for name in ("reading", "lights", "normals", "refinement", "albedo", "meshes", "relit pictures"):
+        assert max(told[name]) == pytest.approx(1.0), name
+    assert told["normals"] == sorted(told["normals"]) and len(told["normals"]) > 5
+
+
 def test_the_bench_measures_every_step(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     flags = ["--height", "48", "--width", "64", "--images", "12", "--many", "20", "--out", str(tmp_path)]
     assert main(["bench-infer", *flags, "--methods", "factorisation"]) == 0
@@ -252,4 +306,8 @@ def test_the_bench_measures_every_step(tmp_path: Path, capsys: pytest.CaptureFix
     runs = found[HERE]
     assert runs["factorisation, 20 pictures"]["peak_gib"] > 0 and runs["factorisation, 12 pictures"]["seconds"] > 0
     assert "within 180 s, 3 GiB" in capsys.readouterr().out
+    assert main(["bench-infer", "--quick", "--out", str(tmp_path)]) == 0
+    large = json.loads((tmp_path / "bench_large.json").read_text())
+    assert large["stages"]["normals"] > 0 and large["peak_gib"] > 0 and large["expected"] > 0
+    assert "million" not in (said := capsys.readouterr().out) and "minutes, expected" in said
     assert "too dark" in bench_infer.table({"pf14": {"error": "too dark"}}, bench_infer.BenchClassicalConfig(), "here")

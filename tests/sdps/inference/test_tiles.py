@@ -1,5 +1,11 @@
 """Tiles: together they are the whole, and what networks say of them is what they say of the whole."""
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -18,6 +24,7 @@ from sdps.models.checkpoint import TrainedModel
 from sdps.models.frames import FusedMap
 from sdps.models.registry import create
 
+ROOT = Path(__file__).resolve().parents[3]
 LIGHTS = hemisphere_lights(6, np.random.default_rng(1))
 
 
@@ -127,3 +134,17 @@ def test_methods_by_pixel_see_some_rows_at_once(name: str, sphere: tuple, monkey
     assert observed_bytes(name, len(images), mask.size) == 8 * 2**20
     np.testing.assert_allclose(run_on_box(name, images, mask, (LIGHTS, None)).normals, whole, atol=1e-6)
     assert observed_bytes("pf14", len(images), mask.size) > 8 * 2**20  # sees all at once
+
+
+def test_memory_does_not_grow_with_the_frame() -> None:
+    """Of 600x600 pixels at once the network makes 0.6 GiB."""
+    command = [sys.executable, "tests/support/large_memory.py", "600"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests" / "support")])}
+
+    def more(mebibytes: int) -> float:
+        done = subprocess.run(
+            [*command, str(mebibytes)], check=True, capture_output=True, text=True, cwd=ROOT, env=environment
+        )  # fmt: skip
+        return float(json.loads(done.stdout.splitlines()[-1])["more_mib"])
+
+    assert more(200) < 300.0 < 450.0 < more(4000)

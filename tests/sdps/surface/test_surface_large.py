@@ -138,3 +138,17 @@ def test_views_of_large_objects_are_thinned(monkeypatch) -> None:
     monkeypatch.setattr(views, "_of_the_box", all_of_it)
     assert np.abs(thin.astype(float) - views.turned(depth, 30.0, 24)).mean() < 6.0
     assert sides[0] < 140
+
+
+def test_bands_of_images_are_the_whole_images(monkeypatch) -> None:
+    normals, mask = shaded_sphere(64)
+    scene = lambertian(normals, mask, lights(9), albedo=0.6, intensities=np.linspace(0.5, 2, 9))
+    arguments = scene.images, scene.mask, scene.normals, scene.lights, scene.intensities
+    whole = fit_albedo(*arguments)
+    left = residuals(*arguments, whole)
+    monkeypatch.setattr(relight, "_BAND", 640)  # ten rows
+    np.testing.assert_array_equal(fit_albedo(*arguments), whole)
+    cut = residuals(*arguments, whole)
+    np.testing.assert_array_equal(cut.pixels, left.pixels)
+    np.testing.assert_allclose(cut.images, left.images, rtol=1e-6)
+    assert cut.overall == pytest.approx(left.overall, rel=1e-6)
