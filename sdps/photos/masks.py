@@ -10,7 +10,7 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from render.shared.errors import InputError
-from sdps.photos.picture_file import decode, turned
+from sdps.photos.picture_file import Picture, decode, turned
 from sdps.photos.response import full_scale
 
 _LARGEST = 0.9
@@ -107,11 +107,7 @@ def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
     Raises:
         InputError: unreadable, of another size, or empty.
     """
-    picture = decode(path)
-    pixels = picture.pixels.max(-1)
-    if picture.alpha is not None and picture.alpha.min() < picture.alpha.max():
-        pixels = picture.alpha
-    mask = turned(pixels, picture.orientation) > full_scale(pixels) / 2
+    mask = bright_part(decode(path))
     if mask.shape != shape:
         raise InputError(
             f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} pixels, the pictures are {shape[1]}x{shape[0]}; draw "
@@ -120,6 +116,18 @@ def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
     if not mask.any():
         raise InputError(f"{path}: the mask is empty; paint the object white (above half brightness) on black")
     return np.ascontiguousarray(mask)
+
+
+def bright_part(picture: Picture) -> np.ndarray:
+    """Return what a mask marks, (H, W) bool: what is opaque, otherwise bright, otherwise the upper of two values."""
+    pixels = picture.pixels.max(-1)
+    if picture.alpha is not None and picture.alpha.min() < picture.alpha.max():
+        pixels = picture.alpha
+    limit = full_scale(pixels) / 2
+    low, high = pixels.min(), pixels.max()
+    if low < high <= limit and ((pixels == low) | (pixels == high)).all():
+        limit = low  # such as labels 0 and 1
+    return turned(pixels, picture.orientation) > limit
 
 
 def border_share(mask: np.ndarray) -> float:
@@ -160,7 +168,7 @@ def _ground_is_lit(variation: Variation, mask: np.ndarray, above: np.ndarray) ->
     follows, bright = (
         float(np.median(field[outside]) / max(float(np.median(field[mask])), 1e-9)) for field in (deviation, mean)
     )
-    scattered = float((above & ~mask).sum() / max(int(above.sum()), 1))
+    scattered = float((above & ~mask).sum() / max(float(above.sum()), 1.0))
     if scattered > _SCATTERED and follows > _FOLLOWS:
         return f"what changes most lies all over the frame, and the rest changes too, {follows:.0%} as much"
     if bright > _AS_BRIGHT and follows > _AS_MUCH:
