@@ -69,14 +69,19 @@ def fit_albedo(
     """
     if passes < 1:
         raise InputError(f"passes must be at least 1, got {passes}")
-    if len(bands := _bands(mask)) > 1:
-        picture = np.zeros((*mask.shape, 3), np.float32)
-        for number, rows in enumerate(bands):
-            with repeat(number, len(bands)):
-                few = _Rows(images, rows, mask.shape)
-                picture[rows] = fit_albedo(few, mask[rows], normals[rows], lights, intensities, passes=passes)
-        return picture
-    unit, lights, intensities = _checked(images, mask, normals, lights, intensities)
+    picture, bands = np.zeros((*mask.shape, 3), np.float32), _bands(mask)
+    for number, rows in enumerate(bands):
+        some = images if len(bands) == 1 else _Rows(images, rows, mask.shape)
+        with repeat(number, len(bands)):
+            unit, directions, strengths = _checked(some, mask[rows], normals[rows], lights, intensities)
+            picture[rows][mask[rows]] = _fitted(some, mask[rows], unit, directions, strengths, passes)
+    return picture
+
+
+def _fitted(
+    images: "ImageSource", mask: np.ndarray, unit: np.ndarray, lights: np.ndarray, intensities: np.ndarray, passes: int
+) -> np.ndarray:  # (n, C)
+    """Return the albedo of the mask's pixels; arguments as `_checked` returns them."""
     albedo = smallest = None
     for number in range(passes):
         above, below = np.zeros((2, len(unit), 3), np.float32)
@@ -94,9 +99,8 @@ def fit_albedo(
         albedo = np.maximum(above, 0.0, out=above)
         albedo /= np.maximum(below, np.finfo(np.float32).tiny, out=below)
         smallest = np.maximum(_LEAST * albedo.mean(axis=1), 1e-12)
-    picture = np.zeros((*mask.shape, 3), np.float32)
-    picture[mask] = albedo
-    return picture
+    assert albedo is not None  # there is a pass
+    return albedo
 
 
 def relit(
