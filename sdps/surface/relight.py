@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _READ_PIXELS = 2**20  # read at once, whole images
 _PART = 2**20  # pixels worked on at once
-_BAND = 2**22  # pixels of the frame, above which images are read some rows at a time, and more often
+_BAND = 2**22  # pixels, of larger pictures only the object's rows are read, so many of the object at once
 _TRACED = 2**20  # pixels of the box above which shadows are traced on a coarser grid
 _LEAST = 0.02  # of a pixel's brightness: smaller residuals do not gain more weight
 _LIFT = 1.0  # pixels by which an occluder must rise above a ray, since the depth has errors of its own
@@ -71,7 +71,7 @@ def fit_albedo(
         raise InputError(f"passes must be at least 1, got {passes}")
     picture, bands = np.zeros((*mask.shape, 3), np.float32), _bands(mask)
     for number, rows in enumerate(bands):
-        some = images if len(bands) == 1 else _Rows(images, rows, mask.shape)
+        some = _Rows(images, rows, mask.shape) if rows != slice(0, len(mask)) else images
         with repeat(number, len(bands)):
             unit, directions, strengths = _checked(some, mask[rows], normals[rows], lights, intensities)
             picture[rows][mask[rows]] = _fitted(some, mask[rows], unit, directions, strengths, passes)
@@ -191,7 +191,7 @@ def residuals(
     picture, wrong, bands = np.zeros(mask.shape, np.float32), np.zeros((2, len(images))), _bands(mask)
     for number, rows in enumerate(bands):
         with repeat(number, len(bands)):
-            some = images if len(bands) == 1 else _Rows(images, rows, mask.shape)
+            some = _Rows(images, rows, mask.shape) if rows != slice(0, len(mask)) else images
             sums, of_pixels = _sums(some, mask[rows], normals[rows], lights, intensities, albedo[rows])
         wrong += sums
         picture[rows][mask[rows]] = _relative(*of_pixels)
@@ -260,12 +260,13 @@ class _Rows:
 
 
 def _bands(mask: np.ndarray) -> list[slice]:
-    """Return the rows that are worked on at once: all, or those of some million pixels with any of the object."""
-    if mask.size <= _BAND:
+    """Return the rows that are worked on at once: all of small pictures, else those with some million of the object."""
+    if mask.size <= _BAND or not mask.any():
         return [slice(0, len(mask))]
-    step = max(1, _BAND // mask.shape[1])
-    bands = [slice(start, start + step) for start in range(0, len(mask), step)]
-    return [rows for rows in bands if mask[rows].any()] or bands
+    sums = np.cumsum(mask.sum(axis=1))
+    number = (np.maximum(sums - 1, 0) // _BAND)[mask.any(axis=1)]  # of the band that a row with object is in
+    rows = np.flatnonzero(mask.any(axis=1))
+    return [slice(int(some[0]), int(some[-1]) + 1) for some in (rows[number == k] for k in np.unique(number))]
 
 
 def _unit(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:

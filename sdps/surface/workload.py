@@ -158,7 +158,7 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
         fine = 120 * size.pixels * (0.6e-6 + 55e-9 * images)
         found["refinement"] = (coarse + fine) / threads + 3 * once
     found["depth"] = (1.2e-6 if size.pixels > LARGE else 5e-6) * size.pixels * (60 if discontinuities else 1)
-    found["albedo"] = 4 * once + 60e-9 * images * size.pixels
+    found["albedo"] = 4 * once * ceil(size.pixels / 2**22) + 60e-9 * images * size.pixels
     thin = size.box / ceil((size.box / 2**20) ** 0.5) ** 2
     found["relit pictures"] = 8e-9 * thin**1.5 + 3e-7 * size.frame
     found["files"] = 7e-6 * size.pixels / _step(size) ** 2 + 0.8e-6 * size.frame
