@@ -1,7 +1,8 @@
-"""Every example runs from the command line and writes what it says."""
+"""Every example runs and writes what it says."""
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -16,12 +17,26 @@ import render
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def run(name: str, *flags: object) -> str:
-    command = [sys.executable, str(ROOT / "examples" / name), *map(str, flags)]
+def command(name: str, *flags: object) -> str:
+    """Run an example in a process of its own and return what it says."""
+    words = [sys.executable, str(ROOT / "examples" / name), *map(str, flags)]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}  # these packages, whichever are installed
-    done = subprocess.run(command, cwd=ROOT, env=environment, check=False, capture_output=True, text=True)
+    done = subprocess.run(words, cwd=ROOT, env=environment, check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Return the function that does the same in this process, where everything is loaded."""
+
+    def called(name: str, *flags: object) -> str:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, flags)])
+        capsys.readouterr()
+        runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return called
 
 
 def size_of(path: Path) -> tuple[int, int]:
@@ -31,7 +46,7 @@ def size_of(path: Path) -> tuple[int, int]:
 
 
 def test_render_a_scene(tmp_path):
-    said = run("01_render_a_scene.py", "--out", tmp_path, "--size", 32, "--spp", 4)
+    said = command("01_render_a_scene.py", "--out", tmp_path, "--size", 32, "--spp", 4)
     assert said.count("images (5, 32, 32, 3)") == 3
     assert size_of(tmp_path / "images.png") == (6 * 32, 3 * 32)
     for name in ("clay", "lacquer", "striped"):
@@ -42,7 +57,7 @@ def test_render_a_scene(tmp_path):
     assert (tmp_path / "lacquer.yaml").is_file()
 
 
-def test_train(tmp_path):
+def test_train(tmp_path, run):
     flags = ("--out", tmp_path, "--size", 32, "--shapes", 2, "--steps", 2, "--method", "pf14")
     said = run("02_train.py", *flags)
     assert said.count("step 2: loss") == 2
@@ -53,7 +68,7 @@ def test_train(tmp_path):
 
 
 @pytest.mark.parametrize("method", ["pf14", pytest.param("auto", marks=pytest.mark.slow)])
-def test_photographs_to_mesh(tmp_path, method):
+def test_photographs_to_mesh(tmp_path, run, method):
     said = run("03_photographs_to_mesh.py", "--out", tmp_path, "--size", 64, "--count", 12, "--method", method)
     assert "normal_mae" in said and len(list((tmp_path / "photographs").glob("0*.png"))) == 12
     assert size_of(tmp_path / "relit.png") == size_of(tmp_path / "normals.png") == (64, 64)
