@@ -30,7 +30,7 @@ from sdps.inference.estimator import check_lights
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
-from sdps.methods.light_witness import complete_intensities, question_lights, see_lights
+from sdps.methods.light_witness import question_lights, see_lights
 from sdps.methods.method import REFINE, Method
 from sdps.methods.parse import by_networks, parse, refined
 from sdps.methods.runner import Runner
@@ -89,16 +89,16 @@ def infer(
     """
     findings = tuple(check(photos)) if findings is None else findings
     _stop(photos, findings, anyway)
-    began = time.perf_counter()
-    intensities = photos.intensities
-    if photos.light_directions is not None:
-        intensities, more = _questioned(photos, models, config)
-        findings = (*findings, *more)
-        _stop(photos, findings, anyway)
-    known = photos.light_directions is not None, intensities is not None
+    known = photos.light_directions is not None, photos.intensities is not None
     runner = _runner(method, known, models, config, refine, len(photos))
     if not anyway:
         workload(photos, runner, discontinuities=discontinuities).check()
+    began = time.perf_counter()
+    intensities = photos.intensities
+    if photos.light_directions is not None:  # after what costs nothing: it reads every photograph twice
+        intensities, more = _questioned(photos, models, config)
+        findings = (*findings, *more)
+        _stop(photos, findings, anyway)
     found = runner.estimate(photos, photos.mask, photos.light_directions, intensities, saturation=photos.saturation)
     seconds = time.perf_counter() - began
     return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
@@ -151,7 +151,7 @@ def estimate(
     if light_directions is not None and intensities is None:
         check_lights(len(images), light_directions)
         seen = see_lights(images, mask, _finder(models), config)
-        intensities = complete_intensities(images, mask, light_directions, seen)
+        intensities, _ = question_lights(images, mask, light_directions, None, seen)
     return runner.estimate(images, mask, light_directions, intensities, saturation=saturation)
 
 
@@ -250,7 +250,7 @@ def _questioned(
     assert photos.light_directions is not None
     seen = see_lights(photos, photos.mask, _finder(models), config)
     intensities, fit = question_lights(
-        photos, photos.mask, photos.files, photos.light_directions, photos.intensities, seen
+        photos, photos.mask, photos.light_directions, photos.intensities, seen, photos.files
     )
     if fit is None:
         return intensities, ()

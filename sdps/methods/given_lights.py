@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from render.shared.imaging.reducing import reduced
 from render.shared.seeds import generator
 from sdps.core.metrics import angle_degrees
 from sdps.inference.image_source import ImageSource
@@ -96,28 +97,35 @@ def reduce_images(images: ImageSource, mask: np.ndarray) -> ReducedImages:
         images: Linear radiance of any overall scale.
         mask: (H, W) bool, not empty.
     """
-    rows, columns = (slice(found.min(), found.max() + 1) for found in np.nonzero(mask))
+    lines = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    rows, columns = (slice(int(found[0]), int(found[-1]) + 1) for found in lines)
     height, width = mask[rows, columns].shape
     shrink = max(1.0, max(height, width) / _SIDE)
-    size = max(1, round(width / shrink)), max(1, round(height / shrink))
+    shape = max(1, round(height / shrink)), max(1, round(width / shrink))
     inside = mask[rows, columns].astype(np.float32)
-    share = cv2.resize(inside, size, interpolation=cv2.INTER_AREA)
+    share = reduced(inside, shape)
     small = share > (0.99 if (share > 0.99).sum() >= 50 else 0.5)
     grey = []
     for number in range(len(images)):
         image = np.asarray(images[number : number + 1])[0][rows, columns].astype(np.float32)
         image = np.where(mask[rows, columns][..., None], image, np.float32(0.0))
-        grey.append((cv2.resize(image, size, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)[..., None])[small])
+        grey.append((reduced(image, shape) / np.maximum(share, 1e-6)[..., None])[small])
     values = np.stack(grey)  # (L, P, 3)
     values = without(values, stray_light(values)).mean(-1).astype(np.float64)
-    whole = np.pad(cv2.resize(mask.astype(np.uint8)[rows, columns], size, interpolation=cv2.INTER_NEAREST), 1) > 0
-    near_rim = cv2.erode(whole.astype(np.uint8), np.ones((5, 5), np.uint8))[1:-1, 1:-1] == 0
+    return ReducedImages(values / max(values.mean(), 1e-12), small, small & _rim(mask, rows, columns, shape))
+
+
+def _rim(mask: np.ndarray, rows: slice, columns: slice, shape: tuple[int, int]) -> np.ndarray:
+    """Return where the reduced box of a mask (H, W) is near the object's outline, but not where the frame cuts it."""
+    box = mask[rows, columns].astype(np.uint8)
+    whole = np.pad(cv2.resize(box, shape[::-1], interpolation=cv2.INTER_NEAREST), 1)
+    rim = cv2.erode(whole, np.ones((5, 5), np.uint8))[1:-1, 1:-1] == 0
     top, left = rows.start == 0, columns.start == 0
     bottom, right = rows.stop == mask.shape[0], columns.stop == mask.shape[1]
     for cut, edge in ((top, np.s_[:3]), (bottom, np.s_[-3:]), (left, np.s_[:, :3]), (right, np.s_[:, -3:])):
         if cut:
-            near_rim[edge] = False
-    return ReducedImages(values / max(values.mean(), 1e-12), small, small & near_rim)
+            rim[edge] = False
+    return rim
 
 
 def fit_normals(

@@ -44,36 +44,22 @@ def see_lights(
     return None
 
 
-def complete_intensities(
-    images: ImageSource, mask: np.ndarray, directions: np.ndarray, seen: Estimate | None
-) -> np.ndarray:
-    """Return intensities (L,) float32 of lights of which only the directions (L, 3) are known.
-
-    Args:
-        images, mask: As for `see_lights`.
-        directions: Of any length but zero.
-        seen: What a network finds; equal intensities are the start without one.
-    """
-    start = np.ones(len(images)) if seen is None else seen.intensities
-    return find_intensities(reduce_images(images, mask), _unit(directions), start)
-
-
 def question_lights(
     images: ImageSource,
     mask: np.ndarray,
-    files: tuple[str, ...],
     directions: np.ndarray,
     intensities: np.ndarray | None,
     seen: Estimate | None,
+    files: tuple[str, ...] = (),
 ) -> tuple[np.ndarray, LightFit | None]:
     """Look whether given lights are those of the images, and find the intensities where these are not given.
 
     Args:
         images, mask: As for `see_lights`.
-        files: (L,) names of the images.
-        directions: (L, 3), as given.
+        directions: (L, 3), as given, of any length but zero.
         intensities: (L,) or (L, 3), or None.
-        seen: What a network finds.
+        seen: What a network finds, which intensities start from; without it they start equal.
+        files: (L,) names of the images; without them only intensities are found.
 
     Returns:
         The intensities, those given or those found, and how the lights fit; None where nothing can be said.
