@@ -43,7 +43,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _fix() -> None:
-    """Fetch a libLLVM where none works; a failure is no end. The mesh is fetched by the report, which looks at it."""
+    """Fetch a libLLVM where none works, and go on if that fails. The report fetches the mesh."""
     try:
         variant.choose()
     except InputError:

@@ -130,7 +130,7 @@ def _flush(path: Path) -> None:
 
 
 def _flush_folder(path: Path) -> None:
-    """Bring the names in a folder to the disk, where the system can; without, they may change later than told."""
+    """Write the names in a folder to the disk, where the system can do that; otherwise a rename may reach it later."""
     if os.name == "nt":
         return  # has no such call
     with suppress(OSError):

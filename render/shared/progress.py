@@ -49,7 +49,7 @@ def share(start: float, stop: float) -> Iterator[None]:
 
 @contextmanager
 def repeat(number: int, count: int) -> Iterator[None]:
-    """Take the stages inside for repeat `number` of `count`, so that their shares do not begin anew with each."""
+    """Take the stages inside for repeat `number` of `count`, so that progress goes on instead of starting again."""
     with share(number / count, (number + 1) / count):
         yield
 

@@ -152,7 +152,7 @@ def _doubt(changes: np.ndarray, mask: np.ndarray, threshold: float) -> str:
 
 
 def _ground_is_lit(variation: Variation, mask: np.ndarray, above: np.ndarray) -> str:
-    """Say why what lies outside a mask is no background; empty where it is.
+    """Say why what lies outside a mask is not a background; empty where it is.
 
     A dark background hardly changes with the light. A bright steady one does not change either.
 

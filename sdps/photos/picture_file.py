@@ -58,7 +58,7 @@ def misnamed(name: str, kind: str) -> bool:
 
 
 def _not_read(path: Path, data: bytes) -> InputError:
-    """Build the error for bytes that are no picture of a kind that is read."""
+    """Build the error for bytes that are not a picture of a kind that is read."""
     remedy = "copy it again or leave it out"
     if not data:
         return InputError(f"{path}: damaged, the file is empty; {remedy}")
@@ -68,7 +68,7 @@ def _not_read(path: Path, data: bytes) -> InputError:
     suffix = path.suffix.lower()
     if suffix in SUFFIXES:
         return InputError(f"{path}: damaged or not {name_kind(SUFFIXES[suffix])}; {remedy}")
-    return InputError(f"{path}: is no picture of a kind that is read ({NAMED}); convert it to 16-bit TIFF or PNG")
+    return InputError(f"{path}: is not a picture of a kind that is read ({NAMED}); convert it to 16-bit TIFF or PNG")
 
 
 def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:

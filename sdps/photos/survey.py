@@ -146,7 +146,7 @@ class _Look:
         return notes
 
     def _no_photograph(self, name: str, picture: Picture) -> str:
-        """Return why a picture is no photograph, empty where it may be one."""
+        """Return why a picture is not a photograph, empty where it may be one."""
         if name in self.listing.dark:
             return "a dark frame; not yet subtracted" if _level(picture) < _DARK * np.median(self.levels or [0]) else ""
         role = judge_content(picture.pixels, lossy=picture.coding.kind in LOSSY)
@@ -266,7 +266,7 @@ def _check_fit(folder: Path, look: _Look, left_out: str) -> None:
         hint = "it is turned by 90 degrees, turn it back" if other_shape == shape[::-1] else "the camera must not move"
         raise InputError(
             f"{folder / names[0]}: is {sizes[0]} pixels, {rest} {verb} {sizes[1]}{more}; all pictures must have one "
-            f"size ({hint}); leave out what is no photograph with {drop}"
+            f"size ({hint}); leave out what is not a photograph with {drop}"
         )
     raise InputError(
         f"{folder / names[0]}: is {other}, {rest} {verb} {coding}{more}; keep one kind in the folder, or choose with "

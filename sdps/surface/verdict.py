@@ -48,4 +48,4 @@ def _reasons(photos: Photographs, findings: Sequence[Finding], trust: Trust | No
     if trust is not None and trust.doubt:
         yield trust.doubt
     if residual > _MISFIT:
-        yield "the object's reflectance, or light that bounces between its parts, is none that the model knows"
+        yield "the model does not describe the object's reflectance, or the light that bounces between its parts"

@@ -61,7 +61,7 @@ def _rows(root: Path) -> list[dict[str, str]]:
 def _found(root: Path) -> Iterator[tuple[float, str, Path]]:
     for place, folders, files in os.walk(root):
         path = Path(place)
-        # Folders may go while they are looked at, and names that are no text cannot be sent.
+        # Folders may be removed while this looks at them, and names that are not valid text cannot be sent.
         with suppress(OSError, UnicodeEncodeError):
             place.encode()
             if MANIFEST in files:

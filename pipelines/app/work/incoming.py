@@ -13,13 +13,12 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from pipelines.app.work.refusals import Refused, full, spelled
+from pipelines.app.work.refusals import GONE, Refused, full, spelled
 from pipelines.app.work.sessions import Session
 from render.shared.errors import InputError
 
 _BLOCK = 2**20  # bytes written at a time
 _STALLED = 120.0  # seconds without a byte
-_GONE = "that is no longer here; load it again"
 T = TypeVar("T")
 
 
@@ -41,7 +40,7 @@ class Incoming:
         """Count bytes before they are written.
 
         Raises:
-            InputError: there is no room for them; the message begins with `what`.
+            InputError: they do not fit; the message begins with `what`.
         """
         self._session.take(size, self._most, what)
         self.size += size
@@ -134,7 +133,7 @@ async def incoming(session: Session, most: int, place: str) -> AsyncIterator[Inc
         yield coming
     except OSError as error:
         if not session.folder.is_dir():
-            raise InputError(_GONE) from error
+            raise InputError(GONE) from error
         refusal = full("the upload", error)
         if refusal is None:
             raise
@@ -195,7 +194,7 @@ def names(folder: Path) -> set[str]:
     try:
         return set(os.listdir(folder))
     except FileNotFoundError as error:
-        raise InputError(_GONE) from error
+        raise InputError(GONE) from error
 
 
 async def off_loop(function: Callable[..., T], *values: object) -> T:

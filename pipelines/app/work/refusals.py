@@ -4,6 +4,8 @@ import errno
 
 from render.shared.errors import InputError
 
+GONE = "that has been removed; load it again"
+"""Of a set of photographs that is not there any more."""
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
 

@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipelines.app.work.refusals import Refused, spelled
+from pipelines.app.work.refusals import GONE, Refused, spelled
 from render.shared.errors import InputError
 
 try:
@@ -93,7 +93,7 @@ class Session:
         """
         path = self.folder / name
         if not _SET.fullmatch(name) or not path.is_dir():
-            raise InputError("that is no longer here; load it again")
+            raise InputError(GONE)
         with self.lock:
             self._sets.pop(name, None)
             self._sets[name] = None  # the one used last is last

@@ -22,7 +22,7 @@ _NO_GEOMETRY = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_xmp", "KHR
                 "EXT_materials_", "EXT_texture_", "EXT_lights_", "MSFT_texture_", "ADOBE_materials_", "MSFT_packing_",
                 "KHR_techniques_webgl")  # fmt: skip
 """Beginnings of extensions that change how a surface looks, not where it is."""
-_READ_MODES = (0, 1, 2, 3, 4, 5)  # points and lines, which are no surface; triangles, and strips of them
+_READ_MODES = (0, 1, 2, 3, 4, 5)  # points and lines, which are not surfaces; triangles and triangle strips
 _GLB = (b"glTF", 0x4E4F534A)  # magic, type of the JSON chunk
 
 

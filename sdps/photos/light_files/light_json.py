@@ -33,10 +33,10 @@ def read_json_table(path: Path, text: str, files: Sequence[str]) -> tuple[Table,
         files: Names of the pictures, (L,).
 
     Returns:
-        The rows; and whether the file states our frame, which then is no matter of flags.
+        The rows; and whether the file states our frame, so that no flag may change it.
 
     Raises:
-        InputError: another layout, or values that are no lights.
+        InputError: another layout, or values that are not lights.
     """
     try:
         content = parse_json(text)

@@ -32,7 +32,7 @@ class Table:
     Attributes:
         values: (N, W) float64, finite.
         names: (N,) what the file calls the rows; None where it has no names.
-        lines: (N,) numbers of the lines in the file, for messages; () where there are no lines.
+        lines: (N,) numbers of the lines in the file, for messages; () where the file has no lines.
         columns: (W,) what the file says the numbers are: x, y, z, i, r, g, b, azimuth, elevation, slant or tilt; ()
             where it does not say.
         radians: Angles are in radians, not in degrees.

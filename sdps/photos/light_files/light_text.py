@@ -61,7 +61,7 @@ def read_text_table(path: Path, text: str, count: int, want: Want) -> Table:
         want: What a row should be.
 
     Raises:
-        InputError: a line that is no such row, by its number in the file.
+        InputError: a line that is not such a row, by its number in the file.
     """
     heading, lines = _content(path, text, want)
     points, commas = (
