@@ -30,6 +30,7 @@ UV ?= uv
 
 VENV := .venv
 SDPS := $(VENV)/bin/sdps
+LAB := $(VENV)/bin/python -m lab
 READY := $(VENV)/.ready
 ASSETS_READY := $(VENV)/.assets-ready
 DOCS_READY := $(VENV)/.docs-ready
@@ -43,7 +44,7 @@ SETTINGS := $(foreach item,$(SET),--set $(item))
 help:
 	@echo "make app   a local page: photographs to surfaces, scenes to play with, data to look at"
 	@echo "make demo | test | lint | bench | bench-train | models | doctor | docs"
-	@echo "make render-data | train | eval-merltest   PRESET=smoke|demo|small|study|paper OUT=folder SET='section.field=value ...'"
+	@echo "make render-data | train | eval-merltest   PRESET=smoke|demo|small|paper OUT=folder SET='section.field=value ...'"
 	@echo "make train MODELS=lcnet,nenet,sdps-plus   also STREAM=1: render while training, store nothing"
 	@echo "make study   every model of the paper on equal data and steps, then tables A and B"
 	@echo "make eval-classical | bench-classical | eval-photos DATA=folder   the methods without learning"
@@ -96,7 +97,8 @@ models: $(READY)
 	$(SDPS) models
 
 # The study of docs/studies/model-comparison.md: every model, the same data and steps.
-study: PRESET = study
+study: PRESET = lab/presets/study.yaml
+study: OUT = out/study
 study: $(ASSETS_READY)
 	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
 	$(SDPS) train --preset $(PRESET) --out $(OUT) --models '$(or $(MODELS),all)' $(SETTINGS)
@@ -119,7 +121,7 @@ eval-lights: $(READY)
 	$(SDPS) eval-lights '$(DATA)' --dataset $(DATASET) --out $(OUT) $(if $(RUNS),--models $(RUNS))
 
 eval-figures: $(ASSETS_READY)
-	$(SDPS) eval-figures --preset $(PRESET) --out $(OUT) $(if $(FIGURES),--figures '$(FIGURES)') \
+	$(LAB) eval-figures --preset $(PRESET) --out $(OUT) $(if $(FIGURES),--figures '$(FIGURES)') \
 		$(if $(METHODS),--methods '$(METHODS)') $(SETTINGS)
 
 infer: OUT = out/infer
@@ -129,14 +131,14 @@ infer: $(READY)
 # Weights of finished runs into assets/weights; then their tables, there and in docs/results.md. DATA: DiLiGenT's folder.
 ship: PRESET = ship
 ship: $(READY)
-	$(SDPS) ship --preset $(PRESET) --out $(OUT) $(if $(MODELS),--models '$(MODELS)')
+	$(LAB) ship --preset $(PRESET) --out $(OUT) $(if $(MODELS),--models '$(MODELS)')
 
 shipped-results: OUT = out/shipped
 shipped-results: PRESET = ship
 shipped-results: $(ASSETS_READY)
 	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) --set 'test.shipped=[all]' $(SETTINGS)
 	$(if $(DATA),$(SDPS) eval-diligent '$(DATA)' --out $(OUT) --methods '$(or $(METHODS),learned)')
-	$(SDPS) shipped-results --out $(OUT) --page docs/results.md
+	$(LAB) shipped-results --out $(OUT) --page docs/results.md
 
 report: $(READY)
 	$(SDPS) report $(OUT)
@@ -191,23 +193,23 @@ lint: $(READY)
 
 bench: OUT = out/bench
 bench: $(ASSETS_READY)
-	$(SDPS) bench --out $(OUT)
+	$(LAB) bench --out $(OUT)
 
 bench-train: OUT = out/bench-train
 bench-train: $(READY)
-	$(SDPS) bench-train --out $(OUT)
+	$(LAB) bench-train --out $(OUT)
 
 bench-classical: OUT = out/bench-classical
 bench-classical: $(READY)
-	$(SDPS) bench-classical --out $(OUT)
+	$(LAB) bench-classical --out $(OUT)
 
 bench-infer: OUT = out/bench-infer
 bench-infer: $(READY)
-	$(SDPS) bench-infer --out $(OUT) $(if $(QUICK),--quick,--large) $(if $(METHODS),--methods '$(METHODS)') $(if $(RUNS),--models $(RUNS))
+	$(LAB) bench-infer --out $(OUT) $(if $(QUICK),--quick,--large) $(if $(METHODS),--methods '$(METHODS)') $(if $(RUNS),--models $(RUNS))
 
 bench-surface: OUT = out/bench-surface
 bench-surface: $(READY)
-	$(SDPS) bench-surface $(DATA) --out $(OUT)
+	$(LAB) bench-surface $(DATA) --out $(OUT)
 
 # Into out/site; nothing is fetched but the packages, once.
 docs: $(DOCS_READY)

@@ -16,7 +16,7 @@ class Command(NamedTuple):
     """A command, loaded only when it is the one that is run.
 
     Attributes:
-        module: Module below `pipelines`.
+        module: Module.
         about: One line of help.
         declare: Function of the module that adds flags to a parser.
         run: Function of the module that takes the parsed flags and returns the exit code.
@@ -38,52 +38,47 @@ class Group(NamedTuple):
 
 
 DATA = Group("plan, check, preview, describe, export, relight and import data folders", {
-    "plan": Command("data.data_plan", "write the manifest of a preset and estimate disk and time", stores=True),
-    "status": Command("data.data_status", "tell what is done, failed and left, and at what rate", stores=True),
-    "validate": Command("data.data_validate", "check every shard of a folder", stores=True),
-    "preview": Command("data.data_preview",
+    "plan": Command("pipelines.data.data_plan", "plan the scenes of a preset; estimate disk and time", stores=True),
+    "status": Command("pipelines.data.data_status", "show what is done, failed and left, and the rate", stores=True),
+    "validate": Command("pipelines.data.data_validate", "check every shard of a folder", stores=True),
+    "preview": Command("pipelines.data.data_preview",
                        "write contact sheets and a page with light, material and shape statistics", stores=True),
-    "card": Command("data.data_card", "write the dataset card and Croissant JSON", stores=True),
-    "export": Command("data.data_exchange", "write the scenes in a layout that other loaders read", stores=True),
-    "relight": Command("data.data_relight", "mix images under environments and several lights from a light stage"),
-    "import": Command("data.data_exchange", "turn PS-FCN trees and DiLiGenT folders into shards",
+    "card": Command("pipelines.data.data_card", "write the dataset card and Croissant JSON", stores=True),
+    "export": Command("pipelines.data.data_exchange", "write scenes in a layout other loaders read", stores=True),
+    "relight": Command("pipelines.data.data_relight", "mix images under many lights from a light stage"),
+    "import": Command("pipelines.data.data_exchange", "turn PS-FCN trees and DiLiGenT folders into shards",
                       "add_import_arguments", "import_main"),
-    "pack": Command("data.data_pack", "write the scenes into WebDataset tars, for training that streams", stores=True),
+    "pack": Command("pipelines.data.data_pack", "pack scenes into WebDataset tars for streaming", stores=True),
 })  # fmt: skip
 
 COMMANDS: dict[str, Command | Group] = {
-    "infer": Command("infer", "find normals, lights and a surface in a folder of photographs"),
-    "app": Command("app.app", "serve a local page for photographs, scenes and data"),
-    "doctor": Command("bench.doctor", "show what this machine has and what is missing"),
-    "demo": Command("demo", "render, train, evaluate and regenerate, fitted to this machine"),
-    "render-data": Command("rendering.render_data", "render the training scenes of a preset", stores=True),
+    "infer": Command("pipelines.infer", "find normals, lights and a surface in a folder of photographs"),
+    "app": Command("pipelines.app.app", "serve a local page for photographs, scenes and data"),
+    "doctor": Command("pipelines.doctor", "show what this machine has and what is missing"),
+    "demo": Command("pipelines.demo", "render, train, evaluate and regenerate, fitted to this machine"),
+    "render-data": Command("pipelines.rendering.render_data", "render the training scenes of a preset", stores=True),
     "data": DATA,
-    "models": Command("train.list_models", "list the learned models"),
-    "train": Command("train.train", "train models, by default LCNet, then NENet", stores=True),
-    "eval-merltest": Command("evaluate.eval_merltest", "render and score MERL-Test scenes"),
-    "eval-diligent": Command("benchmarks.eval_diligent", "score methods on DiLiGenT's objects, by folder"),
-    "eval-lights": Command("benchmarks.eval_lights", "score lighting on Gourd&Apple or the Light Stage gallery"),
-    "eval-figures": Command("evaluate.figures.eval_figures", "make the paper's figures on MERL-Test scenes"),
-    "eval-classical": Command("evaluate.eval_classical", "compare the classical methods on rendered scenes"),
-    "eval-photos": Command("benchmarks.eval_photos", "score uncalibrated methods on real photographs"),
-    "curves": Command("train.compare_curves", "draw learning curves of runs, and where they are heading"),
-    "ship": Command("train.ship", "copy trained weights to where commands find them without being told"),
-    "shipped-results": Command("report.shipped_results", "write down how good the pretrained weights are"),
-    "report": Command("report.page", "collect everything evaluated into one page"),
-    "regenerate": Command("rendering.regenerate", "render test scenes of chosen shapes and materials"),
-    "fit-material": Command("rendering.fit_material", "fit the built-in model to a MERL .binary table"),
+    "models": Command("pipelines.train.list_models", "list the learned models"),
+    "train": Command("pipelines.train.train", "train models, by default LCNet, then NENet", stores=True),
+    "eval-merltest": Command("pipelines.evaluate.eval_merltest", "render and score MERL-Test scenes"),
+    "eval-diligent": Command("pipelines.benchmarks.eval_diligent", "score methods on DiLiGenT's objects, by folder"),
+    "eval-lights": Command("pipelines.benchmarks.eval_lights", "score lights on Gourd&Apple or Light Stage"),
+    "eval-classical": Command("pipelines.evaluate.eval_classical", "compare the classical methods on rendered scenes"),
+    "eval-photos": Command("pipelines.benchmarks.eval_photos", "score uncalibrated methods on real photographs"),
+    "report": Command("pipelines.report.page", "collect everything evaluated into one page"),
+    "regenerate": Command("pipelines.rendering.regenerate", "render test scenes of chosen shapes and materials"),
+    "fit-material": Command("pipelines.rendering.fit_material", "fit the built-in model to a MERL .binary table"),
     "materials": Command(
-        "rendering.catalogue", "list the built-in materials", "add_material_arguments", "materials_main"
+        "pipelines.rendering.catalogue", "list the built-in materials", "add_material_arguments", "materials_main"
     ),
-    "shapes": Command("rendering.catalogue", "list the shape families", "add_shape_arguments", "shapes_main"),
-    "noise": Command("rendering.image_noise", "measure the renderer's noise against converged images"),
-    "bench-train": Command("bench.bench_train", "measure training against a plain float32 loop"),
-    "bench-classical": Command("bench.bench_classical", "time the classical methods on a large object"),
-    "bench-checks": Command("bench.bench_checks", "count false alarms and hits of the photograph checks"),
-    "bench-infer": Command("bench.bench_infer", "time sdps infer on photographs of a large object"),
-    "bench-surface": Command("bench.bench_surface", "score and time depth, meshes and relit pictures"),
-    "bench": Command("bench.bench", "measure the renderer against Mitsuba's path integrator"),
+    "shapes": Command("pipelines.rendering.catalogue", "list the shape families", "add_shape_arguments", "shapes_main"),
 }
+
+IN_LAB = ("bench", "bench-checks", "bench-classical", "bench-infer", "bench-surface", "bench-train",
+          "eval-figures", "noise", "ship", "shipped-results")  # fmt: skip
+"""Commands that `lab` has, which is not installed."""
+
+Commands = Mapping[str, Command | Group]
 
 
 class _Parser(argparse.ArgumentParser):
@@ -93,18 +88,20 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message}; see `{self.prog} --help`")
 
 
-def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
+def build_parser(words: Sequence[str], commands: Commands = COMMANDS, program: str = "sdps") -> argparse.ArgumentParser:
     """Return the parser; only the flags of the command that `words` name are declared, so that one module is loaded.
 
     Args:
         words: What was typed, without the flags.
+        commands: What can be run.
+        program: How it is called.
 
     Raises:
         InputError: an unknown command, with the nearest.
     """
-    parser = _Parser(prog="sdps", description="Photometric-stereo data and training (SDPS-Net) with Mitsuba 3.")
+    parser = _Parser(prog=program, description="Photometric-stereo data and training (SDPS-Net) with Mitsuba 3.")
     parser.add_argument("--version", action="store_true", help="print the version and exit")
-    _add_commands(parser, COMMANDS, words, "command")
+    _add_commands(parser, commands, words, "command")
     return parser
 
 
@@ -114,6 +111,8 @@ def _add_commands(
     """Declare the commands of one level, and what follows the one that was typed."""
     wanted = words[0] if words else None
     if wanted is not None and wanted not in commands:
+        if wanted in IN_LAB:
+            raise InputError(f"{wanted}: not installed with the package; in a clone run `python -m lab {wanted}`")
         raise unknown(kind, wanted, commands)
 
     def show_help(_: argparse.Namespace) -> int:
@@ -130,7 +129,7 @@ def _add_commands(
         if isinstance(command, Group):
             _add_commands(child, command.commands, words[1:], f"{name} command")
         else:
-            module = importlib.import_module(f"pipelines.{command.module}")
+            module = importlib.import_module(command.module)
             getattr(module, command.declare)(child)
             child.set_defaults(run=getattr(module, command.run), stores=command.stores)
 
@@ -157,21 +156,21 @@ def version() -> str:
         return "unknown"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, commands: Commands = COMMANDS, program: str = "sdps") -> int:
     """Run one command and return its exit code: 0 done, 1 something is missing, 2 bad input, 130 stopped."""
     argv = list(sys.argv[1:] if argv is None else argv)
     try:
-        args = build_parser([word for word in argv if not word.startswith("-")]).parse_args(argv)
+        args = build_parser([word for word in argv if not word.startswith("-")], commands, program).parse_args(argv)
         if args.version:
             sys.stdout.write(f"sdps {version()}\n")
             return 0
         _require_folders(args)
         return args.run(args)
     except InputError as error:
-        sys.stderr.write(f"sdps: {error}\n")
+        sys.stderr.write(f"{program}: {error}\n")
         return 2
     except KeyboardInterrupt:
-        sys.stderr.write("sdps: stopped; what is finished is kept, run the same command again to go on\n")
+        sys.stderr.write(f"{program}: stopped; what is finished is kept, run the same command again to go on\n")
         return 130
     except BrokenPipeError:  # the reader of a list closed early, e.g. `sdps materials | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -180,7 +179,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.filename is None:
             raise
         name = os.fsdecode(error.filename) if isinstance(error.filename, bytes) else error.filename
-        sys.stderr.write(f"sdps: {InputError(f'{name}: {error.strerror}; name another file or folder')}\n")
+        sys.stderr.write(f"{program}: {InputError(f'{name}: {error.strerror}; name another file or folder')}\n")
         return 2
 
 

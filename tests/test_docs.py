@@ -12,12 +12,13 @@ from pathlib import Path
 import pytest
 import yaml
 
+from lab.commands import COMMANDS as IN_LAB
 from pipelines.cli import COMMANDS, Group
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
-PACKAGES = ("render", "sdps", "pipelines")
+PACKAGES = ("render", "sdps", "pipelines", "lab")
 TOPS = (*PACKAGES, "assets", "tests", "docs")
 NAMES = {path.name for top in (*PACKAGES, "tests") for path in (ROOT / top).rglob("*.py")} | {"run_model.py"}
 """Python files of the project, and one of SDPS-Net's code."""
@@ -30,6 +31,7 @@ SPAN = re.compile(r"`([^`\n]+)`")
 PATH = re.compile(rf"(?:{'|'.join(TOPS)})/[\w./-]+")
 DOTTED = re.compile(rf"(?<![\w/.-])(?:{'|'.join(PACKAGES)})(?:\.\w+)+")
 SDPS = re.compile(r"(?:^|[\s;`(])(?<!from )(?<!import )sdps ([a-z][a-z-]*)(?: ([a-z][a-z-]*))?")
+LAB = re.compile(r"python -m lab ([a-z][a-z-]*)")
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 MAKE = re.compile(r"(?:^|[\s;`(])make ([a-z][a-z-]*)")
 
@@ -80,7 +82,9 @@ def _bound(node: ast.stmt) -> set[str]:
 @cache
 def flags() -> set[str]:
     """Return the flags of all commands together; those made of a configuration's fields stand in the promised ones."""
-    code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "pipelines").rglob("*.py"))
+    code = "".join(
+        path.read_text(encoding="utf-8") for top in ("pipelines", "lab") for path in (ROOT / top).rglob("*.py")
+    )
     code += (ROOT / "tests" / "support" / "interface.json").read_text(encoding="utf-8")
     either = re.findall(r'"--([a-z][a-z-]*)",\s*action=argparse.BooleanOptionalAction', code)
     return {*re.findall(r'"(--[a-z][a-z-]*)"', code), *(f"--no-{name}" for name in either), "--help"}
@@ -142,6 +146,8 @@ def test_commands_shown_are_there(page):
             if isinstance(COMMANDS[name], Group) and second:
                 assert second in COMMANDS[name].commands, f"{page.name}: sdps {name} {second}"
             assert set(FLAG.findall(shown)) <= flags(), f"{page.name}: {shown}"
+        for name in LAB.findall(shown):
+            assert name in IN_LAB, f"{page.name}: python -m lab {name}"
         for name in MAKE.findall(shown):
             assert name in targets, f"{page.name}: make {name}"
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from lab.commands import COMMANDS as IN_LAB
 from pipelines import cli
 from pipelines.shared import presets
 from sdps.training import training_config
@@ -29,12 +30,12 @@ def flags(parser: argparse.ArgumentParser) -> dict[str, str]:
     return {" ".join(action.option_strings) or action.dest: repr(action.default) for action in actions}
 
 
-def commands() -> dict[str, dict[str, str]]:
+def commands(there: cli.Commands = cli.COMMANDS) -> dict[str, dict[str, str]]:
     found = {}
-    for name, command in cli.COMMANDS.items():
+    for name, command in there.items():
         words = [[name, child] for child in command.commands] if isinstance(command, cli.Group) else [[name]]
         for path in words:
-            parser = cli.build_parser(path)
+            parser = cli.build_parser(path, there)
             for word in path:
                 parser = choices(parser)[word]
             found[" ".join(path)] = flags(parser)
@@ -58,10 +59,10 @@ def _fields(kind: type) -> dict[str, str]:
     }
 
 
-@pytest.mark.parametrize("kind", ["commands", "keys"])
+@pytest.mark.parametrize("kind", ["commands", "lab", "keys"])
 def test_nothing_that_users_rely_on_is_gone(kind: str) -> None:
     promised = json.loads(FILE.read_text(encoding="utf-8"))[kind]
-    there = {"commands": commands, "keys": keys}[kind]()
+    there = {"commands": commands, "lab": lambda: commands(IN_LAB), "keys": keys}[kind]()
     for place, names in promised.items():
         assert place in there
         for name, default in names.items():
@@ -69,6 +70,5 @@ def test_nothing_that_users_rely_on_is_gone(kind: str) -> None:
 
 
 if __name__ == "__main__":
-    FILE.write_text(
-        json.dumps({"commands": commands(), "keys": keys()}, indent=1, sort_keys=True) + "\n", encoding="utf-8"
-    )
+    there = {"commands": commands(), "lab": commands(IN_LAB), "keys": keys()}
+    FILE.write_text(json.dumps(there, indent=1, sort_keys=True) + "\n", encoding="utf-8")

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def peak_of(code: str) -> int:
     """Run code in a process of its own and return its peak."""
-    code = f"from pipelines.shared.memory import peak_bytes\n{code}\nprint(peak_bytes())"
+    code = f"from lab.shared.memory import peak_bytes\n{code}\nprint(peak_bytes())"
     command = [sys.executable, "-c", code]
     return int(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout)
 

@@ -7,7 +7,7 @@
 with x, y and o of `image_model`. The terms were chosen one by one: each explains most of what those before it leave of
 the 100 materials fitted to MERL. The numbers m of an object are those that explain best what the rest of the model
 leaves of its images: weighted least squares of the logarithms, with a normal distribution in front of them. That
-distribution is of such materials on a sphere: `docs/scripts/reflectance_modes.py` measures it.
+distribution is of such materials on a sphere: `lab/studies/reflectance_modes.py` measures it.
 """
 
 from functools import cache

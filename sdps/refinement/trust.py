@@ -1,7 +1,7 @@
 """How far refinement can be trusted: the errors to expect of it and of its start, and reasons to keep the start.
 
 The formulas were fitted on rendered scenes of shapes and lights that no network was trained on, by
-`docs/scripts/refinement_study.py --fit`; docs/studies/refinement.md shows expected against actual errors.
+`lab/studies/refinement_study.py --fit`; docs/studies/refinement.md shows expected against actual errors.
 """
 
 from collections.abc import Iterator

@@ -91,8 +91,9 @@ def start(words: list[str], fault: str, rng: random.Random) -> subprocess.Popen[
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    program = "lab" if words[0] == "ship" else "pipelines.cli"
     return subprocess.Popen(
-        [sys.executable, "-m", "pipelines.cli", *words], cwd=ROOT, env=environment, stdout=subprocess.DEVNULL,
+        [sys.executable, "-m", program, *words], cwd=ROOT, env=environment, stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE, start_new_session=True, preexec_fn=full if fault == "full disk" else None,
     )  # fmt: skip
 

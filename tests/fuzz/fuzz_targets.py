@@ -244,14 +244,13 @@ def _command_lines(folder: Path) -> None:
             number += 1
 
 
-_LONG = ("bench", "bench-train", "bench-classical", "bench-checks", "bench-infer", "bench-surface", "shapes")
+_LONG = ("shapes",)
 """Commands that begin to work whatever their flags are; only flags they do not have are tried."""
 
 
 def _stop(words: tuple[str, ...], actions: list[Any]) -> list[str]:
     """Return flags that end a command which needs no other, before anything long is begun."""
     stops = {
-        "noise": ["--reference", "0", "--size", "0"],
         "materials": ["--materials", "missing"],
         "app": ["--max-files", "0", "--max-megabytes", "0"],
     }

@@ -15,10 +15,11 @@ import pytest
 import trimesh
 from sdps_scenes import hemisphere_lights
 
-from pipelines.bench import bench_infer
+from lab.bench import bench_infer
+from lab.commands import main as lab_main
+from lab.shared.machines import HERE, kinds
 from pipelines.cli import build_parser, main
 from pipelines.infer import write_page
-from pipelines.shared.machines import HERE, kinds
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.progress import listening
@@ -300,13 +301,13 @@ def test_every_stage_tells_how_far_it_is(hills: tuple, tmp_path: Path) -> None:
 
 def test_the_bench_measures_every_step(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     flags = ["--height", "48", "--width", "64", "--images", "12", "--many", "20", "--out", str(tmp_path)]
-    assert main(["bench-infer", *flags, "--methods", "factorisation"]) == 0
+    assert lab_main(["bench-infer", *flags, "--methods", "factorisation"]) == 0
     found = json.loads((tmp_path / "bench_infer.json").read_text())["kinds"]
     assert tuple(found) == kinds()  # this machine, and it held to AVX2 where it has more
     runs = found[HERE]
     assert runs["factorisation, 20 pictures"]["peak_gib"] > 0 and runs["factorisation, 12 pictures"]["seconds"] > 0
     assert "within 180 s, 3 GiB" in capsys.readouterr().out
-    assert main(["bench-infer", "--quick", "--out", str(tmp_path)]) == 0
+    assert lab_main(["bench-infer", "--quick", "--out", str(tmp_path)]) == 0
     large = json.loads((tmp_path / "bench_large.json").read_text())
     assert large["stages"]["normals"] > 0 and large["peak_gib"] > 0 and large["expected"] > 0
     assert "million" not in (said := capsys.readouterr().out) and "minutes, expected" in said

@@ -161,7 +161,7 @@ def test_doctor_reports_variant_and_cores(capsys):
 
 
 def test_doctor_passes_on_a_small_disk_and_says_so(capsys, monkeypatch):
-    monkeypatch.setattr("pipelines.bench.doctor.free_bytes", lambda folder: 3_200_000_000)
+    monkeypatch.setattr("pipelines.doctor.free_bytes", lambda folder: 3_200_000_000)
     assert main(["doctor"]) == 0
     assert "3.2 GB; the demo takes about 5.0 GB, choose another --out" in capsys.readouterr().out
 

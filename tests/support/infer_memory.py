@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 
-from pipelines.shared.memory import peak_bytes
+from lab.shared.memory import peak_bytes
 from sdps.api import infer, load
 
 

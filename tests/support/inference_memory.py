@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from sdps_scenes import hemisphere_lights, shade, sphere_normals
 
-from pipelines.shared.memory import peak_bytes
+from lab.shared.memory import peak_bytes
 from render.shared.config import to_plain
 from sdps.data.augment import Augmentation
 from sdps.inference.estimator import Estimator

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from sdps_scenes import hemisphere_lights
 
-from pipelines.shared.memory import peak_bytes
+from lab.shared.memory import peak_bytes
 from render.shared.config import to_plain
 from sdps.data.augment import Augmentation
 from sdps.inference import estimator as estimators

@@ -1,4 +1,4 @@
-"""Fit the built-in model to any BRDF and write it as YAML; docs/scripts/fit_library.py made the library so."""
+"""Fit the built-in model to any BRDF and write it as YAML; lab/studies/fit_library.py made the library so."""
 
 import dataclasses
 import json

@@ -1,11 +1,12 @@
-"""`sdps eval-classical`, `sdps bench-classical`, and the scores kept on disk."""
+"""`sdps eval-classical`, `python -m lab bench-classical`, and the scores kept on disk."""
 
 import json
 
 import pytest
 
+from lab.bench import bench_classical
+from lab.commands import main as lab_main
 from pipelines import cli
-from pipelines.bench import bench_classical
 from pipelines.evaluate.evaluation import ScoreCache
 
 SMALL = ["--set", "test.shapes=[sphere]", "--set", "test.materials=['lambertian:0.5', red-phenolic]",
@@ -35,7 +36,7 @@ def test_unknown_method_is_one_line(capsys):
 
 def test_bench_measures_each_method_in_its_own_process(tmp_path, capsys):
     arguments = ["--height", "40", "--width", "48", "--lights", "12", "--out", str(tmp_path)]
-    assert cli.main(["bench-classical", *arguments, "--methods", "least-squares,factorisation"]) == 0
+    assert lab_main(["bench-classical", *arguments, "--methods", "least-squares,factorisation"]) == 0
     found = json.loads((tmp_path / "bench_classical.json").read_text())["methods"]
     assert found["factorisation"]["peak_gib"] > 0 and found["least-squares"]["normal_mae"] < 20
     assert "times least squares" in capsys.readouterr().out
@@ -43,7 +44,7 @@ def test_bench_measures_each_method_in_its_own_process(tmp_path, capsys):
 
 @pytest.mark.parametrize("arguments", [["--height", "8"], ["--lights", "3"]])
 def test_bench_too_small(arguments, capsys):
-    assert cli.main(["bench-classical", *arguments]) == 2
+    assert lab_main(["bench-classical", *arguments]) == 2
     assert "at least" in capsys.readouterr().err
 
 

@@ -1,12 +1,11 @@
 """The fitter recovers BRDFs that are known in closed form; the metric and the network reader behave."""
 
-import fit_library
-import material_models
 import numpy as np
 import pytest
-from fit_library import NetworkFile, half_difference
 from merl_support import glossy
 
+from lab.studies import fit_library, material_models
+from lab.studies.fit_library import NetworkFile, half_difference
 from render.materials import model
 from render.materials.categories import category
 from render.materials.fit import fitting, solver, spheres

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from fit_library import half_difference
 from merl_support import glossy, hemisphere, values
 
+from lab.studies.fit_library import half_difference
 from render.materials import library, merl
 from render.shared.errors import InputError
 

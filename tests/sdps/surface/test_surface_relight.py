@@ -9,8 +9,8 @@ from classical_scenes import sphere as shaded_sphere
 from sdps_scenes import write_data
 from surface_scenes import sphere
 
-from pipelines.bench import bench_surface
-from pipelines.cli import main
+from lab.bench import bench_surface
+from lab.commands import main as lab_main
 from render.records.shards import Shard
 from render.shared.errors import InputError
 from sdps.core.integration import integrate
@@ -190,7 +190,7 @@ def test_directions_are_refused(scene):
 def test_the_bench_scores_scenes_and_times_steps(tmp_path, capsys):
     write_data(tmp_path / "data", ("train",), lights=8, size=64)
     flags = ["--height", "48", "--width", "64", "--images", "12", "--steps", "albedo", "--out", str(tmp_path / "out")]
-    assert main(["bench-surface", str(tmp_path / "data"), *flags]) == 0
+    assert lab_main(["bench-surface", str(tmp_path / "data"), *flags]) == 0
     found = json.loads((tmp_path / "out" / "bench_surface.json").read_text())
     assert [row["normals"] for row in found["depths"]] == ["true normals", "least squares"]
     assert found["depths"][0]["mae"] < 0.1 < found["depths"][1]["mae"] < 10.0  # attached shadows mislead least squares
@@ -202,8 +202,8 @@ def test_the_bench_scores_scenes_and_times_steps(tmp_path, capsys):
         took = bench_surface._work(step, bench_surface.BenchClassicalConfig(height=32, width=40, lights=12))
         assert took["pixels"] > 500 and took["seconds"] > 0
     assert "pixels of object, 12 images" in capsys.readouterr().out
-    assert main(["bench-surface", str(tmp_path / "nowhere"), *flags]) == 2
-    assert main(["bench-surface", "--steps", "albdo"]) == 2
+    assert lab_main(["bench-surface", str(tmp_path / "nowhere"), *flags]) == 2
+    assert lab_main(["bench-surface", "--steps", "albdo"]) == 2
     assert "did you mean 'albedo'" in capsys.readouterr().err
 
 

@@ -13,8 +13,8 @@ import pytest
 import torch
 from sdps_scenes import write_data
 
+from lab.shared.machines import HELD, hold, kinds
 from pipelines.cli import main
-from pipelines.shared.machines import HELD, hold, kinds
 from render.shared.errors import InputError
 from sdps.core import precision
 from sdps.core.precision import arithmetic

@@ -1,0 +1,155 @@
+"""Error per material on BUNNY beside the published curves (the paper's supplement)."""
+
+import csv
+from dataclasses import dataclass
+from importlib import resources
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import spearmanr
+
+from lab.figures.drawn import Drawn, LeftOut, paper_row
+from pipelines.evaluate.workbench import Workbench, lit_object
+from pipelines.report.sections import Table
+from pipelines.shared import charts
+from pipelines.shared.text_tables import number
+from render.shared.errors import InputError
+from render.shared.files import read_text
+
+SHAPE = "bunny"
+FILE = "published/sdps_bunny_per_brdf.csv"
+COLUMNS = {"B1": "SDPS_Net", "B0": "PS_FCN", "B5": "UPS_FCN_deep_mask", "B9": "UPS_FCN_retrain"}
+LABELS = {"SDPS_Net": "SDPS-Net", "PS_FCN": "PS-FCN", "UPS_FCN_deep_mask": "UPS-FCN deep+mask",
+          "UPS_FCN_retrain": "UPS-FCN retrain"}  # fmt: skip
+HARDEST = 10
+
+
+def read_published() -> dict[str, dict[str, float]]:
+    """Return {method: {material: MAE in degrees}} of the published curves.
+
+    Raises:
+        InputError: the table that travels with the package is missing or damaged.
+    """
+    path = resources.files("assets") / FILE
+    lines = [line for line in read_text(str(path)).splitlines() if not line.startswith("#")]
+    try:
+        rows = list(csv.DictReader(lines))
+        return {name: {row["brdf"]: float(row[name]) for row in rows} for name in COLUMNS.values()}
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged table ({error}); install the package again") from error
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A method's errors beside the published curve it is compared with.
+
+    Attributes:
+        method: Its name.
+        errors: MAE in degrees by material; without those it failed on.
+        beside: Column of the published curve.
+    """
+
+    method: str
+    errors: dict[str, float]
+    beside: str
+
+    def rank_correlation(self, curves: dict[str, dict[str, float]]) -> tuple[float, float, int]:
+        """Return Spearman's rho with the published curve, its p-value and the number of materials; NaN where
+        fewer than 3 errors differ."""
+        shared = [name for name in self.errors if name in curves[self.beside]]
+        ours, theirs = ([column[name] for name in shared] for column in (self.errors, curves[self.beside]))
+        if len(set(ours)) < 3:
+            return float("nan"), float("nan"), len(shared)
+        found = spearmanr(ours, theirs)
+        return float(found.statistic), float(found.pvalue), len(shared)
+
+
+def make(bench: Workbench) -> Drawn:
+    """Evaluate and draw; errors are averaged over `test.repeats` draws of the intensities.
+
+    Raises:
+        LeftOut: no bunny among the shapes, or no method that gives normals.
+        InputError: scenes that cannot be rendered or read.
+    """
+    if SHAPE not in bench.config.shapes:
+        raise LeftOut(f"materials needs {SHAPE} in test.shapes; the published curves are for it")
+    runners = [runner for runner in bench.runners if runner.method.normals]
+    if not runners:
+        raise LeftOut("materials needs a method that gives normals; add one to --methods")
+    published = read_published()
+    wanted, folder = bench.merltest()
+    wanted = [scene for scene in wanted if scene.shape == SHAPE]
+    found: dict[str, dict[str, list[float]]] = {runner.method.name: {} for runner in runners}
+    repeats = range(bench.config.repeats)
+    objects = ((s.material, lit_object(s, folder, bench.config, repeat)) for s in wanted for repeat in repeats)
+    for material, runner, result in bench.evaluated(objects, runners, len(wanted) * len(repeats), "materials"):
+        found[runner.method.name].setdefault(material, []).append(result.scores.get("normal_mae", np.nan))
+    curves = []
+    for method in (runner.method for runner in runners):  # without what it failed on in any of the repeats
+        kept = {name: float(np.mean(e)) for name, e in found[method.name].items() if np.isfinite(e).all()}
+        curves.append(Curve(method.name, kept, COLUMNS.get(paper_row(method), "SDPS_Net")))
+    names = [scene.material for scene in wanted]
+    reference = published["SDPS_Net"]
+    order = sorted(names, key=lambda name: (reference.get(name, np.inf), name))
+    text = (
+        f"Normals of {SHAPE} with {len(names)} materials under the lights of {bench.config.lights}, "
+        f"{bench.config.repeats} draw(s) of random intensities. Materials are in the order of the published SDPS-Net "
+        "curve. Grey: the paper's curves, of its own rendering, digitised from the vector figure of its poster."
+    )
+    return Drawn(
+        title="Error per material",
+        text=text,
+        charts=(("materials", "Mean angular error of normals per material.", _chart(curves, order, published)),),
+        tables=(_summary(curves, published), _hardest(curves, published)),
+        values={
+            curve.method: {"rank_correlation": rho if np.isfinite(rho) else None, "beside": curve.beside,
+                           "normal_mae": curve.errors}
+            for curve in curves
+            for rho in curve.rank_correlation(published)[:1]
+        },
+    )  # fmt: skip
+
+
+def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
+    rows = []
+    for curve in curves:
+        rho, p, count = curve.rank_correlation(published)
+        beside = [published[curve.beside][name] for name in curve.errors if name in published[curve.beside]]
+        rows.append((
+            curve.method, number(float(np.mean(list(curve.errors.values())))) if curve.errors else "-",
+            LABELS[curve.beside], number(float(np.mean(beside))) if beside else "-",
+            f"{rho:.2f}" if np.isfinite(rho) else "-", f"{p:.1g}" if np.isfinite(p) else "-", str(count),
+        ))  # fmt: skip
+    note = "Mean angular error in degrees over mask pixels. Spearman's rank correlation over the materials."
+    header = ("method", "mean", "published curve", "its mean, same materials", "rank correlation", "p", "materials")
+    return Table(title=f"Error per material: {SHAPE}", header=header, rows=tuple(rows), note=note)
+
+
+def _hardest(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
+    """List the materials the first method finds hardest."""
+    first = curves[0].errors
+    names = sorted(first, key=lambda name: first[name], reverse=True)[:HARDEST]
+    rows = tuple(
+        (name, *(number(c.errors[name]) if name in c.errors else "-" for c in curves),
+         *(number(column[name]) if name in column else "-" for column in published.values()))
+        for name in names
+    )  # fmt: skip
+    header = ("material", *(c.method for c in curves), *(f"{LABELS[name]}, published" for name in published))
+    return Table(title=f"Hardest materials of {curves[0].method}", header=header, rows=rows, note="Degrees, as above.")
+
+
+def _chart(curves: list[Curve], order: list[str], published: dict[str, dict[str, float]]) -> Figure:
+    figure = charts.new_figure(max(7.0, 2.6 + 0.105 * len(order)), 5.2)
+    axes, x = figure.add_subplot(), np.arange(len(order))
+    chart = charts.LineChart(axes)
+    for style, (name, column) in enumerate(published.items()):
+        y = [column.get(material, np.nan) for material in order]
+        axes.plot(x, y, color=charts.PUBLISHED, lw=1.6 if style == 0 else 0.9, ls=charts.LINE_STYLES[style], zorder=1)
+        chart.end(f"{LABELS[name]}, published", y, "0.35")
+    for place, curve in enumerate(curves):
+        y = [curve.errors.get(material, np.nan) for material in order]
+        chart.line(place, charts.short(curve.method), x, y, ms=3.5, lw=0.9, zorder=3)
+    axes.set_xticks(x, order, rotation=90, fontsize=6 if len(order) > 40 else 8)
+    axes.set(ylabel="normals, mean angular error (degrees)", xlim=(-0.5, len(order) - 0.5))
+    chart.finish(gap=0.05)
+    return figure

@@ -1,0 +1,1 @@
+"""Trained weights into the package, and the tables of what they do."""

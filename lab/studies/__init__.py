@@ -1,0 +1,1 @@
+"""Scripts behind the figures of docs/studies; each says in its first lines how it is run."""

@@ -1,0 +1,76 @@
+"""Measure how reflectance of real materials leaves the model of refinement: assets/reflectance_modes.yaml.
+
+    python -m lab.studies.reflectance_modes
+
+Spheres of the fitted MERL materials that networks are trained on (the held-out ones are left out), under 100 lights;
+normals and lights are known. What `sdps.refinement.image_model` has of reflectance is fitted to each sphere. What is
+left, as logarithms, is explained by least squares with the terms of `sdps.refinement.modes`. Written: the mean product
+of their coefficients over the materials, without the tenth of materials with the largest ones.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from tqdm import tqdm
+
+from render.materials.fit.spheres import hemisphere_lights, shading_frame, sphere_normals
+from render.materials.library import held_out, load, names
+from render.materials.model import Material, evaluate
+from render.shared.files import atomic_path
+from sdps.refinement.descent import Problem, Weights, solve
+from sdps.refinement.image_model import State, factors
+from sdps.refinement.modes import ASSET, MODES, left_over, terms
+from sdps.refinement.problems import problem_of
+from sdps.refinement.refine import start_of
+
+_SIDE, _LIGHTS, _ITERATIONS = 42, 100, 300
+_KEPT = 0.9  # share of the materials
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Fit, and write the asset."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=ASSET)
+    args = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    lights = hemisphere_lights(_LIGHTS, np.random.default_rng(0)).astype(np.float32)
+    chosen = sorted(set(names()) - set(held_out()))
+    found = np.stack([coefficients(load(name), lights) for name in tqdm(chosen, disable=None)])
+    size = np.square(found).sum(axis=1)
+    found = found[size <= np.quantile(size, _KEPT)]
+    rows = [[float(f"{value:.3g}") for value in row] for row in found.T @ found / len(found)]
+    with atomic_path(args.out) as temporary:
+        head = "# Mean products of the coefficients of reflectance modes. Made by lab/studies/reflectance_modes.py.\n"
+        temporary.write_text(head + yaml.safe_dump({"second_moments": rows}, default_flow_style=None, width=110))
+    return 0
+
+
+def coefficients(material: Material, lights: np.ndarray) -> np.ndarray:  # (MODES,)
+    """Return the coefficients of a material's modes."""
+    mask, normals = sphere_normals(_SIDE)
+    images = np.zeros((len(normals), 3, len(lights)), np.float32)
+    for number, light in enumerate(lights):
+        wi, wo = shading_frame(normals, light)
+        images[:, :, number] = np.pi * evaluate(material, wi, wo) * np.maximum(wi[:, 2:], 0.0)
+    problem: Problem = problem_of(images, mask, 1, np.ones((len(lights), 3)), np.full((3, len(lights)), np.inf))
+    state: State = start_of(problem, normals, lights, np.ones((len(lights), 3)))
+    free = frozenset({"log_albedo", "log_strength", "body", "lobes", "log_sharpness"})
+    state = solve(problem, state, free=free, iterations=_ITERATIONS, boost=4.0, weights=Weights())
+    left, weights = left_over(factors(state), problem.images, problem.kept)
+    shapes = terms(*(torch.from_numpy(part.astype(np.float32)) for part in (normals, lights)))
+    shapes = torch.cat([torch.ones_like(shapes[..., :1]), shapes], dim=-1).flatten(0, 1).double()  # (P L, 1 + MODES)
+    root = weights.flatten().double().sqrt()[:, None]
+    least = 1e-4 * torch.eye(1 + MODES, dtype=torch.float64) / weights.numel()
+    scaled = shapes * root
+    return torch.linalg.solve(scaled.T @ scaled + least, scaled.T @ (left.flatten().double()[:, None] * root))[
+        1:, 0
+    ].numpy()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
