@@ -21,6 +21,7 @@ class Command(NamedTuple):
         declare: Function of the module that adds flags to a parser.
         run: Function of the module that takes the parsed flags and returns the exit code.
         stores: Whether its folders may be addresses in object storage.
+        hidden: Whether it is an earlier name, which works and is not listed.
     """
 
     module: str
@@ -28,6 +29,7 @@ class Command(NamedTuple):
     declare: str = "add_arguments"
     run: str = "main"
     stores: bool = False
+    hidden: bool = False
 
 
 class Group(NamedTuple):
@@ -123,7 +125,8 @@ def _add_commands(
     children = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
     for name, command in commands.items():
         about = command.about
-        child = children.add_parser(name, help=about, description=about[0].upper() + about[1:] + ".")
+        listed = {} if isinstance(command, Command) and command.hidden else {"help": about}
+        child = children.add_parser(name, description=about[0].upper() + about[1:] + ".", **listed)
         if name != wanted:
             continue
         if isinstance(command, Group):
