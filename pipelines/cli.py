@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from render.shared.errors import InputError, unknown
 from render.shared.storage import address
@@ -125,8 +125,9 @@ def _add_commands(
     children = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
     for name, command in commands.items():
         about = command.about
-        listed = {} if isinstance(command, Command) and command.hidden else {"help": about}
-        child = children.add_parser(name, description=about[0].upper() + about[1:] + ".", **listed)
+        hidden = isinstance(command, Command) and command.hidden
+        told: dict[str, Any] = {"description": f"{about[0].upper()}{about[1:]}."} | ({} if hidden else {"help": about})
+        child = children.add_parser(name, **told)
         if name != wanted:
             continue
         if isinstance(command, Group):
