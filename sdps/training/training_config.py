@@ -49,7 +49,7 @@ class TrainingConfig:
         compile: Compile the network with `torch.compile`.
         precision: `auto` (what is faster on this machine, `sdps.core.precision`), `float32`, or `bfloat16`, which
             runs the networks under autocast; weights and loss stay float32.
-        channels_last: Keep feature maps channels-last, which is faster on every processor tried (docs/studies/speed.md).
+        channels_last: Keep feature maps channels-last, faster on every processor tried (docs/studies/speed.md).
         workers: Loader processes; 0 loads in the trainer's own.
         cache: Keep decoded scenes as memory-mapped arrays in `<data>/cache`.
         shuffle_window: Of a packed set (`sdps data pack`), scenes among which the order is drawn; only about twice as
