@@ -47,7 +47,7 @@ class TrainedModel:
     metadata: dict[str, Any]
 
     @property
-    def role(self) -> str:
+    def role(self) -> registry.Role:
         """What the model is for; see `registry.ModelEntry`."""
         return registry.entry(self.name).role
 

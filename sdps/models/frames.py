@@ -20,8 +20,9 @@ from torch.nn import functional
 from render.shared.errors import InputError, unknown
 from render.shared.progress import stage
 from sdps.core.first_normals import first_normals, frames
+from sdps.core.losses import NormalCriterion, expected_error_loss
 from sdps.core.symmetry import Symmetry
-from sdps.models.base import KeepingNetwork, Observations, TurningNetwork
+from sdps.models.base import FusionNetwork, Observations, Truth
 from sdps.models.blocks import LOG_USUAL, SLOPE, chord_degrees, conv, deconv
 
 FRAMES = ("normal", "camera")
@@ -78,7 +79,7 @@ class StagedNormals(NamedTuple):
     expected: Tensor  # (B, 1, H, W), distance to the true normals
 
 
-class FrameNet(KeepingNetwork, TurningNetwork):
+class FrameNet(FusionNetwork):
     """Normals pixel by pixel in frames of their own, then corrected by their surroundings.
 
     Args:
@@ -89,6 +90,7 @@ class FrameNet(KeepingNetwork, TurningNetwork):
 
     needs_mask = True
     kept_bytes = 6
+    equivariant = True
 
     def __init__(self, *, width: int = 64, blocks: int = 4, frame: str = "normal") -> None:
         super().__init__()
@@ -112,13 +114,22 @@ class FrameNet(KeepingNetwork, TurningNetwork):
         for parameter in (*self.offset.parameters(), *self.leave[-1].parameters()):
             nn.init.zeros_(parameter)
 
-    def forward(self, seen: Observations) -> Tensor:
-        return self.regress(self.encode(seen))
-
     def staged(self, seen: Observations) -> StagedNormals:
         """Return what is learned: the normals of pixels alone, the corrected ones, and the error to expect of these."""
         fused = self.encode(seen)
         return StagedNormals(fused.normals, *self.corrected(fused))
+
+    def loss(self, seen: Observations, truth: Truth, criterion: NormalCriterion) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the losses of the normals at both stages plus, weighted, that of the expected error."""
+        staged = self.staged(seen)
+        loss, terms = criterion(staged.normals, truth.normals, truth.mask)
+        terms["pixel_loss"], _ = criterion(staged.alone, truth.normals, truth.mask)
+        terms["expected_loss"] = expected_error_loss(staged.expected, staged.normals, truth.normals, truth.mask)
+        return loss + terms["pixel_loss"] + criterion.expected_weight * terms["expected_loss"], terms
+
+    def inference_seconds(self, images: int, pixels: float, box: float, views: int) -> float:
+        """Return about how long inference takes: views are turned after the images are fused."""
+        return 2.1e-6 * images * pixels + 2.0e-6 * views * box
 
     def encode(self, seen: Observations) -> FusedMap:
         """Return the fused map of all of a scene's images; without gradients a few pixels at a time."""
@@ -146,27 +157,27 @@ class FrameNet(KeepingNetwork, TurningNetwork):
         change = self.leave(torch.cat([back, entered], dim=1)).float()
         return functional.normalize(normals + change[:, :3], dim=1), (change[:, 3:] + LOG_USUAL).exp()
 
-    def turned(self, feature: FusedMap, symmetry: Symmetry) -> FusedMap:
+    def turn(self, feature: FusedMap, symmetry: Symmetry) -> FusedMap:
         """Return the fused map of the turned scene: its pixels see their lights in frames that turn with them."""
         normals, fused, mask = (symmetry.images(each) for each in feature)
         return FusedMap(symmetry.vectors(normals, dim=1), fused, mask)
 
-    def kept(self, seen: Observations) -> Observations:
-        """Return some of a scene's images, in 16 bits, for `fused`."""
-        return seen._replace(images=seen.images.half())
+    def accumulate(self, so_far: list[Observations] | None, seen: Observations) -> list[Observations]:
+        """Keep the images of a scene, in 16 bits."""
+        return [*(so_far or []), seen._replace(images=seen.images.half())]
 
-    def fused(self, parts: list[Observations]) -> FusedMap:
+    def aggregate(self, accumulated: list[Observations]) -> FusedMap:
         """Return the fused map of all of a scene's images, which are never copied as a whole."""
-        assert parts[0].mask is not None  # the network asks for it
-        inside = parts[0].mask[:, 0] > 0.5  # (1, H, W)
-        directions, errors = _all_lights(parts)
+        assert accumulated[0].mask is not None  # the network asks for it
+        inside = accumulated[0].mask[:, 0] > 0.5  # (1, H, W)
+        directions, errors = _all_lights(accumulated)
         found = torch.zeros(inside.numel(), 3 + _MAP, device=inside.device)
         places = inside.flatten().nonzero()[:, 0]
         strips = places.split(max(1, _STRIP // directions.shape[1]))
         for number, some in enumerate(strips):
             # Autocast to bfloat16 refuses to join images of 16-bit floats.
             with torch.autocast(inside.device.type, enabled=False):
-                values = torch.cat([part.images[0].flatten(2)[..., some] for part in parts])  # (Q, 3, n)
+                values = torch.cat([part.images[0].flatten(2)[..., some] for part in accumulated])  # (Q, 3, n)
             lights = (each.expand(len(some), *each.shape[1:]) for each in (directions, errors))
             found[some] = self._per_pixel(Pixels(values.permute(2, 0, 1).float(), *lights)).float()
             stage("normals", number + 1, len(strips))

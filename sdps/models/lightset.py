@@ -17,7 +17,7 @@ from torch.nn import functional
 from render.shared.errors import InputError
 from sdps.core.lighting import LightClasses, ReadOut
 from sdps.core.losses import expected_distance_loss
-from sdps.models.base import Lights, MeetingNetwork
+from sdps.models.base import LightingNetwork, Lights
 from sdps.models.blocks import LOG_USUAL, SLOPE, Convolution, chord_degrees
 
 SIDE = 64
@@ -82,7 +82,7 @@ class Attention(nn.Module):
         return tokens + self.think(self.between(tokens))
 
 
-class LightSetNet(MeetingNetwork):
+class LightSetNet(LightingNetwork):
     """Regresses the light of every image, and the error to expect of it, from all images together.
 
     Args:
@@ -105,7 +105,7 @@ class LightSetNet(MeetingNetwork):
         self.blocks = nn.ModuleList(Attention(width, heads) for _ in range(blocks))
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 5))
 
-    def encode(self, images: Tensor, mask: Tensor, context: Tensor | None = None) -> Tensor:
+    def encode(self, images: Tensor, mask: Tensor) -> Tensor:
         """Return the object's radiance and the mask, (B, Q, 4, S, S), of images of any side, 128 in use."""
         masks = mask[:, None].expand(-1, images.shape[1], -1, -1, -1)
         both = torch.cat([images * masks, masks], dim=2)
@@ -129,8 +129,9 @@ class LightSetNet(MeetingNetwork):
             intensities = _USUAL_INTENSITY * (strengths - strengths.mean(dim=1, keepdim=True)).exp()
             return SetPrediction(directions, intensities, (values[..., 4] + LOG_USUAL).exp())
 
-    def predict_many(self, local: Tensor, seed: int) -> SetPrediction:
+    def predict_parts(self, parts: list[Tensor], seed: int) -> SetPrediction:
         """Return what groups of images say; all images together give the intensities of a group their scale."""
+        local = torch.cat(parts, dim=1)
         together = self.predict(local)
         groups = local.shape[1] // _TOGETHER
         if groups < 2:
@@ -154,9 +155,9 @@ class LightSetNet(MeetingNetwork):
         total = chord.mean() + 0.5 * relative + 0.02 * likely
         return {"total": total, "chord": chord.mean(), "relative": relative, "expected": likely}
 
-    def lights(self, prediction: SetPrediction, read_out: ReadOut = "centre") -> Lights:
+    def read_lights(self, prediction: SetPrediction, read_out: ReadOut = "centre") -> Lights:
         """Return the regressed lights; there are no classes to read out."""
-        return Lights(prediction.directions, prediction.intensities, expected=chord_degrees(prediction.expected))
+        return Lights(prediction.directions, prediction.intensities, expected_error=chord_degrees(prediction.expected))
 
 
 def described(local: Tensor) -> tuple[Tensor, Tensor]:

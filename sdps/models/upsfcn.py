@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from sdps.core.lighting import LightClasses
-from sdps.core.losses import class_loss
-from sdps.models.base import Observations
+from sdps.core.losses import NormalCriterion, class_loss
+from sdps.models.base import Observations, Truth
 from sdps.models.blocks import conv, initialise, max_over_images
 from sdps.models.lcnet import LightingLogits, head
 from sdps.models.nenet import MaxFusionNet
@@ -83,6 +83,13 @@ class UPSFCNLight(MaxFusionNet):
         heads = (self.azimuth, self.elevation, self.intensity)
         logits = LightingLogits(*(part(vector).flatten(1).unflatten(0, local.shape[:2]) for part in heads))
         return NormalsAndLights(self.regress(fused), logits)
+
+    def loss(self, seen: Observations, truth: Truth, criterion: NormalCriterion) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of the normals plus, weighted, that of the lights."""
+        normals, logits = self.with_lights(seen)
+        loss, terms = criterion(normals, truth.normals, truth.mask)
+        terms["lighting_loss"] = self.lighting_loss(logits, truth.directions, truth.intensities)
+        return loss + criterion.lighting_weight * terms["lighting_loss"], terms
 
     def lighting_loss(self, logits: LightingLogits, directions: Tensor, intensities: Tensor) -> Tensor:
         """Return the summed cross-entropies of the true classes of directions (B, Q, 3) and intensities (B, Q)."""

@@ -7,6 +7,7 @@ none of them tells is "not recorded".
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -24,6 +25,7 @@ from sdps.models.blocks import parameter_count
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.publishing.learning_curves import Rows, read_metrics
+from sdps.training.recipes import CONFIGS
 
 UNKNOWN = "not recorded"
 _METRICS, _DATASET_CARD = "metrics.jsonl", "DATASET_CARD.md"
@@ -71,7 +73,7 @@ def _composed(model: TrainedModel, weights: Path, data: str | Path | None, shipp
     folder = Path(data) if data is not None and (Path(data) / MANIFEST).is_file() else None
     card = read_text(folder / _DATASET_CARD) if folder is not None and (folder / _DATASET_CARD).is_file() else ""
     lights = metadata.get("lights") or entry.lights
-    scores = _scores(metadata, told=lights == TRUE_LIGHTS)
+    scores = _scores(metadata, lights_given=lights == TRUE_LIGHTS)
     composition = _data(model, folder)
     return fill(
         _TEMPLATE,
@@ -100,10 +102,10 @@ def _composed(model: TrainedModel, weights: Path, data: str | Path | None, shipp
     )
 
 
-def _scores(metadata: Mapping[str, Any], *, told: bool) -> dict[str, float]:
-    """Return the metrics of validation, without the errors of lights that the network was told."""
+def _scores(metadata: Mapping[str, Any], *, lights_given: bool) -> dict[str, float]:
+    """Return the metrics of validation, without the errors of lights that the network was given."""
     scores = {name.removeprefix("val_"): float(value) for name, value in (metadata.get("metrics") or {}).items()}
-    return {name: value for name, value in scores.items() if not (told and name.startswith(_OF_LIGHTS))}
+    return {name: value for name, value in scores.items() if not (lights_given and name.startswith(_OF_LIGHTS))}
 
 
 def _repeat(weights: Path, model: TrainedModel) -> dict[str, Any]:
@@ -112,11 +114,13 @@ def _repeat(weights: Path, model: TrainedModel) -> dict[str, Any]:
     again = {"name": "repeat", "description": f"Trains {run} again.", "train": [run]}
     recorded = _plain(weights.parent / _PRESET)
     if "data" in recorded:
-        kept = {name: value for name, value in recorded.items() if name != "test"}
+        kept = {name: value for name, value in recorded.items() if name not in ("test", "joint")}
         return {"preset": {**kept, **again}, "recorded": recorded.get("name", UNKNOWN), "needed": []}
     base = _plain(weights.parent / _TRAINING).get("model") or model.name
-    needed = [f"`{config[key]}`" for key in ("lights", "normals") if config.get(key) not in (None, "", TRUE_LIGHTS)]
-    return {"preset": {**again, "runs": {run: {"base": str(base), **config}}}, "recorded": "", "needed": needed}
+    known = {field.name for field in fields(CONFIGS[model.role])}  # earlier versions had further settings
+    settings = {name: value for name, value in config.items() if name in known}
+    needed = [f"`{settings['lights']}`"] if settings.get("lights") not in (None, "", TRUE_LIGHTS) else []
+    return {"preset": {**again, "runs": {run: {"base": str(base), **settings}}}, "recorded": "", "needed": needed}
 
 
 def _plain(file: Path) -> dict[str, Any]:
@@ -166,9 +170,8 @@ def _training(metadata: Mapping[str, Any], rows: Rows) -> list[tuple[str, str]]:
         ("last training loss", f"{loss[-1]:.4g}" if loss else UNKNOWN),
         ("code version (hash of the package's source)", f"`{metadata.get('code', UNKNOWN)}`"),
     ]
-    for use in ("lighting", "normals"):
-        if isinstance(metadata.get(use), Mapping):
-            facts.append((f"frozen {use} model it was trained with", _value(metadata[use])))
+    if isinstance(metadata.get("lighting"), Mapping):
+        facts.append(("frozen lighting model it was trained with", _value(metadata["lighting"])))
     return facts
 
 

@@ -403,7 +403,7 @@ class Trainer:
                 raise InputError(f"{path}: of another run ({key} was {was!r}, now {value!r}); choose another --out")
 
     def save_weights(self, metrics: dict[str, float], suffix: str = "") -> None:
-        """Write each network with everything needed to use and to trace it; InputError where it is not finite."""
+        """Write the network with everything needed to use and to trace it; InputError where it is not finite."""
         self._require_finite()
         metadata = {
             "config": to_plain(self.config),
@@ -415,14 +415,13 @@ class Trainer:
             "metrics": metrics,
             **self.stage.origin(),
         }
-        for part in self.stage.parts(self._kept()):
-            model = TrainedModel(part.model, part.network, part.options, metadata)
-            save_weights(self.folder / f"{part.name}{suffix}.safetensors", model)
+        model = TrainedModel(self.stage.model, self._kept(), self.stage.options, metadata)
+        save_weights(self.folder / f"{self.stage.name}{suffix}.safetensors", model)
 
     def result(self, metrics: dict[str, float], waiting_share: float, *, interrupted: bool) -> TrainingResult:
         """Describe how the run ended."""
-        names = [part.name for part in self.stage.parts(self.stage.network)]
-        weights = None if interrupted else {name: self.folder / f"{name}.safetensors" for name in names}
+        name = self.stage.name
+        weights = None if interrupted else {name: self.folder / f"{name}.safetensors"}
         return TrainingResult(weights, self.step, self.seconds(), metrics, waiting_share, interrupted)
 
 

@@ -1,4 +1,4 @@
-"""What a training run is told: one frozen dataclass per kind of model, defaults as in the paper's code.
+"""The settings of a training run: one frozen dataclass per kind of model, defaults as in the paper's code.
 
 A run ends after `epochs`, or after `steps` or `minutes` when one of these is given; the learning rate
 follows the share of that budget already spent, so a shorter budget anneals fully all the same.
@@ -18,7 +18,7 @@ from sdps.models.lcnet import EARLY_SIZE, INPUT_SIZE
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
-    """What both stages share.
+    """What all kinds of models share.
 
     Attributes:
         seed: Root seed of weights, order, image subsets and augmentation.
@@ -146,19 +146,15 @@ class TrainingConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LightingTraining(TrainingConfig):
-    """Models that tell lights: LCNet, its variants, and the second pass.
+    """Models that find lights.
 
     Attributes:
         direction_classes: K_d, classes of azimuth and of elevation.
         intensity_classes: K_e.
-        lights: The run whose lights a second pass starts from (empty: the one its registry entry names).
-        normals: The run whose normals a second pass sees (empty: the one its registry entry names).
     """
 
     direction_classes: int = 36
     intensity_classes: int = 20
-    lights: str = ""
-    normals: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -200,7 +196,6 @@ class NormalTraining(TrainingConfig):
         min_object: Least share of object pixels a crop should have; the best of a few draws is taken.
         lighting_weight: Weight of the lighting loss beside the normal loss, for models that learn both.
         gradient_weight: Weight of the error of the normals' steps from pixel to pixel.
-        shading_weight: Weight of the errors of the shading maps, for models that learn them.
         expected_weight: Weight of the errors of the expected error, for models that learn it.
         options: Options of the network over those of its registry entry, for variants of a model.
     """
@@ -217,7 +212,6 @@ class NormalTraining(TrainingConfig):
     min_object: float = 0.3
     lighting_weight: float = 0.1
     gradient_weight: float = 0.0
-    shading_weight: float = 0.0
     expected_weight: float = 0.02
     options: dict[str, bool | int | float | str] = field(default_factory=dict)
 
@@ -229,15 +223,8 @@ class NormalTraining(TrainingConfig):
             raise InputError(f"light_blend must be in [0, 10], got {self.light_blend}")
         if not 0.0 <= self.min_object < 1.0:
             raise InputError(f"min_object must be in [0, 1), got {self.min_object}")
-        check_fields(
-            self,
-            "not negative",
-            "light_error",
-            "lighting_weight",
-            "gradient_weight",
-            "shading_weight",
-            "expected_weight",
-        )
+        weights = "lighting_weight", "gradient_weight", "expected_weight"
+        check_fields(self, "not negative", "light_error", *weights)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,34 +250,3 @@ class PixelTraining(NormalTraining):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_fields(self, "at least 1", "pixels_per_scene", "min_lights", "rotations")
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointTraining(NormalTraining):
-    """A lighting model and a normal model, both trained before, fine-tuned together.
-
-    Attributes:
-        normals: The run of the normal model.
-        lights: The run of the lighting model.
-        lighting_weight: Weight of the lighting loss.
-        normal_weight: Weight of the normal loss, whose gradients reach the lighting model through its lights.
-    """
-
-    lights: str = "lcnet"
-    normals: str = "nenet"
-    read_out: ReadOut = "expectation"
-    learning_rate: float = 1e-4
-    lighting_weight: float = 1.0
-    normal_weight: float = 10.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.read_out != "expectation":
-            raise InputError(f"read_out must be expectation, the only one with a gradient, got {self.read_out}")
-        if self.options:
-            raise InputError("options must be empty: the networks are those of the pair")
-        if self.light_blend:
-            raise InputError("light_blend must be 0: the normals' error reaches the lighting model through its lights")
-        if self.light_error:
-            raise InputError("light_error must be 0: the lights' own errors are what is to shrink")
-        check_fields(self, "positive", "normal_weight")

@@ -38,7 +38,7 @@ def test_lighting_networks(name: str) -> None:
     loss = network.loss(prediction, vectors(2, 3, 3), torch.ones(2, 3, device=META))["total"]
     assert loss.device == META
     for how in ("centre", "expectation"):
-        assert network.lights(prediction, how).directions.device == META
+        assert network.read_lights(prediction, how).directions.device == META
     loss.backward()
 
 

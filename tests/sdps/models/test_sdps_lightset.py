@@ -74,10 +74,10 @@ def test_many_images_meet_in_groups_that_share_one_scale(network, monkeypatch):
     with torch.no_grad():
         local = network.encode(images, mask)
         together = network.predict(local, local)
-        for first, second in zip(network.predict_many(local, 0), together, strict=True):
+        for first, second in zip(network.predict_parts([local], 0), together, strict=True):
             torch.testing.assert_close(first, second)  # too few to be parted
         monkeypatch.setattr("sdps.models.lightset._TOGETHER", 3)
-        found, again, other = (network.predict_many(local, seed) for seed in (0, 0, 1))
+        found, again, other = (network.predict_parts([local], seed) for seed in (0, 0, 1))
         order = torch.randperm(7, generator=torch.Generator().manual_seed(0))
         groups = [network.predict(local[:, part], local) for part in order.tensor_split(2)]
     for part, group in zip(order.tensor_split(2), groups, strict=True):
@@ -146,10 +146,10 @@ def test_the_scale_of_intensities_costs_nothing_and_the_ratios_do(network):
     assert math.isclose(other, 0.375 * math.log(2.0), rel_tol=1e-4)
 
 
-def test_expected_errors_are_told_in_degrees(network):
+def test_expected_errors_are_in_degrees(network):
     chord = torch.tensor([[2.0 * math.sin(math.radians(5.0)), 3.0]])
-    lights = network.lights(SetPrediction(torch.zeros(1, 2, 3), torch.ones(1, 2), chord))
-    np.testing.assert_allclose(lights.expected, [[10.0, 180.0]], rtol=1e-5)
+    lights = network.read_lights(SetPrediction(torch.zeros(1, 2, 3), torch.ones(1, 2), chord))
+    np.testing.assert_allclose(lights.expected_error, [[10.0, 180.0]], rtol=1e-5)
 
 
 def test_options_that_build_nothing_are_refused():

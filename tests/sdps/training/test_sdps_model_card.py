@@ -5,10 +5,11 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
-from sdps_scenes import write_data
+from sdps_scenes import hemisphere_lights, shade, sphere_normals, write_data
 
 from pipelines.shared import presets
 from pipelines.train.train import in_order
@@ -64,7 +65,7 @@ def test_the_card_tells_what_the_files_tell(tmp_path: Path, data: Path) -> None:
     for fact in ("2,210,048", "B1", "the true ones", "1.50", "80", "2.0%", "abc123", file_hash(data / MANIFEST),
                  "train 2, val 1", "sphere", "`augmentation.intensity_range` | 0.2, 2", "`learning_rate` | 0.0005",
                  "| normal_mae | 12.35 | degrees | mean angle between estimated and true normals",
-                 "11.5 at step 4", "x right, y up, z to the camera", "load_estimator"):  # fmt: skip
+                 "11.5 at step 4", "x right, y up, z to the camera", "sdps.estimate(images, mask"):  # fmt: skip
         assert fact in text, fact
     assert str(tmp_path) not in text  # no paths of this machine
     assert str(data) not in text
@@ -116,14 +117,13 @@ def test_the_whole_preset_is_told_where_it_is_known(tmp_path: Path, data: Path) 
 
 def test_its_snippet_loads_the_weights(tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     weights = write_run(tmp_path, data)
-    lighting = write_run(tmp_path, data, model="lcnet", name="lcnet", config=LightingTraining())
-    (weights.parent / "lcnet.safetensors").write_bytes(lighting.read_bytes())
     snippet = re.search(r"```python\n(.*?)```", render_card(weights), re.DOTALL).group(1)
     monkeypatch.chdir(weights.parent)
-    names: dict = {}
-    exec(snippet.split("# images")[0], names)  # what comes after needs images
-    assert names["estimator"].normals.name == "nenet"
-    compile(snippet, "snippet", "exec")
+    normals, mask = sphere_normals(24)
+    lights = hemisphere_lights(4, np.random.default_rng(0))
+    names = {"images": shade(normals, lights), "mask": mask, "lights": lights, "intensities": np.ones(4)}
+    exec(snippet, names)
+    np.testing.assert_allclose(names["estimate"].light_directions, lights, atol=1e-6)  # of its last line
 
 
 def test_what_is_not_known_is_not_recorded(tmp_path: Path) -> None:
@@ -186,8 +186,6 @@ def test_names_break_no_table(tmp_path: Path) -> None:
         ("lcnet-reg", "this project decided: heads and loss"),
         ("upsfcn", "does not apply"),
         ("nenet-norm", "pixel's norm"),
-        ("attention", "pixel's maximum"),
-        ("attention", "3 blocks of self-attention"),
         ("frames", "exchange what they know 4 times"),
     ],
 )

@@ -24,11 +24,10 @@ from sdps.data.dataset import SampleKey, SceneDataset, collate
 from sdps.models.checkpoint import TrainedModel, load_state, load_weights, save_state, save_weights
 from sdps.models.registry import MODELS, create
 from sdps.training import recipes, trainer
-from sdps.training.joint import JointStage
 from sdps.training.stage_factory import create_stage
 from sdps.training.stages import LightingStage, NormalStage
 from sdps.training.trainer import CHECKPOINT, METRICS, TrainingResult, train
-from sdps.training.training_config import JointTraining, LightingTraining, NormalTraining
+from sdps.training.training_config import LightingTraining, NormalTraining
 
 TIMES = {"seconds", "images_per_second", "waiting_share"}
 QUICK = NormalTraining(
@@ -248,22 +247,6 @@ def test_weights_that_are_kept_may_hold_a_share_of_the_start(folder: Path, tmp_p
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
 
 
-def test_fine_tuning_together_reaches_the_lighting_network_through_the_lights(folder: Path, tmp_path: Path) -> None:
-    def model(name: str) -> TrainedModel:
-        return TrainedModel(name, create(name), {}, {"config": {"augmentation": {}}, "data": "d", "step": 1})
-
-    config = JointTraining(
-        steps=2, batch_scenes=2, images=2, size=32, crop=16, workers=0, validation_scenes=1, lighting_weight=0.0
-    )
-    stage = JointStage(config, model("lcnet"), model("nenet"))
-    before = {name: tensor.clone() for name, tensor in stage.network.state_dict().items()}
-    result = train(stage, folder, tmp_path)
-    changed = {name for name, tensor in stage.network.state_dict().items() if not torch.equal(tensor, before[name])}
-    assert {"lighting.azimuth.1.weight", "lighting.intensity.1.weight", "normals.normal.weight"} <= changed
-    assert sorted(result.weights) == ["lcnet-joint", "nenet-joint"]
-    assert load_weights(result.weights["lcnet-joint"], "lighting").name == "lcnet"
-
-
 @pytest.mark.slow
 def test_compiled_networks_take_the_same_steps(folder: Path, tmp_path: Path) -> None:
     if shutil.which("g++") is None:
@@ -286,8 +269,7 @@ def test_a_stage_is_made_for_every_model(folder: Path) -> None:
             for use, run in needed.items()
         }
         stage = create_stage(name, name, recipes.run(name, {}, {}).config, trained)
-        assert stage.goal == ("direction_mae" if item.role in ("lighting", "second") else "normal_mae")
-        assert len(stage.parts(stage.network)) == 1
+        assert stage.goal == ("direction_mae" if item.role == "lighting" else "normal_mae")
 
 
 def test_loss_that_is_not_finite_ends_the_run(folder: Path, tmp_path: Path) -> None:
