@@ -1,4 +1,4 @@
-"""The two stages' losses (SDPS-Net, eqs. 2 and 3).
+"""The losses of lights and normals (SDPS-Net, eqs. 2 and 3, and others).
 
 All are means over equal shares (images of a scene, scenes of a batch), so that the mean of the losses of equal parts of
 a batch is the loss of the whole: parts may be accumulated, or spread over processes.
@@ -54,8 +54,8 @@ _CHORD_FLOOR = 0.02
 def chord_normal_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
     """Return the mean over scenes of the mean distance |n - truth| over the object's pixels, smooth near zero.
 
-    It grows with the angle as the mean angular error does, not with its square as 1 - cos: pixels that nothing can tell
-    do not outweigh all others.
+    It grows with the angle as the mean angular error does, not with its square as 1 - cos: hopeless pixels do not
+    outweigh all others.
 
     Args:
         normals: (B, 3, H, W) unit estimates.

@@ -18,7 +18,7 @@ from sdps.data.augment import measure_exposure
 from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map
 from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
 from sdps.inference.inference_config import InferenceConfig
-from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES, give_back, tiles
+from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES, release_memory, tiles
 from sdps.inference.turned_views import KeptView, TurnedView, mean_lights, mean_normals
 from sdps.models.base import FusionNetwork, LightingNetwork, Lights, NormalNetwork
 from sdps.models.checkpoint import TrainedModel, load_weights
@@ -192,7 +192,7 @@ class Estimator(InferenceConfig):
                 whole[scene.rows, scene.columns][tile.inner] = found
             if len(parts) > 1:
                 del normals, expected
-                give_back()
+                release_memory()
         return box
 
     def _tiling(self, images: int) -> tuple[int, int, int]:

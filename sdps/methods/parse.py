@@ -58,7 +58,7 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
     if parts == [REFINE]:
         raise InputError(f"method {text}: say what is refined, as in sdps-plus+{REFINE}")
     if parts[-1] == REFINE:
-        return refined(parse("+".join(parts[:-1]), find))
+        return with_refinement(parse("+".join(parts[:-1]), find))
     if not all(parts) or len(parts) > 2:
         raise InputError(f"method {text!r}: want METHOD or LIGHTS+NORMALS, either with +{REFINE}")
     if len(parts) == 2:
@@ -78,7 +78,7 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
     return combine(None, name, None, find)
 
 
-def refined(method: Method) -> Method:
+def with_refinement(method: Method) -> Method:
     """Return a method whose normals and lights are refined by inverse rendering (`sdps.refinement`).
 
     Raises:
@@ -89,7 +89,7 @@ def refined(method: Method) -> Method:
     return replace(method, name=f"{method.name}, refined", refined=True, paper="")
 
 
-def by_networks(method: Method) -> bool:
+def uses_networks(method: Method) -> bool:
     """Return whether a network finds the normals, under lights that a network finds or that are given."""
     return method.lights != NONE and method.normals not in (NONE, *CLASSICAL)
 

@@ -107,7 +107,7 @@ def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedM
         tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (not a dict)
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: not written by this project (no {FORMAT!r} header); train the network again")
-    name, options, metadata = _described(path, header)
+    name, options, metadata = _read_header(path, header)
     roles = (role,) if isinstance(role, str) else role
     if roles and registry.entry(name).role not in roles:
         raise InputError(
@@ -135,7 +135,7 @@ def _shape(tensors: Mapping[str, torch.Tensor], name: str) -> tuple[int, ...] | 
     return tuple(tensors[name].shape) if name in tensors else None
 
 
-def _described(path: str | Path, header: dict[str, str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
+def _read_header(path: str | Path, header: dict[str, str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Return model name, options and metadata of a file's header, or refuse it."""
     try:
         name, options, metadata = header["model"], parse_json(header["options"]), parse_json(header["metadata"])
@@ -161,7 +161,7 @@ def load_state(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: truncated or foreign file.
     """
-    with decoding(path, "a checkpoint", "delete it to start this run afresh"):
+    with decoding(path, "a checkpoint", "delete it to start this run again"):
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(state, dict):
             raise TypeError(f"it holds a {type(state).__name__}")

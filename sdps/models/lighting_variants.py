@@ -82,5 +82,5 @@ class LCNetSoft(LCNet):
         return {"total": total, **terms, "chord": chord, "relative": relative}
 
     def read_lights(self, prediction: LightingLogits, read_out: ReadOut = "expectation") -> Lights:
-        """Return the expectation over the classes, whatever read-out is asked for elsewhere."""
+        """Return the expectation over the classes, whichever read-out is asked for."""
         return super().read_lights(prediction, "expectation")

@@ -1,4 +1,4 @@
-"""A lighting network whose images see each other at every stage: what one image leaves open, the others tell.
+"""A lighting network whose images see each other at every stage: what one image leaves open, the others show.
 
 LCNet looks at every image by itself, and lets them meet once, at the end, by a maximum. Here each image is first
 divided by what its pixels show on average over all images, which takes the albedo away; before every convolution the
@@ -31,7 +31,7 @@ _FLOOR = 0.01
 _BRIGHTEST = 6.0
 """Shading that counts as no more: highlights reach hundreds of times the average."""
 _USUAL_INTENSITY = 0.94
-"""Geometric mean of intensities drawn evenly from 0.2 to 2. Only their ratios can be told from images."""
+"""Geometric mean of intensities drawn evenly from 0.2 to 2. Images show only their ratios."""
 _TOGETHER = 32
 """Images that meet in use, about: many more than in training meet another mean, maximum and attention than it had."""
 
@@ -116,7 +116,7 @@ class LightSetNet(LightingNetwork):
     def predict(self, local: Tensor, shared: Tensor | None = None) -> SetPrediction:
         """Return the prediction of every image; `local` is of all images of the scenes."""
         with torch.no_grad(), torch.autocast(local.device.type, enabled=False):
-            seen, likeness = described(local.float())
+            seen, likeness = image_inputs(local.float())
         tokens = self.read(self.levels(seen).flatten(2))
         for block in self.blocks:
             tokens = block(tokens, likeness)
@@ -160,7 +160,7 @@ class LightSetNet(LightingNetwork):
         return Lights(prediction.directions, prediction.intensities, expected_error=chord_degrees(prediction.expected))
 
 
-def described(local: Tensor) -> tuple[Tensor, Tensor]:
+def image_inputs(local: Tensor) -> tuple[Tensor, Tensor]:
     """Return what the network sees of each image, (B, Q, 6, S, S), and how alike images look, (B, Q, Q, 2).
 
     Args:

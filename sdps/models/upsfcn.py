@@ -18,9 +18,9 @@ _WIDTHS = (64, 128, 256)
 class UPSFCN(MaxFusionNet):
     """PS-FCN without lights: images as they are, of unknown intensities.
 
-    `deep` and `width` are reconstructions that meet the published counts; the supplement with the tables was not to be
-    had. `width=1.7` widens every layer alike (6.39 M; published 6.4 M). `deep` adds six convolutions to the extractor
-    at quarter size and two to the regressor at half size (6.04 M; published 6.1 M).
+    `deep` and `width` are reconstructions that meet the published counts; the supplement with the tables is not
+    available. `width=1.7` widens every layer alike (6.39 M; published 6.4 M). `deep` adds six convolutions to the
+    extractor at quarter size and two to the regressor at half size (6.04 M; published 6.1 M).
 
     Args:
         width: Factor on the channels of every layer.
@@ -45,9 +45,9 @@ class NormalsAndLights(NamedTuple):
 
 
 class UPSFCNLight(MaxFusionNet):
-    """UPS-FCN that also learns to tell the lights, as additional supervision (B8).
+    """UPS-FCN that also learns to predict the lights, as additional supervision (B8).
 
-    A reconstruction: to the 3-channel UPS-FCN come, on each image's feature beside the fused one, six convolutions of
+    A reconstruction: the 3-channel UPS-FCN plus, on each image's feature and the fused one, six convolutions of
     stride 2 and LCNet's three heads. 5.80 M parameters; published 5.7 M. The lights are not used at test.
 
     Args:

@@ -50,13 +50,13 @@ def run(name: str, sections: Mapping[str, Mapping[str, Any]], runs: Mapping[str,
     values: dict[str, Any] = {}
     for layer, settings in (("", recipe), (role, sections.get(role, {})), (where, own)):
         build(CONFIGS[role], {**values, **settings}, layer)  # names the section a mistake is in
-        values |= {key: _merged(values.get(key), value) for key, value in settings.items()}
+        values |= {key: _merge(values.get(key), value) for key, value in settings.items()}
     config: TrainingConfig = build(CONFIGS[role], values, where)
     requires = _requires(name, model, config)
     return Run(name, model, config, requires | ({"start": config.start} if config.start else {}))
 
 
-def _merged(before: Any, value: Any) -> Any:
+def _merge(before: Any, value: Any) -> Any:
     """Lay one section's value over another's; of nested sections, only the fields named."""
     return {**before, **value} if isinstance(before, Mapping) and isinstance(value, Mapping) else value
 

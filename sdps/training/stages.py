@@ -1,4 +1,4 @@
-"""What models of each role ask of a batch: the network, its loss and its validation metrics.
+"""How models of each role are trained on a batch: the network, its loss and its validation metrics.
 
 The trainer (`sdps.training.trainer`) knows nothing else about them.
 """
@@ -146,7 +146,7 @@ class NormalStage(Stage):
         """Record the lights trained on, and the data and step of the model they came from."""
         if self.lighting is None:
             return {"lights": self.source or "none"}
-        return {"lights": self.source, "lighting": described(self.lighting)}
+        return {"lights": self.source, "lighting": model_identity(self.lighting)}
 
     def sample_options(self) -> SampleOptions:
         return replace(super().sample_options(), crop=self.config.crop, min_object=self.config.min_object)
@@ -166,7 +166,7 @@ class NormalStage(Stage):
         """Return the lights given in training: with drawn errors, then some of the way to the true ones."""
         lights, limit = self.lights(batch), self.config.light_blend
         if lights is not None and self.config.light_error:
-            lights = disturbed(lights, batch.seed.tolist(), self.config.light_error)
+            lights = disturb(lights, batch.seed.tolist(), self.config.light_error)
         if self.lighting is None or lights is None or not limit:
             return lights
         drawn = [min(generator(seed, "light_blend").uniform(0.0, limit), 1.0) for seed in batch.seed.tolist()]
@@ -195,7 +195,7 @@ class NormalStage(Stage):
             "normal_mae": normal_error(normals, batch),
         }
         if lights is not None and self.config.light_error:
-            drawn = disturbed(lights, batch.seed.tolist(), self.config.light_error)
+            drawn = disturb(lights, batch.seed.tolist(), self.config.light_error)
             seen = self.network.observe(batch.images, batch.mask, drawn)
             values |= light_errors(drawn, batch, "_drawn")
             values["normal_mae_drawn"] = normal_error(self.network(seen), batch)
@@ -207,12 +207,12 @@ class NormalStage(Stage):
 
 
 _BENT, _SCATTERED, _UNEVEN = 0.10, 0.06, 0.08
-"""How far `disturbed` moves lights: all alike, each by itself, and in intensity."""
+"""How far `disturb` moves lights: all alike, each by itself, and in intensity."""
 _STRAYED = math.degrees(math.sqrt(math.pi / 2 * (_BENT**2 + _SCATTERED**2)))
-"""Mean error of directions that `disturbed` moves by the share 1: both parts move them across by Gaussian steps."""
+"""Mean error of directions that `disturb` moves by the share 1: both parts move them across by Gaussian steps."""
 
 
-def disturbed(lights: Lights, seeds: list[int], limit: float) -> Lights:
+def disturb(lights: Lights, seeds: list[int], limit: float) -> Lights:
     """Return lights with errors like those of estimated ones, drawn for each scene.
 
     A linear map bends the directions of a scene alike, as a relief that is taken too flat or too deep does; each light
@@ -253,8 +253,8 @@ def freeze(model: TrainedModel) -> TrainedModel:
     return model
 
 
-def described(model: TrainedModel) -> dict[str, Any]:
-    """Return what tells one trained model from another."""
+def model_identity(model: TrainedModel) -> dict[str, Any]:
+    """Return what distinguishes one trained model from another."""
     return {"model": model.name, **{key: model.metadata.get(key) for key in ("data", "step", "metrics")}}
 
 

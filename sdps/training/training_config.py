@@ -22,8 +22,8 @@ class TrainingConfig:
 
     Attributes:
         seed: Root seed of weights, order, image subsets and augmentation.
-        start: What of the same network training starts from: a run, `shipped:<name>` or a `.safetensors` file; empty
-            for random weights.
+        start: Weights of the same network that training starts from: a run, `shipped:<name>` or a `.safetensors` file;
+            empty for random weights.
         start_share: Share of the start in the weights that are validated and saved; the rest is what was trained (0:
             all of it). Averages of fine-tuned weights and those before them are often better than both (Wortsman et
             al., Robust fine-tuning of zero-shot models, CVPR 2022, eq. 1, whose alpha is 1 less this).
@@ -41,8 +41,8 @@ class TrainingConfig:
         cooldown: See `schedule`.
         halve_after: Epochs after which `halving` halves; scaled with the budget when it is not `epochs`.
         warmup: Share of the budget over which the learning rate rises linearly from zero.
-        optimiser: `adam` or `adamw`, betas 0.9 and 0.999; or `muon` (`sdps.training.muon`), with AdamW for what is no
-            matrix.
+        optimiser: `adam` or `adamw`, betas 0.9 and 0.999; or `muon` (`sdps.training.muon`), with AdamW for what is not
+            a matrix.
         weight_decay: Weight decay (0 in the paper: its 4e-4 is parsed but never used).
         clip_gradient: Largest gradient norm; 0 leaves gradients alone.
         ema: Decay of an exponential moving average of the weights, which is then validated and saved (0: none).
@@ -191,10 +191,10 @@ class NormalTraining(TrainingConfig):
             training sample; of shares drawn above 1 the lights are the true ones. Many images and test-time
             augmentation give better lights than a sample's few images.
         light_error: Size of the errors drawn onto the lights in training, 1 for those of lights estimated from few
-            images. So a network learns what estimated lights are worth, and no lighting model has to run.
+            images. So a network learns what estimated lights are worth, without a lighting model.
         crop: Side of the random crop the network sees (0: the whole image); the lighting model always sees the whole.
         min_object: Least share of object pixels a crop should have; the best of a few draws is taken.
-        lighting_weight: Weight of the lighting loss beside the normal loss, for models that learn both.
+        lighting_weight: Weight of the lighting loss next to the normal loss, for models that learn both.
         gradient_weight: Weight of the error of the normals' steps from pixel to pixel.
         expected_weight: Weight of the errors of the expected error, for models that learn it.
         options: Options of the network over those of its registry entry, for variants of a model.

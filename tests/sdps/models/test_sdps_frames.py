@@ -18,11 +18,11 @@ from sdps.models.base import Lights, Observations
 from sdps.models.blocks import parameter_count
 from sdps.models.checkpoint import TrainedModel, load_weights, save_weights
 from sdps.models.cnnps import rotate_about_view
-from sdps.models.frames import FrameNet, FusedMap, Pixels, described, object_pixels
+from sdps.models.frames import FrameNet, FusedMap, Pixels, object_pixels, pixel_inputs
 from sdps.models.registry import MODELS
 from sdps.training import recipes
 from sdps.training.stage_factory import create_stage
-from sdps.training.stages import disturbed
+from sdps.training.stages import disturb
 
 
 def unit(*shape: int) -> Tensor:
@@ -107,7 +107,7 @@ def test_what_a_pixel_is_told_does_not_change_when_it_turns_about_the_view():
         first, scale, error = first_normals(values, directions)
         axes = frames(first)
         start = (axes @ first[..., None])[..., 0]
-        told.append(described(Pixels(values, directions, errors), axes, start, scale, error))
+        told.append(pixel_inputs(Pixels(values, directions, errors), axes, start, scale, error))
     for one, other in zip(*told, strict=True):
         torch.testing.assert_close(one, other, atol=2e-3, rtol=1e-3)
 
@@ -175,11 +175,11 @@ def test_size_and_options():
 
 def test_light_errors_are_those_of_the_seed_and_grow_with_the_limit():
     lights = Lights(unit(2, 40), torch.rand(2, 40) + 0.5)
-    one, again, none = (disturbed(lights, [3, 4], limit) for limit in (1.0, 1.0, 0.0))
+    one, again, none = (disturb(lights, [3, 4], limit) for limit in (1.0, 1.0, 0.0))
     torch.testing.assert_close(one.directions, again.directions)
     torch.testing.assert_close(none.directions, lights.directions)
     torch.testing.assert_close(none.intensities, lights.intensities)
-    many = [disturbed(lights, [seed, seed + 1], 1.0) for seed in range(0, 200, 2)]
+    many = [disturb(lights, [seed, seed + 1], 1.0) for seed in range(0, 200, 2)]
     angles = torch.stack([(each.directions * lights.directions).sum(-1).clamp(-1, 1).acos() for each in many])
     assert 4.0 < math.degrees(angles.mean()) < 9.0
     expected = torch.stack([each.expected_error for each in many])

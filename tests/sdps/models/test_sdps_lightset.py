@@ -11,7 +11,7 @@ from torch.nn import functional
 from render.shared.errors import InputError
 from sdps.inference.chunked import lighting_prediction
 from sdps.models.blocks import parameter_count
-from sdps.models.lightset import LightSetNet, SetPrediction, described
+from sdps.models.lightset import LightSetNet, SetPrediction, image_inputs
 from sdps.models.registry import MODELS
 
 
@@ -105,7 +105,7 @@ def test_albedo_does_not_change_the_shading():
     local[:, :, 3] = 1.0
     painted = local.clone()
     painted[:, :, :3] *= torch.rand(1, 1, 1, 64, 64) + 0.5
-    (one, alike), (other, painted_alike) = described(local), described(painted)
+    (one, alike), (other, painted_alike) = image_inputs(local), image_inputs(painted)
     torch.testing.assert_close(one[:, :, 3], other[:, :, 3], atol=0.02, rtol=0.02)  # but for the floor
     torch.testing.assert_close(alike, painted_alike, atol=0.02, rtol=0.02)
 
@@ -114,7 +114,7 @@ def test_images_that_look_alike_are_told_so():
     local = torch.rand(1, 3, 4, 64, 64)
     local[:, :, 3] = 1.0
     local[:, 1, :3] = 0.5 * local[:, 0, :3]
-    _, alike = described(local)
+    _, alike = image_inputs(local)
     assert alike[0, 0, 1].min() > 0.97 and alike[0, 0, 2, 1] < 0.5
 
 

@@ -75,12 +75,14 @@ def test_the_card_tells_what_the_files_tell(tmp_path: Path, data: Path) -> None:
     assert {"type": "normal_mae", "value": 12.3456} in metrics
 
 
-@pytest.mark.parametrize("told", [{"step": "x"}, {"computed": [1]}, {"metrics": {"val_loss": []}}, {"scenes": "many"}])
-def test_a_card_of_weights_that_tell_nonsense_is_refused(told: dict, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "values", [{"step": "x"}, {"computed": [1]}, {"metrics": {"val_loss": []}}, {"scenes": "many"}]
+)
+def test_a_card_of_weights_with_nonsense_in_them_is_refused(values: dict, tmp_path: Path) -> None:
     path = write_run(tmp_path, None)
     model = load_weights(path)
-    save_weights(path, replace(model, metadata=model.metadata | told))
-    with pytest.raises(InputError, match=r"own\.safetensors: damaged or not weights that tell"):
+    save_weights(path, replace(model, metadata=model.metadata | values))
+    with pytest.raises(InputError, match=r"own\.safetensors: damaged or not weights with the settings"):
         render_card(path)
 
 
@@ -186,7 +188,7 @@ def test_names_break_no_table(tmp_path: Path) -> None:
         ("lcnet-reg", "this project decided: heads and loss"),
         ("upsfcn", "does not apply"),
         ("nenet-norm", "pixel's norm"),
-        ("frames", "exchange what they know 4 times"),
+        ("frames", "exchange what they show 4 times"),
     ],
 )
 def test_models_differ(tmp_path: Path, model: str, fact: str) -> None:
