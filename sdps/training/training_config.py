@@ -163,17 +163,14 @@ class LightingTraining(TrainingConfig):
                 f"size must be {INPUT_SIZE} for LCNet, whose last layers need it, or {EARLY_SIZE} for a run that "
                 f"others start from, got {self.size}"
             )
-        self.classes()
+        low, high = self.intensity_range()
+        # Refuses numbers that make no classes.
+        LightClasses(directions=self.direction_classes, intensities=self.intensity_classes, low=low, high=high)
 
     def intensity_range(self) -> tuple[float, float]:
         """Return the range the intensity classes cover: the one intensities are drawn from."""
         low, high = self.augmentation.intensity_range
         return low, max(high, low + 1e-3)
-
-    def classes(self) -> LightClasses:
-        """Return the discretised lighting space."""
-        low, high = self.intensity_range()
-        return LightClasses(directions=self.direction_classes, intensities=self.intensity_classes, low=low, high=high)
 
 
 @dataclass(frozen=True, kw_only=True)

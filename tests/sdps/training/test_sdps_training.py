@@ -302,7 +302,7 @@ def test_stage_two_leaves_the_lighting_network_as_it_is(folder: Path, tmp_path: 
     stage = NormalStage(replace(QUICK, steps=2, lights="lcnet"), lighting)
     result = train(stage, folder, tmp_path)
     assert all(torch.equal(tensor, before[name]) for name, tensor in lighting.network.state_dict().items())
-    assert load_weights(result.weights["nenet"], "normals").metadata["lighting"]["data"] == "d"
+    assert load_weights(result.weights["nenet"]).metadata["lighting"]["data"] == "d"
     # NENet is given class centres, not the true lights.
     dataset = SceneDataset(folder, "train", stage.sample_options())
     lights = stage.lights(collate([dataset.sample(SampleKey(0, 0, 0))]))
@@ -340,7 +340,7 @@ def test_validation_may_see_more_images_than_training(folder: Path, tmp_path: Pa
 
 
 def test_weights_carry_their_origin(uninterrupted: tuple) -> None:
-    model = load_weights(uninterrupted[1].weights["nenet"], "normals")
+    model = load_weights(uninterrupted[1].weights["nenet"])
     assert model.metadata["step"] == 8
     assert len(model.metadata["data"]) == 64
     assert build(NormalTraining, model.metadata["config"]) == QUICK
@@ -352,7 +352,7 @@ def test_half_precision_weights_load_as_float32(tmp_path: Path) -> None:
     save_weights(tmp_path / "whole.safetensors", model)
     save_weights(tmp_path / "half.safetensors", model, half=True)
     assert (tmp_path / "half.safetensors").stat().st_size < 0.51 * (tmp_path / "whole.safetensors").stat().st_size
-    loaded = load_weights(tmp_path / "half.safetensors", "normals").network
+    loaded = load_weights(tmp_path / "half.safetensors").network
     for name, tensor in loaded.state_dict().items():
         assert tensor.dtype == torch.float32
         torch.testing.assert_close(tensor, model.network.state_dict()[name], atol=1e-3, rtol=1e-3)
@@ -383,13 +383,12 @@ def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path
     save_weights(headless, TrainedModel("nenet", create("nenet"), {}, {}))
     save_weights(foreign, TrainedModel("nenet2", create("nenet"), {}, {"config": {"augmentation": {}}}))
     cases = [
-        (weights, "lighting", "holds 'nenet', a model for 'normals'"),
-        (cut, "normals", "damaged or not a safetensors"),
-        (text, "normals", "damaged or not a safetensors"),
-        (tmp_path / "none.safetensors", "normals", "no such weights"),
-        (misfit, "lighting", "do not fit"),
-        (headless, "normals", "damaged header"),
-        (foreign, "normals", "a model this version does not know"),
+        (cut, "damaged or not a safetensors"),
+        (text, "damaged or not a safetensors"),
+        (tmp_path / "none.safetensors", "no such weights"),
+        (misfit, "do not fit"),
+        (headless, "damaged header"),
+        (foreign, "a model this version does not know"),
     ]
     for number, (options, message) in enumerate((
         ("abc", "damaged header"), ({"direction_classes": 10**12}, "do not fit"), ({"use_mask": {}}, "damaged header"),
@@ -397,10 +396,10 @@ def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path
     )):  # fmt: skip
         odd = tmp_path / f"odd{number}.safetensors"
         save_weights(odd, TrainedModel("lcnet", create("lcnet"), options, {"config": {"augmentation": {}}}))
-        cases.append((odd, "lighting", message))
-    for path, role, message in cases:
+        cases.append((odd, message))
+    for path, message in cases:
         with pytest.raises(InputError, match=message) as error:
-            load_weights(path, role)
+            load_weights(path)
         assert "\n" not in str(error.value)
 
 
