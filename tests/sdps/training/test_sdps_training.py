@@ -438,7 +438,7 @@ def test_configuration_is_checked(values: dict, message: str) -> None:
         build(LightingTraining, values, "training")
 
 
-def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
+def test_a_run_takes_start_and_lights_of_others(tmp_path: Path) -> None:
     settings = {"runs": {"psfcn-late": {"base": "psfcn", "start": "nenet", "steps": 1}}}
     run = recipes.run("psfcn-late", {}, settings["runs"])
     assert run.requires == {"start": "nenet"}
@@ -449,3 +449,6 @@ def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
     other = TrainedModel("upsfcn", create("upsfcn"), {}, {"config": {"augmentation": {}}})
     with pytest.raises(InputError, match=r"runs.psfcn-late.start: 'upsfcn' has another network"):
         create_stage("psfcn-late", run.model, run.config, {"start": other})
+    run = recipes.run("nenet", {}, {"nenet": {"lights": "shipped:psfcn"}})
+    with pytest.raises(InputError, match=r"runs.nenet.lights: 'upsfcn' finds no lights; name a lighting model"):
+        create_stage("nenet", "nenet", run.config, {"lighting": other})
