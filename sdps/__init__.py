@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from sdps.core.estimate import Estimate
     from sdps.core.integration import integrate
     from sdps.core.metrics import score
-    from sdps.inference.estimator import load_estimator
     from sdps.inference.inference_config import InferenceConfig
     from sdps.photos.reading import load
     from sdps.surface.inferred import Inference
@@ -31,7 +30,6 @@ else:
             "sdps.api": ("available_methods", "estimate", "infer", "plan", "train"),
             "sdps.core.estimate": ("Estimate",),
             "sdps.core.metrics": ("score",),
-            "sdps.inference.estimator": ("load_estimator",),
             "sdps.inference.inference_config": ("InferenceConfig",),
             "sdps.surface.inferred": ("Inference",),
             "sdps.photos.reading": ("load",),
@@ -51,7 +49,6 @@ __all__ = [
     "infer",
     "integrate",
     "load",
-    "load_estimator",
     "mesh",
     "plan",
     "relit",

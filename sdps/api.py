@@ -32,7 +32,7 @@ from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
 from sdps.methods.light_witness import question_lights, see_lights
 from sdps.methods.method import REFINE, Method
-from sdps.methods.parse import by_networks, parse, refined
+from sdps.methods.parse import parse, uses_networks, with_refinement
 from sdps.methods.runner import Runner
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load
@@ -267,8 +267,8 @@ def _runner(
     plain = method.removesuffix(f"+{REFINE}")
     chosen = _adapted(_automatic(known[0], find) if plain == AUTO else plain, known, find)
     if refine is None:
-        refine = by_networks(chosen) and images >= FEWEST_IMAGES
-    return Runner(refined(chosen) if refine or plain != method else chosen, find, config)
+        refine = uses_networks(chosen) and images >= FEWEST_IMAGES
+    return Runner(with_refinement(chosen) if refine or plain != method else chosen, find, config)
 
 
 def _adapted(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> Method:
@@ -281,9 +281,9 @@ def _adapted(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -
                 f"--method {text}: is told the lights; give them with --lights, or put a lighting model before it, "
                 f"as in lcnet+{text}"
             )
-        if intensities and not by_networks(method):
+        if intensities and not uses_networks(method):
             _log.warning("%s finds the intensities itself; those given are not used", text)
-        return replace(method, intensities=TRUE_LIGHTS) if intensities and by_networks(method) else method
+        return replace(method, intensities=TRUE_LIGHTS) if intensities and uses_networks(method) else method
     if "+" not in text and text in classical.METHODS and not classical.METHODS[text].calibrated:
         _log.warning("%s finds the lights itself; those given are not used", text)
         return parse(text, find)

@@ -178,7 +178,7 @@ def test_from_images_to_a_mesh(tmp_path):
 def test_methods_that_can_be_used_are_listed():
     about = sdps.available_methods()
     assert {"sdps", "lcnet", "pf14", "least-squares"} <= about.keys() and all(about.values())
-    assert not {"lcnet-second", "true", "lcnet-reg"} & about.keys()  # no method by itself, and without weights
+    assert not {"true", "lcnet-reg"} & about.keys()  # not a method by itself, and without weights
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def keys() -> dict[str, dict[str, str]]:
     preset = presets.load("demo")
     sections = {"preset": type(preset), "data": type(preset.data), "test": type(preset.test)}
     sections["stream"] = type(preset.stream)
-    for name in ("LightingTraining", "NormalTraining", "PixelTraining", "JointTraining"):
+    for name in ("LightingTraining", "NormalTraining", "PixelTraining"):
         sections[name] = getattr(training_config, name)
     return {name: _fields(kind) for name, kind in sections.items()}
 

@@ -34,7 +34,7 @@ from sdps.core.losses import masked_normal_loss
 from sdps.core.precision import arithmetic
 from sdps.data.dataset import Batch
 from sdps.models import registry
-from sdps.models.base import LightingNetwork, Lights, NormalNetwork
+from sdps.models.base import FusionNetwork, LightingNetwork, Lights
 from sdps.training.distributed import Team
 from sdps.training.loggers import Meter
 from sdps.training.stage_factory import create_stage
@@ -261,7 +261,7 @@ def plain_loop(model: str, batch: Batch) -> Callable[[], object]:
             prediction = network(batch.images, batch.mask)
             loss = network.loss(prediction, batch.directions, batch.intensities)["total"]
         else:
-            assert isinstance(network, NormalNetwork), model
+            assert isinstance(network, FusionNetwork), model
             lights = Lights(batch.directions, batch.intensities)
             normals = network(network.observe(batch.images, batch.mask, lights))
             loss = masked_normal_loss(normals, batch.normals, batch.mask)

@@ -48,17 +48,17 @@ def errors(data: Path, weights: Path, lighting: Path | None, scenes: int, images
 
 def _of_lights(network: Any, batch: Batch) -> tuple[np.ndarray, np.ndarray] | None:
     """Return expected and actual errors of the lights, (Q,) each; None where the network tells none."""
-    found = network.lights(network(batch.images, batch.mask))
-    if found.expected is None:
+    found = network.read_lights(network(batch.images, batch.mask))
+    if found.expected_error is None:
         return None
-    return found.expected[0].numpy(), angle_degrees(found.directions[0].numpy(), batch.directions[0].numpy())
+    return found.expected_error[0].numpy(), angle_degrees(found.directions[0].numpy(), batch.directions[0].numpy())
 
 
 def _of_normals(network: Any, lights: Any, batch: Batch) -> tuple[np.ndarray, np.ndarray] | None:
     """Return expected and actual errors of the object's pixels, (P,) each; None where the network tells none."""
     told = Lights(batch.directions, batch.intensities)
     if lights is not None:
-        told = lights.lights(lights(batch.images, batch.mask), "expectation").doubted()
+        told = lights.read_lights(lights(batch.images, batch.mask), "expectation").with_errors()
     normals, expected = network.regress_with_error(network.encode(network.observe(batch.images, batch.mask, told)))
     if expected is None:
         return None

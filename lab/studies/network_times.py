@@ -1,6 +1,6 @@
 """Print the processor time of normal networks on one object, beside the first one's.
 
-    OMP_NUM_THREADS=1 python -m lab.studies.network_times nenet-plus attention
+    OMP_NUM_THREADS=1 python -m lab.studies.network_times nenet-plus frames
 
 With `ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2` before it the processor is held to AVX2. The networks have
 random weights and true lights and take turns, so that other jobs disturb them alike. Only this thread is timed: on

@@ -57,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
     items = suite.pick(items, args.objects)
     if not chosen:  # every method that finds lights, and the paper's pair for its normals
         models = select.runs_folder(args.models)
-        pairs = [method for method in select.every_method(models) if method.paper == "B1" or method.second]
+        pairs = [method for method in select.every_method(models) if method.paper == "B1"]
         chosen = [*select.lighting_rows(models), *pairs, *select.classical_rows(calibrated=False)]
     return suite.evaluate(
         bench, args, items, chosen, text=definition(bench, items, about, args.longest_side),

@@ -173,8 +173,8 @@ def lighting_only(found: Found, chosen: Sequence[Method]) -> Found:
     return {name: found[name] for name in kept}
 
 
-def _lights_of(method: Method) -> tuple[str, str, str | None, int | None]:
-    return method.lights, method.second, method.read_out, method.light_views
+def _lights_of(method: Method) -> tuple[str, str | None, int | None]:
+    return method.lights, method.read_out, method.light_views
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

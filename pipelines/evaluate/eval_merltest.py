@@ -43,7 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="lighting model of a combination (default: every trained model, a row each)")  # fmt: skip
     parser.add_argument("--normals", default=None, metavar="NAME|FILE",
                         help="normal model, combination such as sdps-plus, or classical method")  # fmt: skip
-    parser.add_argument("--second", default=None, metavar="NAME|FILE", help="second lighting pass")
     parser.add_argument("--intensities", default=None, choices=("true",), help="give the true intensities only")
 
 
@@ -84,8 +83,8 @@ def table_rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[lis
         InputError: nothing is trained, or flags name what is not there.
     """
     constant = Method(name="constant predictor", normals=CONSTANT)
-    if any((args.lights, args.normals, args.second, args.intensities)):
-        method = rows.chosen(out, args.lights, args.normals, args.second, args.intensities)
+    if any((args.lights, args.normals, args.intensities)):
+        method = rows.from_flags(out, args.lights, args.normals, args.intensities)
         reference = Method(name="least-squares, true lights", lights="true", normals="least-squares")
         return [], [method, *([reference] if method.name != reference.name else []), constant]
     normals = rows.normal_methods(out, preset.test.shipped, preset.test)
@@ -153,6 +152,5 @@ def _mean_scores(draws: list[dict[str, float]]) -> dict[str, float]:
 
 def build_tables(results: list[SceneScores], lighting: list[Method], normals: list[Method]) -> list[Table]:
     """Return table A where every model has its row, and table B."""
-    second = [method for method in normals if method.second]  # rows of both tables
-    first = [lighting_table(results, [*lighting, *second], all_rows=True)] if lighting else []
+    first = [lighting_table(results, lighting, all_rows=True)] if lighting else []
     return [*first, normal_table(results, normals, all_rows=bool(lighting))]

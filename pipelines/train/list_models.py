@@ -7,7 +7,7 @@ import sys
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps models`."""
-    parser.add_argument("--role", choices=("lighting", "second", "normals", "pixels"), default=None)
+    parser.add_argument("--role", choices=("lighting", "normals", "pixels"), default=None)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -20,8 +20,8 @@ def main(args: argparse.Namespace) -> int:
     if args.json:
         listed = [
             {"name": name, "role": item.role, "parameters": item.parameters, "paper": item.paper,
-             "lights": item.lights, "normals": item.normals, "summary": item.summary,
-             "reconstruction": item.reconstruction, "recipe": dict(item.recipe)}
+             "lights": item.lights, "summary": item.summary, "reconstruction": item.reconstruction,
+             "recipe": dict(item.recipe)}
             for name, item in models.items()
         ]  # fmt: skip
         sys.stdout.write(json.dumps(listed, indent=2) + "\n")

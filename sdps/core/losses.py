@@ -1,8 +1,11 @@
-"""The two stages' losses (SDPS-Net, eqs. 2 and 3).
+"""The losses of lights and normals (SDPS-Net, eqs. 2 and 3, and others).
 
 All are means over equal shares (images of a scene, scenes of a batch), so that the mean of the losses of equal parts of
 a batch is the loss of the whole: parts may be accumulated, or spread over processes.
 """
+
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -51,8 +54,8 @@ _CHORD_FLOOR = 0.02
 def chord_normal_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
     """Return the mean over scenes of the mean distance |n - truth| over the object's pixels, smooth near zero.
 
-    It grows with the angle as the mean angular error does, not with its square as 1 - cos: pixels that nothing can tell
-    do not outweigh all others.
+    It grows with the angle as the mean angular error does, not with its square as 1 - cos: hopeless pixels do not
+    outweigh all others.
 
     Args:
         normals: (B, 3, H, W) unit estimates.
@@ -105,18 +108,37 @@ def normal_gradient_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor
     return (sums / pairs.clamp(min=1.0)).mean()
 
 
-def shading_loss(shading: Tensor, truth: Tensor, mask: Tensor, directions: Tensor) -> Tensor:
-    """Return the mean over scenes of the mean squared error of max(n . l, 0) over images and the object's cells.
+@dataclass(frozen=True)
+class NormalCriterion:
+    """The loss of a normal network, as a run's configuration chooses it.
 
-    Args:
-        shading: (B, Q, 1, h, w) estimates, in cells of H/h x W/w pixels.
-        truth: (B, 3, H, W) unit normals.
-        mask: (B, 1, H, W), 0 or 1; a cell counts by its share of object pixels, whose mean it is compared with.
-        directions: (B, Q, 3) true ones, unit.
+    Attributes:
+        kind: 1 - cos, over the object (`masked`) or all pixels (`faithful`); or the distance of the vectors (`chord`).
+        gradient_weight: Weight of `normal_gradient_loss`.
+        lighting_weight: Weight of the loss of lights, for networks that learn them too.
+        expected_weight: Weight of the loss of the expected error, for networks that predict it.
     """
-    side = truth.shape[-1] // shading.shape[-1]
-    lit = torch.einsum("bchw,bqc->bqhw", truth * mask, directions).clamp(min=0.0)
-    share = functional.avg_pool2d(mask, side)  # (B, 1, h, w)
-    wanted = functional.avg_pool2d(lit, side) / share.clamp(min=1e-6)
-    sums = ((shading[:, :, 0].float() - wanted).square() * share).sum(dim=(1, 2, 3))  # (B,)
-    return (sums / (share.sum(dim=(1, 2, 3)) * shading.shape[1]).clamp(min=1.0)).mean()
+
+    kind: Literal["masked", "faithful", "chord"] = "masked"
+    gradient_weight: float = 0.0
+    lighting_weight: float = 0.1
+    expected_weight: float = 0.02
+
+    def __call__(self, normals: Tensor, truth: Tensor, mask: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of estimated normals alone, and its named parts.
+
+        Args:
+            normals: (B, 3, H, W) unit estimates.
+            truth: (B, 3, H, W) unit normals.
+            mask: (B, 1, H, W), 0 or 1.
+        """
+        masked = masked_normal_loss(normals, truth, mask)
+        loss, terms = masked, {"masked_loss": masked}
+        if self.kind == "chord":
+            loss = chord_normal_loss(normals, truth, mask)
+        elif self.kind == "faithful":
+            loss = faithful_normal_loss(normals, truth)
+        if self.gradient_weight:
+            terms["gradient_loss"] = normal_gradient_loss(normals, truth, mask)
+            loss = loss + self.gradient_weight * terms["gradient_loss"]
+        return loss, terms

@@ -1,13 +1,12 @@
 """Networks applied to a scene's images chunk by chunk, with the result of seeing them all at once.
 
-Maximum and mean over the images are all that most networks share between them, so running ones suffice. Of every image
-only a lighting network's local feature is kept: 64 kB, half of that in bfloat16; and, for normal networks that attend
-to the lights of a pixel, 16 bytes per pixel.
+Of every image only a lighting network's local feature is kept, 64 kB, half of that in bfloat16, and what a normal
+network asks for: `kept_bytes` per pixel.
 
 Legend: L images, P pixels of the object, (h, w) the sides of what the network sees.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -15,25 +14,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from render.shared.progress import share, stage
+from render.shared.progress import repeat, share, stage
 from sdps.core.symmetry import Symmetry
-from sdps.inference.turned_views import AnyView
-from sdps.models.base import (
-    KeepingNetwork,
-    LightingNetwork,
-    Lights,
-    MeetingNetwork,
-    NormalNetwork,
-    TurningNetwork,
-    divide,
-)
+from sdps.inference.image_source import View
+from sdps.inference.turned_views import AnyView, TurnedView, turned_lights
+from sdps.models.base import FusionNetwork, LightingNetwork, Lights, divide
 from sdps.models.cnnps import predict_normals
 
 Autocast = Callable[[], AbstractContextManager[Any]]
 _GREY_VALUES = 2**26
 """Grey values kept at once for pixel networks (256 MiB); of more, the images are read again for further pixels."""
-_READ_SHARE, _FUSED_SHARE, _SEEN_SHARE = 0.05, 0.4, 0.9
-"""Parts of the time for normals until a network has read all images, has fused them, and has seen them one by one."""
+_READ_SHARE, _AGGREGATED_SHARE, _SEEN_SHARE = 0.05, 0.4, 0.9
+"""Parts of the time for normals until a network has read all images, has aggregated them, and has seen each."""
 _PIXELS = {"cpu": 64, "cuda": 2048}
 """Pixels a pixel network sees at once: what fits the caches of a CPU is twice as fast there as more."""
 
@@ -42,7 +34,6 @@ def lighting_prediction(
     network: LightingNetwork,
     view: AnyView,
     autocast: Autocast,
-    context: Callable[[slice], Tensor] | None = None,
     seed: int = 0,
 ) -> Any:
     """Return a lighting network's prediction for all images, as its `forward` would.
@@ -51,93 +42,71 @@ def lighting_prediction(
         network: In evaluation mode.
         view: Images of 128x128.
         autocast: Makes the context in which the network runs.
-        context: Further channels (1, n, C, 128, 128) for the images of a slice.
-        seed: For what a `MeetingNetwork` draws.
+        seed: For networks that draw something.
     """
     mask, local = view.mask, []
     for part, images in view:
-        extra = None if context is None else context(part)
         with autocast():
-            feature = network.encode(images, mask, extra)  # (1, n, F, 8, 8)
+            local.append(network.encode(images, mask))  # (1, n, F, 8, 8)
         stage("lights", part.stop, len(view))
-        local.append(feature)
-    if isinstance(network, MeetingNetwork):
-        with autocast():
-            return network.predict_many(torch.cat(local, dim=1), seed)
-    shared = torch.cat([feature.amax(dim=1, keepdim=True) for feature in local], dim=1).amax(dim=1, keepdim=True)
     with autocast():
-        predictions = [network.predict(feature, shared) for feature in local]
-    return type(predictions[0])(*(torch.cat(parts, dim=1) for parts in zip(*predictions, strict=True)))
+        return network.predict_parts(local, seed)
 
 
 def normal_map(
-    network: NormalNetwork,
-    view: AnyView,
-    lights: Lights | None,
-    autocast: Autocast,
-    symmetries: Sequence[Symmetry] = (),
+    network: FusionNetwork, view: View, lights: Lights | None, autocast: Autocast, symmetries: Sequence[Symmetry]
 ) -> list[tuple[Tensor, Tensor | None]]:
-    """Return a normal network's unit normals (1, 3, h, w), float32, and the errors it expects of them.
+    """Return unit normals (1, 3, h, w), float32, of every turned view, and the errors to expect of them.
 
     Args:
         network: In evaluation mode.
         view: Images whose sides are multiples of `network.size_multiple`.
-        lights: Of all images, (1, L, ...); None for networks that are not told the lights.
+        lights: Of all images, (1, L, ...); None for networks that are not given them.
         autocast: Makes the context in which the network runs.
-        symmetries: Of a `TurningNetwork`: an answer for each, of the feature turned so. Others give one.
+        symmetries: How the view is turned.
     """
-    brightness = None if network.division == "none" else _brightness(network, view, lights)
+    found = []
+    if network.equivariant:  # the images are seen once
+        feature = _feature(network, view, lights, autocast)
+        with share(_AGGREGATED_SHARE, 1.0):
+            for number, symmetry in enumerate(symmetries):
+                with autocast():
+                    found.append(network.regress_with_error(network.turn(feature, symmetry)))
+                stage("normals", number + 1, len(symmetries))
+        return found
+    for number, symmetry in enumerate(symmetries):
+        with repeat(number, len(symmetries)):
+            feature = _feature(network, TurnedView(view, symmetry), turned_lights(symmetry, lights), autocast)
+            with autocast():
+                found.append(network.regress_with_error(feature))
+    return found
+
+
+def _feature(network: FusionNetwork, view: AnyView, lights: Lights | None, autocast: Autocast) -> Any:
+    """Return the feature of all images."""
+    brightness = _brightness(network, view, lights) if network.normalised else None
     mask = view.mask
-    feature: Any = None
-    kept: list[Any] = []
-    begun = _READ_SHARE if isinstance(network, KeepingNetwork) else _SEEN_SHARE
-    with share(0.0, begun):
+    accumulated: Any = None
+    read = _READ_SHARE if network.kept_bytes else _SEEN_SHARE
+    with share(0.0, read):
         for part, images in view:
-            some = None if lights is None else lights.part(part)
+            some = None if lights is None else lights.select(part)
             seen = network.observe(images, mask, some, brightness)
             with autocast():
-                if isinstance(network, KeepingNetwork):
-                    kept.append(network.kept(seen))
-                else:
-                    feature = _maximum(feature, network.encode(seen))
+                accumulated = network.accumulate(accumulated, seen)
             stage("normals", part.stop, len(view))
-    if isinstance(network, KeepingNetwork):
-        with autocast(), share(begun, begun := _FUSED_SHARE):
-            feature = network.fused(kept)
-        kept.clear()
-    assert feature is not None  # a view has an image
-    with share(begun, 1.0):
-        return list(_answers(network, feature, autocast, symmetries))
+    with autocast(), share(read, _AGGREGATED_SHARE if network.kept_bytes else 1.0):
+        return network.aggregate(accumulated)
 
 
-def _answers(
-    network: NormalNetwork, feature: Any, autocast: Autocast, symmetries: Sequence[Symmetry]
-) -> Iterator[tuple[Tensor, Tensor | None]]:
-    """Yield the normals of a feature; of a `TurningNetwork` one after the other, as each turned scene has them."""
-    if not (isinstance(network, TurningNetwork) and symmetries):
-        with autocast():
-            yield network.regress_with_error(feature)
-        return
-    for number, symmetry in enumerate(symmetries):
-        with autocast():
-            yield network.regress_with_error(network.turned(feature, symmetry))
-        stage("normals", number + 1, len(symmetries))
-
-
-def _brightness(network: NormalNetwork, view: AnyView, lights: Lights | None) -> Tensor:
+def _brightness(network: FusionNetwork, view: AnyView, lights: Lights | None) -> Tensor:
     """Return `network.brightness` of all images, (1, 1, 1, h, w)."""
-    total: Tensor | None = None
+    total = torch.zeros(())
     for part, images in view:
         if network.needs_lights:
             assert lights is not None
             images = divide(images, lights.intensities[:, part])
-        found = network.brightness(images)
-        if network.division == "max":
-            total = _maximum(total, found)
-        else:
-            found = found * (images.shape[1] / len(view))
-            total = found if total is None else total + found
-    assert total is not None  # a view has an image
+        total = total + network.brightness(images) * (images.shape[1] / len(view))
     return total
 
 
@@ -181,7 +150,3 @@ def pad_to(multiple: int) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
         return functional.pad(images, border), functional.pad(mask, border)
 
     return fit
-
-
-def _maximum(first: Tensor | None, second: Tensor) -> Tensor:
-    return second if first is None else torch.maximum(first, second)

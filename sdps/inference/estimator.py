@@ -12,28 +12,19 @@ from torch import Tensor
 from render.shared.errors import InputError
 from render.shared.progress import repeat
 from sdps.core.estimate import Estimate
-from sdps.core.lighting import ReadOut
 from sdps.core.precision import Arithmetic, arithmetic
 from sdps.core.symmetry import SYMMETRIES
 from sdps.data.augment import measure_exposure
 from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map
 from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
 from sdps.inference.inference_config import InferenceConfig
-from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES, give_back, tiles
-from sdps.inference.turned_views import (
-    KeptView,
-    TurnedView,
-    mean_lights,
-    mean_normals,
-    turned_context,
-    turned_lights,
-)
-from sdps.models.base import Lights, NormalNetwork, TurningNetwork
+from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES, release_memory, tiles
+from sdps.inference.turned_views import KeptView, TurnedView, mean_lights, mean_normals
+from sdps.models.base import FusionNetwork, LightingNetwork, Lights, NormalNetwork
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
-from sdps.models.lighting_variants import LCNetSecond
 
-_ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels"), "second": ("second",)}
+_ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels")}
 _CHUNK_PIXELS = {"cpu": 2**17}
 """On CPUs fewer images at once: their feature maps fit the caches, a quarter to a half faster with the same result."""
 
@@ -50,13 +41,9 @@ class _Known(NamedTuple):
 class Estimator(InferenceConfig):
     """Trained networks that work together: any lighting model with any normal model; its options are those of its base.
 
-    A first lighting pass that a second follows is read out as expectation, as in the second's training.
-
     Attributes:
         lighting: Trained lighting model, or None when lights are always given or `normals` is told none.
         normals: Trained model that gives normals, by convolution or pixel by pixel; None for lights alone.
-        second: Trained second lighting pass. It sees the normals that `normals` finds at 128x128 under the first
-            lights; `normals` then works again, under the second lights.
         device: Where all networks are.
         chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images. None: what
             suits the device.
@@ -67,7 +54,6 @@ class Estimator(InferenceConfig):
 
     lighting: TrainedModel | None
     normals: TrainedModel | None
-    second: TrainedModel | None = None
     device: torch.device
     chunk_pixels: int | None = None
 
@@ -77,10 +63,6 @@ class Estimator(InferenceConfig):
             model = getattr(self, place)
             if model is not None and model.role not in roles:
                 raise InputError(f"{place}: {model.name!r} is a model for {model.role!r}, not for {' or '.join(roles)}")
-        if self.second is not None and self.normals is None:
-            raise InputError(f"second: {self.second.name!r} sees estimated normals; give a normal model too")
-        if self.second is not None and self.lighting is None:
-            raise InputError(f"second: {self.second.name!r} starts from estimated lights; give a lighting model too")
         if self.chunk_pixels is not None and self.chunk_pixels < 1:
             raise InputError(f"chunk_pixels must be at least 1, got {self.chunk_pixels}")
 
@@ -91,9 +73,8 @@ class Estimator(InferenceConfig):
 
     @property
     def needs_lights(self) -> bool:
-        """Whether the normal model is told the lights; otherwise it works without a lighting model."""
-        model = self._normal_model()
-        return model.role == "pixels" or cast(NormalNetwork, model.network).needs_lights
+        """Whether the normal model is given the lights; otherwise it works without a lighting model."""
+        return cast(NormalNetwork, self._normal_model().network).needs_lights
 
     def _normal_model(self) -> TrainedModel:
         """Return the normal model, or refuse to work without one."""
@@ -211,36 +192,23 @@ class Estimator(InferenceConfig):
                 whole[scene.rows, scene.columns][tile.inner] = found
             if len(parts) > 1:
                 del normals, expected
-                give_back()
+                release_memory()
         return box
 
     def _tiling(self, images: int) -> tuple[int, int, int]:
         """Return of which multiple tiles are, how wide their halo is, and how many pixels they have at most."""
-        model = self._normal_model()
-        if model.role == "pixels":
-            return 1, 0, TILE_BYTES // PIXEL_BYTES
-        network = cast(NormalNetwork, model.network)
+        network = cast(NormalNetwork, self._normal_model().network)
         most = TILE_BYTES // (PIXEL_BYTES + images * network.kept_bytes)
         return network.size_multiple, network.reach, most
 
     def _estimate_lights(self, scene: ObjectImages, known: _Known, diagnostics: dict[str, Any]) -> Lights:
-        """Return the lights (1, L, ...) after one or two passes; what is known stays."""
-        read_out = self.read_out if self.second is None else "expectation"
-        lights = self._lighting_pass("lighting", scene, read_out, diagnostics)
-        if self.second is not None:
-            first = self._merged(known, lights)
-            small = self._view(scene, "normals", known.balance, resize_input, INPUT_SIZE**2, diagnostics)
-            normals, mask = self._normals(small, first)[0], small.mask
-
-            def context(part: slice) -> Tensor:
-                return LCNetSecond.context(normals, mask, first.directions[:, part])
-
-            lights = self._lighting_pass("second", scene, self.read_out, diagnostics, context)
+        """Return the lights (1, L, ...); what is known stays."""
+        lights = self._found_lights(scene, diagnostics)
         if lights.confidence is not None:
             diagnostics["confidence"] = lights.confidence[0].float().cpu().numpy()
-        if lights.expected is not None:
-            diagnostics["expected_light_error"] = lights.expected[0].float().cpu().numpy()
-        return self._merged(known, lights.doubted())
+        if lights.expected_error is not None:
+            diagnostics["expected_light_error"] = lights.expected_error[0].float().cpu().numpy()
+        return self._merged(known, lights.with_errors())
 
     def _taken(self, found: Estimate, known: _Known, count: int, diagnostics: dict[str, Any]) -> Lights:
         """Return lights (1, L, ...) that were estimated before, and what was noted of them."""
@@ -251,22 +219,20 @@ class Estimator(InferenceConfig):
         diagnostics.update({name: found.diagnostics[name] for name in told if name in found.diagnostics})
         lights = self._lights(found.light_directions, found.intensities)
         errors = found.diagnostics.get("expected_light_error")
-        return lights._replace(expected=None if errors is None else self._tensor(errors)).doubted()
+        return lights._replace(expected_error=None if errors is None else self._tensor(errors)).with_errors()
 
-    def _lighting_pass(
-        self, place: str, scene: ObjectImages, read_out: ReadOut, diagnostics: dict[str, Any], context: Any = None
-    ) -> Lights:
-        """Return the lights (1, L, ...) that the lighting network in `place` finds, with test-time augmentation."""
-        network = getattr(self, place).network
-        read = self._view(scene, place, None, resize_input, INPUT_SIZE**2, diagnostics)
+    def _found_lights(self, scene: ObjectImages, diagnostics: dict[str, Any]) -> Lights:
+        """Return the lights (1, L, ...) that the lighting network finds, with test-time augmentation."""
+        assert self.lighting is not None
+        network = cast(LightingNetwork, self.lighting.network)
+        read = self._view(scene, "lighting", None, resize_input, INPUT_SIZE**2, diagnostics)
         views = self.light_views or 1
         view: View | KeptView = KeptView(read) if views > 1 else read
         found = []
         for number, symmetry in enumerate(SYMMETRIES[:views]):
-            turned, extra = TurnedView(view, symmetry), turned_context(symmetry, context)
             with repeat(number, views):
-                prediction = lighting_prediction(network, turned, self.arithmetic.autocast, extra, seed=number)
-            found.append((symmetry, network.lights(prediction, read_out)))
+                prediction = lighting_prediction(network, TurnedView(view, symmetry), self.arithmetic.autocast, number)
+            found.append((symmetry, network.read_lights(prediction, self.read_out)))
         return mean_lights(found)
 
     def _normals(self, view: View, lights: Lights | None) -> tuple[Tensor, Tensor | None]:
@@ -276,17 +242,8 @@ class Estimator(InferenceConfig):
             assert lights is not None  # these models need lights
             autocast = self.arithmetic.autocast
             return pixel_normal_map(model.network, view, lights, autocast, rotations=self.rotations), None
-        network = cast(NormalNetwork, model.network)
-        symmetries = SYMMETRIES[: self.normal_views or 1]
-        answers: list[tuple[Tensor, Tensor | None]] = []
-        if isinstance(network, TurningNetwork):
-            answers = normal_map(network, view, lights, self.arithmetic.autocast, symmetries)
-        else:
-            for number, symmetry in enumerate(symmetries):
-                lit = turned_lights(symmetry, lights)
-                with repeat(number, len(symmetries)):
-                    answers += normal_map(network, TurnedView(view, symmetry), lit, self.arithmetic.autocast)
-        return mean_normals(symmetries, answers)
+        network, symmetries = cast(FusionNetwork, model.network), SYMMETRIES[: self.normal_views or 1]
+        return mean_normals(symmetries, normal_map(network, view, lights, self.arithmetic.autocast, symmetries))
 
     def _view(
         self,
@@ -332,36 +289,7 @@ class Estimator(InferenceConfig):
         """Return the lights with what is known in place of what was estimated."""
         pairs = zip(known[:2], lights[:2], strict=True)
         merged = Lights(*(lit.float() if one is None else self._tensor(one) for one, lit in pairs))
-        return merged._replace(expected=lights.expected if known.directions is None else None)
-
-
-def load_estimator(
-    *,
-    lighting: str | Path | None = None,
-    normals: str | Path,
-    second: str | Path | None = None,
-    device: str | torch.device | None = None,
-    **options: Any,
-) -> Estimator:
-    """Load trained models that shall work together.
-
-    Args:
-        lighting: Safetensors of a lighting model; None for known lights only, or a normal model that is told none.
-        normals: Safetensors of a normal model.
-        second: Safetensors of a second lighting pass.
-        device: Torch device; CUDA when there is one, else CPU.
-        options: Other fields of `Estimator`; the defaults are those of every command
-        (`sdps.inference.inference_config`).
-
-    Raises:
-        InputError: a file is missing, damaged, or of a model for something else.
-    """
-    device = default_device(device)
-    files = {"lighting": lighting, "normals": normals, "second": second}
-    models: dict[str, Any] = {
-        place: None if file is None else load_model(file, device, _ROLES[place]) for place, file in files.items()
-    }
-    return Estimator(**models, device=device, **options)
+        return merged._replace(expected_error=lights.expected_error if known.directions is None else None)
 
 
 def default_device(device: str | torch.device | None = None) -> torch.device:
@@ -369,13 +297,13 @@ def default_device(device: str | torch.device | None = None) -> torch.device:
     return torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
 
 
-def load_model(file: str | Path, device: torch.device, role: str | tuple[str, ...] = ()) -> TrainedModel:
+def load_model(file: str | Path, device: torch.device) -> TrainedModel:
     """Load a trained model for inference on `device`.
 
     Raises:
-        InputError: the file is missing, damaged, or of a model of another role.
+        InputError: the file is missing or damaged.
     """
-    model = load_weights(file, role)
+    model = load_weights(file)
     # A third faster on CPUs. The stubs of torch lack `memory_format`.
     model.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model

@@ -15,7 +15,7 @@ import numpy as np
 TILE_BYTES = 7 * 2**28
 """Memory for what networks make of a tile (1.75 GiB); objects whose box fits are one tile."""
 PIXEL_BYTES = 2700
-"""Memory a network takes per pixel, whatever the number of images: feature maps at full size, measured."""
+"""Memory a network takes per pixel, for any number of images: feature maps at full size, measured."""
 _LEAST_SIDE = 64
 
 
@@ -40,8 +40,8 @@ class Tile(NamedTuple):
         return rows, columns
 
 
-def give_back() -> None:
-    """Return memory that was freed to the system, where the C library (glibc) would keep up to a gigabyte of it."""
+def release_memory() -> None:
+    """Return freed memory to the system, where the C library (glibc) would keep up to a gigabyte of it."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
         trim(0)
@@ -65,7 +65,7 @@ def tiles(mask: np.ndarray, most: int, halo: int, multiple: int = 1) -> list[Til
     across = min(width, max(side, int(most / min(height, side + 2 * halo)) - 2 * halo))
     down = max(int(most / min(width, across + 2 * halo)) - 2 * halo, _LEAST_SIDE)
     found = [
-        Tile(rows, columns, _wider(rows, halo, height), _wider(columns, halo, width))
+        Tile(rows, columns, _widen(rows, halo, height), _widen(columns, halo, width))
         for rows in _cut(height, down, multiple)
         for columns in _cut(width, across, multiple)
     ]
@@ -79,5 +79,5 @@ def _cut(length: int, most: int, multiple: int) -> Iterator[slice]:
     return (slice(start, min(start + step, length)) for start in range(0, length, step))
 
 
-def _wider(part: slice, halo: int, length: int) -> slice:
+def _widen(part: slice, halo: int, length: int) -> slice:
     return slice(max(part.start - halo, 0), min(part.stop + halo, length))

@@ -6,7 +6,7 @@ answers, each turned back, is nearer to the truth than one of them.
 Legend: L images, h and w the sides of an image.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -60,18 +60,6 @@ class KeptView:
 AnyView = View | KeptView | TurnedView
 
 
-def turned_context(symmetry: Symmetry, context: Callable[[slice], Tensor] | None) -> Callable[[slice], Tensor] | None:
-    """Return what gives the turned channels of a second pass: normals and shading (1, n, 4, h, w)."""
-    if context is None:
-        return None
-
-    def turned(part: slice) -> Tensor:
-        channels = symmetry.images(context(part))
-        return torch.cat([symmetry.vectors(channels[:, :, :3], dim=2), channels[:, :, 3:]], dim=2)
-
-    return turned
-
-
 def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
     """Return the mean of lights found in turned views, each turned back: directions of unit length.
 
@@ -84,7 +72,7 @@ def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
     mean = functional.normalize(directions.mean(0), dim=-1)  # (B, Q, 3)
     intensities = torch.stack([lights.intensities.float() for _, lights in found]).mean(0)
     sure = [lights.confidence.float() for _, lights in found if lights.confidence is not None]
-    errors = [lights.expected.float() for _, lights in found if lights.expected is not None]
+    errors = [lights.expected_error.float() for _, lights in found if lights.expected_error is not None]
     confidence, expected = (torch.stack(values).mean(0) if values else None for values in (sure, errors))
     if expected is not None:
         spread = torch.rad2deg((directions - mean).square().sum(-1).mean(0).sqrt())  # (B, Q)

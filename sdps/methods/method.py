@@ -26,7 +26,6 @@ class Method:
         name: Label of its row.
         lights: A lighting model (run or file), `true` for lights that are given, or empty for none.
         normals: A normal model, a classical method, or empty for lighting alone.
-        second: A second lighting pass, or empty.
         intensities: `true` where only the intensities are given, else empty.
         read_out: How light classes become lights; None for the configuration's.
         light_views: Test-time augmentation of lights: turned views averaged over where the configuration does not say;
@@ -39,7 +38,6 @@ class Method:
     name: str
     lights: str = NONE
     normals: str = NONE
-    second: str = NONE
     intensities: str = NONE
     read_out: ReadOut | None = None
     light_views: int | None = None
@@ -49,40 +47,30 @@ class Method:
 
     def models(self) -> set[str]:
         """Return the runs whose weights it needs."""
-        return {self.lights, self.normals, self.second} - {NONE, TRUE_LIGHTS, *CLASSICAL}
+        return {self.lights, self.normals} - {NONE, TRUE_LIGHTS, *CLASSICAL}
 
 
-def label(lights: str, normals: str, second: str = NONE, *, combination: str = NONE) -> str:
+def label(lights: str, normals: str, *, combination: str = NONE) -> str:
     """Name what parts make together, by the combination's name and its parts where it has one."""
-    parts = (lights, normals, second)
-    suffix = " (shipped)" if any(part.startswith(pretrained.SHIPPED) for part in parts) else ""
-    lights, normals, second = (part.removeprefix(pretrained.SHIPPED) for part in parts)
+    suffix = " (shipped)" if any(part.startswith(pretrained.SHIPPED) for part in (lights, normals)) else ""
+    lights, normals = (part.removeprefix(pretrained.SHIPPED) for part in (lights, normals))
     if lights == TRUE_LIGHTS:
         text = f"{normals}, true lights"
     else:
-        text = " + ".join(part for part in (lights, second, normals) if part)
+        text = " + ".join(part for part in (lights, normals) if part)
     return (f"{combination} ({text})" if combination else text) + suffix
 
 
-def combined(
-    lights: str,
-    normals: str,
-    second: str = NONE,
-    *,
-    paper: str = "",
-    intensities: str = NONE,
-    combination: str = NONE,
-) -> Method:
+def join(lights: str, normals: str, *, paper: str = "", intensities: str = NONE, combination: str = NONE) -> Method:
     """Return the method of parts that go together, with its label; asked for as a combination, with its views."""
     pair = COMBINATIONS[combination] if combination else None
     views: dict[str, Any] = {field: getattr(pair, field, None) for field in VIEWS}
     named = combination if any(views.values()) else NONE  # others are their parts, and called so
-    name = label(*map(stem, (lights, normals, second)), combination=named)
+    name = label(stem(lights), stem(normals), combination=named)
     return Method(
         name=name + (", true intensities" if intensities else ""),
         lights=lights,
         normals=normals,
-        second=second,
         intensities=intensities,
         paper=paper,
         **views,

@@ -7,19 +7,16 @@ from pathlib import Path
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.methods import pretrained
-from sdps.methods.method import CLASSICAL, CONSTANT, NONE, REFINE, Method, combined, label, stem
+from sdps.methods.method import CLASSICAL, CONSTANT, NONE, REFINE, Method, join, label, stem
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
 
-def combine(
-    lights: str | None, normals: str | None, second: str | None, intensities: str | None, find: Callable[[str], Path]
-) -> Method:
+def combine(lights: str | None, normals: str | None, intensities: str | None, find: Callable[[str], Path]) -> Method:
     """Return the method that a user's choice describes.
 
     Args:
         lights: A run or weights file, or `true`.
         normals: A run, a weights file, a combination such as `sdps`, or a classical method.
-        second: A run or weights file.
         intensities: `true` where only these are given.
         find: Gives the weights file of a name, or raises InputError.
 
@@ -31,18 +28,14 @@ def combine(
     combination = name if name in COMBINATIONS else NONE
     if combination:
         pair = COMBINATIONS[combination]
-        if pair.second and lights != TRUE_LIGHTS:  # of lights that are given nothing is left to correct
-            second = second or prefix + pair.second
         lights = lights or prefix + pair.lighting
         normals = prefix + pair.normals
     if normals is None:
-        raise InputError("--lights and --second need --normals as well; see `sdps models`")
+        raise InputError("--lights and --intensities need --normals as well; see `sdps models`")
     lights = lights or _default_lights(normals, find)
     if normals in CLASSICAL:
-        _check_classical(normals, lights, second, intensities)
-    if second and lights in (NONE, TRUE_LIGHTS):
-        raise InputError("--second corrects estimated lights; name a lighting model with --lights")
-    method = combined(lights, normals, second or NONE, intensities=intensities or NONE, combination=combination)
+        _check_classical(normals, lights, intensities)
+    method = join(lights, normals, intensities=intensities or NONE, combination=combination)
     for needed in sorted(method.models()):
         find(needed)
     return method
@@ -53,9 +46,9 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
 
     Args:
         text: A combination (`sdps`), a normal model (`nenet`), a classical method (`pf14`), a lighting model alone
-            (`lcnet`), lights and normals (`lcnet+psfcn`, `true+least-squares`), or these with a second lighting pass in
-            the middle. Calibrated methods alone are given the true lights, networks alone what they were trained on;
-            `shipped:` before a name means the pretrained weights. `+refine` at the end refines what was found.
+            (`lcnet`), or lights and normals (`lcnet+psfcn`, `true+least-squares`). Calibrated methods alone are given
+            the true lights, networks alone what they were trained on; `shipped:` before a name means the pretrained
+            weights. `+refine` at the end refines what was found.
         find: Gives the weights file of a name, or raises InputError.
 
     Raises:
@@ -65,30 +58,27 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
     if parts == [REFINE]:
         raise InputError(f"method {text}: say what is refined, as in sdps-plus+{REFINE}")
     if parts[-1] == REFINE:
-        return refined(parse("+".join(parts[:-1]), find))
-    if not all(parts) or len(parts) > 3:
-        raise InputError(f"method {text!r}: want METHOD, LIGHTS+NORMALS or LIGHTS+SECOND+NORMALS")
-    if len(parts) > 1:
-        return combine(parts[0], parts[-1], parts[1] if len(parts) == 3 else None, None, find)
+        return with_refinement(parse("+".join(parts[:-1]), find))
+    if not all(parts) or len(parts) > 2:
+        raise InputError(f"method {text!r}: want METHOD or LIGHTS+NORMALS, either with +{REFINE}")
+    if len(parts) == 2:
+        return combine(parts[0], parts[1], None, find)
     (name,) = parts
     if name == CONSTANT:
         return Method(name="constant predictor", normals=CONSTANT)
     if name in classical.METHODS:
-        return combine(TRUE_LIGHTS if classical.METHODS[name].calibrated else None, name, None, None, find)
+        return combine(TRUE_LIGHTS if classical.METHODS[name].calibrated else None, name, None, find)
     if name.removeprefix(pretrained.SHIPPED) in COMBINATIONS:
-        return combine(None, name, None, None, find)
+        return combine(None, name, None, find)
     if name == TRUE_LIGHTS:
         raise InputError(f"method {name}: say which normals, as in true+psfcn")
-    role = MODELS[model_of(name, find)].role
-    if role == "second":
-        raise InputError(f"method {name}: a second lighting pass needs LIGHTS+{name}+NORMALS")
-    if role == "lighting":
+    if MODELS[model_of(name, find)].role == "lighting":
         find(name)
         return Method(name=label(stem(name), NONE), lights=name)
-    return combine(None, name, None, None, find)
+    return combine(None, name, None, find)
 
 
-def refined(method: Method) -> Method:
+def with_refinement(method: Method) -> Method:
     """Return a method whose normals and lights are refined by inverse rendering (`sdps.refinement`).
 
     Raises:
@@ -99,8 +89,8 @@ def refined(method: Method) -> Method:
     return replace(method, name=f"{method.name}, refined", refined=True, paper="")
 
 
-def by_networks(method: Method) -> bool:
-    """Tell whether a network finds the normals, under lights that a network finds or that are given."""
+def uses_networks(method: Method) -> bool:
+    """Return whether a network finds the normals, under lights that a network finds or that are given."""
     return method.lights != NONE and method.normals not in (NONE, *CLASSICAL)
 
 
@@ -117,7 +107,7 @@ def model_of(name: str, find: Callable[[str], Path]) -> str:
 
 
 def _default_lights(normals: str, find: Callable[[str], Path]) -> str:
-    """Return the lights a normal model was trained on; none for methods that are told none."""
+    """Return the lights a normal model was trained on; none for methods that are not given any."""
     if normals in CLASSICAL:
         return NONE
     lights = MODELS[model_of(normals, find)].lights
@@ -125,10 +115,10 @@ def _default_lights(normals: str, find: Callable[[str], Path]) -> str:
     return pretrained.SHIPPED + lights if shipped else lights
 
 
-def _check_classical(normals: str, lights: str, second: str | None, intensities: str | None) -> None:
+def _check_classical(normals: str, lights: str, intensities: str | None) -> None:
     """Refuse what a classical method would not look at, and a calibrated one without lights."""
     calibrated = normals in classical.METHODS and classical.METHODS[normals].calibrated
     if calibrated and not lights:
-        raise InputError(f"{normals} is told the lights; give --lights, `true` or a lighting model")
-    if not calibrated and (lights or second or intensities):
-        raise InputError(f"{normals} finds the lights itself; leave out --lights, --second and --intensities")
+        raise InputError(f"{normals} needs lights; give --lights, `true` or a lighting model")
+    if not calibrated and (lights or intensities):
+        raise InputError(f"{normals} finds the lights itself; leave out --lights and --intensities")

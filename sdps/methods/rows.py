@@ -7,38 +7,34 @@ from pathlib import Path
 from sdps.core.lighting import ReadOut
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
-from sdps.methods.method import NONE, Method, combined, label
+from sdps.methods.method import NONE, Method, join, label
 from sdps.methods.parse import combine, parse
 from sdps.methods.pretrained import ALL, finder
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
-NORMAL_ROWS = (  # lighting, normals, second, row of the paper
-    (TRUE_LIGHTS, "psfcn", NONE, "B0"),
-    ("lcnet", "nenet", NONE, "B1"),
-    ("lcnet", "psfcn", NONE, "B2"),
-    ("lcnet-reg", "nenet-reg", NONE, "B3"),
-    ("lcnet-reg", "psfcn", NONE, "B4"),
-    (NONE, "upsfcn-deep-mask", NONE, "B5"),
-    (NONE, "upsfcn-deep", NONE, "B6"),
-    (NONE, "upsfcn-wide", NONE, "B7"),
-    (NONE, "upsfcn-light", NONE, "B8"),
-    (NONE, "upsfcn", NONE, "B9"),
-    (TRUE_LIGHTS, "nenet", NONE, ""),
-    ("lcnet", "nenet-norm", NONE, ""),
-    (TRUE_LIGHTS, "psfcn-norm", NONE, ""),
-    ("lcnet", "psfcn-norm", NONE, ""),
-    (TRUE_LIGHTS, "cnnps", NONE, ""),
-    ("lcnet", "cnnps", NONE, ""),
-    ("lcnet-joint", "nenet-joint", NONE, ""),
-    ("lcnet-soft", "psfcn", NONE, ""),
-    ("lcnet-soft", "nenet-plus", NONE, ""),
-    ("lcnet-soft", "nenet-plus", "lcnet-second", ""),
-    ("lcnet-soft", "attention", NONE, ""),
-    (TRUE_LIGHTS, "attention", NONE, ""),
-    ("lightset", "frames", NONE, ""),
-    (TRUE_LIGHTS, "frames", NONE, ""),
-    ("lcnet", "least-squares", NONE, ""),
-    (TRUE_LIGHTS, "least-squares", NONE, ""),
+NORMAL_ROWS = (  # lighting, normals, row of the paper
+    (TRUE_LIGHTS, "psfcn", "B0"),
+    ("lcnet", "nenet", "B1"),
+    ("lcnet", "psfcn", "B2"),
+    ("lcnet-reg", "nenet-reg", "B3"),
+    ("lcnet-reg", "psfcn", "B4"),
+    (NONE, "upsfcn-deep-mask", "B5"),
+    (NONE, "upsfcn-deep", "B6"),
+    (NONE, "upsfcn-wide", "B7"),
+    (NONE, "upsfcn-light", "B8"),
+    (NONE, "upsfcn", "B9"),
+    (TRUE_LIGHTS, "nenet", ""),
+    ("lcnet", "nenet-norm", ""),
+    (TRUE_LIGHTS, "psfcn-norm", ""),
+    ("lcnet", "psfcn-norm", ""),
+    (TRUE_LIGHTS, "cnnps", ""),
+    ("lcnet", "cnnps", ""),
+    ("lcnet-soft", "psfcn", ""),
+    ("lcnet-soft", "nenet-plus", ""),
+    ("lightset", "frames", ""),
+    (TRUE_LIGHTS, "frames", ""),
+    ("lcnet", "least-squares", ""),
+    (TRUE_LIGHTS, "least-squares", ""),
 )
 
 
@@ -56,18 +52,17 @@ def lighting_methods(
     """
     names = [name for name, item in MODELS.items() if item.role == "lighting"]
     names += [name for name in own if name not in names]
-    names.append("lcnet-joint")
     trained = [name for name in names if pretrained.trained_file(out, name).is_file()]
     methods = [Method(name=name, lights=name, paper=MODELS[name].paper if name in MODELS else "") for name in trained]
     if "lcnet" in trained:
         read_outs: tuple[ReadOut, ...] = ("centre", "expectation", "peak")
         others = (how for how in read_outs if how != config.read_out)
         methods += [Method(name=f"lcnet, {how}", lights="lcnet", read_out=how) for how in others]
-    available, told = pretrained.shipped(), {way.lights for way in ways}
+    available, wanted = pretrained.shipped(), {way.lights for way in ways}
     kept = [
         Method(name=label(pretrained.SHIPPED + name, NONE), lights=pretrained.SHIPPED + name, paper=MODELS[name].paper)
         for name in names
-        if name in available and (shipped == ALL or pretrained.SHIPPED + name in told)
+        if name in available and (shipped == ALL or pretrained.SHIPPED + name in wanted)
     ]
     rows = [*methods, *kept]
     return rows if config.light_views else with_views(rows, ways)
@@ -109,23 +104,23 @@ def normal_methods(out: Path, shipped: tuple[str, ...] = ALL, config: InferenceC
 
 def _every_row() -> list[Method]:
     """Return the tables' rows, and after them the combinations that average over views."""
-    rows = [combined(lights, normals, second, paper=paper) for lights, normals, second, paper in NORMAL_ROWS]
+    rows = [join(lights, normals, paper=paper) for lights, normals, paper in NORMAL_ROWS]
     for name, pair in COMBINATIONS.items():
         if pair.light_views or pair.normal_views:
-            rows.append(combined(pair.lighting, pair.normals, pair.second, combination=name))
+            rows.append(join(pair.lighting, pair.normals, combination=name))
     return rows
 
 
 def as_shipped(method: Method) -> Method:
     """Return the same way with the weights that travel with the package, where it needs any."""
-    parts = {part: getattr(method, part) for part in ("lights", "normals", "second")}
+    parts = {part: getattr(method, part) for part in ("lights", "normals")}
     placed = {part: pretrained.SHIPPED + name for part, name in parts.items() if name in method.models()}
     return replace(method, name=f"{method.name} (shipped)", **placed) if placed else method
 
 
-def chosen(out: Path, lights: str | None, normals: str | None, second: str | None, intensities: str | None) -> Method:
+def from_flags(out: Path, lights: str | None, normals: str | None, intensities: str | None) -> Method:
     """Return the method that flags describe, with its row in the paper's table; see `sdps.methods.parse.combine`."""
-    return _with_row(combine(lights, normals, second, intensities, finder(out)))
+    return _with_row(combine(lights, normals, intensities, finder(out)))
 
 
 def _with_row(method: Method) -> Method:
@@ -136,5 +131,5 @@ def paper_row(method: Method) -> str:
     """Return the row of the paper's table of normals that a combination is, or an empty string."""
     if method.intensities or method.refined:
         return ""
-    parts = tuple(part.removeprefix(pretrained.SHIPPED) for part in (method.lights, method.normals, method.second))
-    return next((row[3] for row in NORMAL_ROWS if row[:3] == parts), "")
+    parts = tuple(part.removeprefix(pretrained.SHIPPED) for part in (method.lights, method.normals))
+    return next((row[2] for row in NORMAL_ROWS if row[:2] == parts), "")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from sdps.models.checkpoint import TrainedModel
 
 _digest = cache(file_hash)
-_PLACES = ("lights", "second", "normals")
+_PLACES = ("lights", "normals")
 Found = dict[tuple[Hashable, ...], Estimate]
 """Estimated lights by what they depend on."""
 
@@ -56,15 +56,11 @@ class Runner:
         def model(name: str) -> "TrainedModel | None":
             return _loaded(self.files[name]) if name in self.files else None
 
-        lighting, second, normals = (model(getattr(method, place)) for place in _PLACES)
+        lighting, normals = (model(getattr(method, place)) for place in _PLACES)
         self.estimator = None
         if lighting is not None or normals is not None:
             self.estimator = Estimator(
-                lighting=lighting,
-                normals=normals,
-                second=second,
-                device=default_device(),
-                **self.config.options(),
+                lighting=lighting, normals=normals, device=default_device(), **self.config.options()
             )
 
     def identity(self) -> str:
@@ -126,11 +122,8 @@ class Runner:
     def _lights(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
         """Estimate the lights, or take what another method with the same lighting networks found."""
         found = {} if found is None else found
-        places = _PLACES if self.method.second else ("lights",)  # a second pass sees normals
-        names = [name for place in places if (name := getattr(self.method, place)) != NONE]
-        used = (_digest(self.files[name]) for name in names)
-        options = self.config.options() | ({} if self.method.second else {"normal_views": None, "rotations": None})
-        key = (*used, *options.items(), "intensities" in given)
+        options = self.config.options() | {"normal_views": None, "rotations": None}
+        key = (_digest(self.files[self.method.lights]), *options.items(), "intensities" in given)
         if key not in found:
             assert self.estimator is not None  # the method has a lighting model
             found[key] = self.estimator.estimate_lights(images, mask, given.get("intensities"))

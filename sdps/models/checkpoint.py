@@ -47,7 +47,7 @@ class TrainedModel:
     metadata: dict[str, Any]
 
     @property
-    def role(self) -> str:
+    def role(self) -> registry.Role:
         """What the model is for; see `registry.ModelEntry`."""
         return registry.entry(self.name).role
 
@@ -90,15 +90,11 @@ def _with_sorted_header(data: bytes) -> bytes:
     return _LENGTH.pack(len(text)) + text + data[start:]
 
 
-def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedModel:
+def load_weights(path: str | Path) -> TrainedModel:
     """Read weights written by `save_weights` and build their network. Runs no code from the file.
 
-    Args:
-        path: The file.
-        role: Role or roles the caller can use, e.g. `lighting`; any if empty.
-
     Raises:
-        InputError: missing, truncated or foreign file, a model of another role, or weights that do not fit it.
+        InputError: missing, truncated or foreign file, an unknown model, or weights that do not fit it.
     """
     if not Path(path).is_file():
         raise InputError(f"{path}: no such weights file; train one or give another path")
@@ -107,13 +103,7 @@ def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedM
         tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (not a dict)
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: not written by this project (no {FORMAT!r} header); train the network again")
-    name, options, metadata = _described(path, header)
-    roles = (role,) if isinstance(role, str) else role
-    if roles and registry.entry(name).role not in roles:
-        raise InputError(
-            f"{path}: holds {name!r}, a model for {registry.entry(name).role!r}; one for {' or '.join(roles)} is "
-            "needed here; swap the files"
-        )
+    name, options, metadata = _read_header(path, header)
     damaged = next((key for key, tensor in tensors.items() if not torch.isfinite(tensor).all()), None)
     if damaged is not None:
         raise InputError(f"{path}: {damaged} has values that are infinite or NaN; copy or train it again")
@@ -135,7 +125,7 @@ def _shape(tensors: Mapping[str, torch.Tensor], name: str) -> tuple[int, ...] | 
     return tuple(tensors[name].shape) if name in tensors else None
 
 
-def _described(path: str | Path, header: dict[str, str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
+def _read_header(path: str | Path, header: dict[str, str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Return model name, options and metadata of a file's header, or refuse it."""
     try:
         name, options, metadata = header["model"], parse_json(header["options"]), parse_json(header["metadata"])
@@ -161,7 +151,7 @@ def load_state(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: truncated or foreign file.
     """
-    with decoding(path, "a checkpoint", "delete it to start this run afresh"):
+    with decoding(path, "a checkpoint", "delete it to start this run again"):
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(state, dict):
             raise TypeError(f"it holds a {type(state).__name__}")

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from render.shared.errors import InputError
+from sdps.models.base import NormalNetwork
 
 MAP_SIDE = 32
 """w, the side of an observation map in cells."""
@@ -25,7 +26,7 @@ _BLACK = 1e-12
 """A pixel whose maximum is below is black: far under any radiance, yet its inverse's square is a float32."""
 
 
-class CNNPS(nn.Module):
+class CNNPS(NormalNetwork):
     """Regresses the normal of every pixel from its observation map (`observation_maps`).
 
     Layers and widths are those of the authors' code: two dense blocks of two convolutions, a transition that halves

@@ -5,8 +5,8 @@ nothing else. So each pixel's lights are turned into the frame of a first normal
 it, the view in the plane of x and z. There all normals are near z, whatever way the surface faces, and one pixel
 teaches what others of another orientation need. Images of a pixel meet by their mean and maximum (as in Deep Sets,
 Zaheer et al., NeurIPS 2017), a few times over, without convolutions; convolutions see the fused map, once for a scene
-and not once for an image. The network is told what error to expect of each light: it may trust those that are given,
-and know better than those that were estimated badly.
+and not once for an image. The network is given the error to expect of each light: it may trust lights that were
+measured, and know better than lights that were estimated badly.
 
 Legend: B scenes, Q images of a scene, H and W the sides, N pixels of all objects, C channels.
 """
@@ -20,8 +20,9 @@ from torch.nn import functional
 from render.shared.errors import InputError, unknown
 from render.shared.progress import stage
 from sdps.core.first_normals import first_normals, frames
+from sdps.core.losses import NormalCriterion, expected_error_loss
 from sdps.core.symmetry import Symmetry
-from sdps.models.base import KeepingNetwork, Observations, TurningNetwork
+from sdps.models.base import FusionNetwork, Observations, Truth
 from sdps.models.blocks import LOG_USUAL, SLOPE, chord_degrees, conv, deconv
 
 FRAMES = ("normal", "camera")
@@ -29,10 +30,10 @@ _SEEN, _KNOWN = 11, 7
 """Values of a pixel under one light, and those it has under all."""
 _DARK = 1e-3
 """Radiance below which nothing is seen; full scale is 1."""
-_DOUBTFUL = 10.0
+_ERROR_SCALE = 10.0
 """Degrees to expect of a light that count as 1."""
 _MAP = 32
-"""Channels of the fused map besides the normals."""
+"""Channels of the fused map, without the normals."""
 _STRIP = 2**13
 """Pixels times lights that are worked on at once in inference."""
 
@@ -48,9 +49,9 @@ class Exchange(nn.Module):
         self.out = nn.Linear(2 * width, width)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """Return tokens (N, Q, C) that know of each other; their order does not matter."""
+        """Return tokens (N, Q, C) that have seen each other; their order does not matter."""
         seen = self.norm(tokens)
-        shared = self.shared(pooled(seen))[:, None]
+        shared = self.shared(pool(seen))[:, None]
         return tokens + self.out(functional.leaky_relu(self.own(seen) + shared, SLOPE))
 
 
@@ -78,17 +79,18 @@ class StagedNormals(NamedTuple):
     expected: Tensor  # (B, 1, H, W), distance to the true normals
 
 
-class FrameNet(KeepingNetwork, TurningNetwork):
+class FrameNet(FusionNetwork):
     """Normals pixel by pixel in frames of their own, then corrected by their surroundings.
 
     Args:
         width: C, channels of a light of a pixel.
-        blocks: Layers in which the lights of a pixel exchange what they know.
+        blocks: Layers in which the lights of a pixel exchange what they show.
         frame: `normal` for the frame of the first normal; `camera` leaves directions as they are, to compare.
     """
 
     needs_mask = True
     kept_bytes = 6
+    equivariant = True
 
     def __init__(self, *, width: int = 64, blocks: int = 4, frame: str = "normal") -> None:
         super().__init__()
@@ -112,13 +114,22 @@ class FrameNet(KeepingNetwork, TurningNetwork):
         for parameter in (*self.offset.parameters(), *self.leave[-1].parameters()):
             nn.init.zeros_(parameter)
 
-    def forward(self, seen: Observations) -> Tensor:
-        return self.regress(self.encode(seen))
-
-    def staged(self, seen: Observations) -> StagedNormals:
+    def predict_stages(self, seen: Observations) -> StagedNormals:
         """Return what is learned: the normals of pixels alone, the corrected ones, and the error to expect of these."""
         fused = self.encode(seen)
-        return StagedNormals(fused.normals, *self.corrected(fused))
+        return StagedNormals(fused.normals, *self.correct(fused))
+
+    def loss(self, seen: Observations, truth: Truth, criterion: NormalCriterion) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the losses of the normals at both stages plus, weighted, that of the expected error."""
+        stages = self.predict_stages(seen)
+        loss, terms = criterion(stages.normals, truth.normals, truth.mask)
+        terms["pixel_loss"], _ = criterion(stages.alone, truth.normals, truth.mask)
+        terms["expected_loss"] = expected_error_loss(stages.expected, stages.normals, truth.normals, truth.mask)
+        return loss + terms["pixel_loss"] + criterion.expected_weight * terms["expected_loss"], terms
+
+    def inference_seconds(self, images: int, pixels: float, box: float, views: int) -> float:
+        """Return about how long inference takes: views are turned after the images are fused."""
+        return 2.1e-6 * images * pixels + 2.0e-6 * views * box
 
     def encode(self, seen: Observations) -> FusedMap:
         """Return the fused map of all of a scene's images; without gradients a few pixels at a time."""
@@ -128,16 +139,16 @@ class FrameNet(KeepingNetwork, TurningNetwork):
             self._per_pixel(Pixels(*(part.float() for part in some)))
             for some in zip(*(each.split(count) for each in pixels), strict=True)
         ]
-        return self._mapped(torch.cat(found), inside)
+        return self._to_map(torch.cat(found), inside)
 
     def regress(self, feature: FusedMap) -> Tensor:
-        return self.corrected(feature)[0]
+        return self.correct(feature)[0]
 
     def regress_with_error(self, feature: FusedMap) -> tuple[Tensor, Tensor | None]:
-        normals, distance = self.corrected(feature)
+        normals, distance = self.correct(feature)
         return normals, chord_degrees(distance)
 
-    def corrected(self, feature: FusedMap) -> tuple[Tensor, Tensor]:
+    def correct(self, feature: FusedMap) -> tuple[Tensor, Tensor]:
         """Return unit normals (B, 3, H, W), float32, and the expected distance (B, 1, H, W) to the true ones."""
         normals, fused, mask = feature
         entered = self.enter(torch.cat([normals.to(fused.dtype), fused, mask.to(fused.dtype)], dim=1))
@@ -146,27 +157,27 @@ class FrameNet(KeepingNetwork, TurningNetwork):
         change = self.leave(torch.cat([back, entered], dim=1)).float()
         return functional.normalize(normals + change[:, :3], dim=1), (change[:, 3:] + LOG_USUAL).exp()
 
-    def turned(self, feature: FusedMap, symmetry: Symmetry) -> FusedMap:
+    def turn(self, feature: FusedMap, symmetry: Symmetry) -> FusedMap:
         """Return the fused map of the turned scene: its pixels see their lights in frames that turn with them."""
         normals, fused, mask = (symmetry.images(each) for each in feature)
         return FusedMap(symmetry.vectors(normals, dim=1), fused, mask)
 
-    def kept(self, seen: Observations) -> Observations:
-        """Return some of a scene's images, in 16 bits, for `fused`."""
-        return seen._replace(images=seen.images.half())
+    def accumulate(self, so_far: list[Observations] | None, seen: Observations) -> list[Observations]:
+        """Keep the images of a scene, in 16 bits."""
+        return [*(so_far or []), seen._replace(images=seen.images.half())]
 
-    def fused(self, parts: list[Observations]) -> FusedMap:
+    def aggregate(self, accumulated: list[Observations]) -> FusedMap:
         """Return the fused map of all of a scene's images, which are never copied as a whole."""
-        assert parts[0].mask is not None  # the network asks for it
-        inside = parts[0].mask[:, 0] > 0.5  # (1, H, W)
-        directions, errors = _all_lights(parts)
+        assert accumulated[0].mask is not None  # the network asks for it
+        inside = accumulated[0].mask[:, 0] > 0.5  # (1, H, W)
+        directions, errors = _all_lights(accumulated)
         found = torch.zeros(inside.numel(), 3 + _MAP, device=inside.device)
         places = inside.flatten().nonzero()[:, 0]
         strips = places.split(max(1, _STRIP // directions.shape[1]))
         for number, some in enumerate(strips):
             # Autocast to bfloat16 refuses to join images of 16-bit floats.
             with torch.autocast(inside.device.type, enabled=False):
-                values = torch.cat([part.images[0].flatten(2)[..., some] for part in parts])  # (Q, 3, n)
+                values = torch.cat([part.images[0].flatten(2)[..., some] for part in accumulated])  # (Q, 3, n)
             lights = (each.expand(len(some), *each.shape[1:]) for each in (directions, errors))
             found[some] = self._per_pixel(Pixels(values.permute(2, 0, 1).float(), *lights)).float()
             stage("normals", number + 1, len(strips))
@@ -180,16 +191,16 @@ class FrameNet(KeepingNetwork, TurningNetwork):
             camera = torch.eye(3, device=first.device).expand(len(first), 3, 3)
             axes = frames(first) if self.frame == "normal" else camera  # (N, 3, 3)
             start = (axes @ first[..., None])[..., 0]  # the first normal in the frame
-            seen, known = described(pixels, axes, start, scale, residual)
+            seen, known = pixel_inputs(pixels, axes, start, scale, residual)
         tokens = self.exchange(self.seen(seen) + self.known(known)[:, None])  # (N, Q, C)
-        fused = self.fuse(torch.cat([pooled(tokens), known.to(tokens.dtype)], dim=-1))  # (N, 128)
+        fused = self.fuse(torch.cat([pool(tokens), known.to(tokens.dtype)], dim=-1))  # (N, 128)
         # Never under autocast: a normal rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
         with torch.autocast(fused.device.type, enabled=False):
             local = functional.normalize(start + self.offset(fused.float()), dim=-1)
             normals = (local[:, None] @ axes)[:, 0]
             return torch.cat([normals, self.feature(fused.float())], dim=1)
 
-    def _mapped(self, found: Tensor, inside: Tensor) -> FusedMap:
+    def _to_map(self, found: Tensor, inside: Tensor) -> FusedMap:
         """Return what was found of the object's pixels, (N, 3 + 32), in its place; `inside` (B, H, W) bool."""
         places = found.new_zeros(*inside.shape, found.shape[1])
         places[inside] = found
@@ -206,7 +217,7 @@ def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor]:
     return directions.to(kept).float(), expected.to(kept).float()
 
 
-def pooled(tokens: Tensor) -> Tensor:
+def pool(tokens: Tensor) -> Tensor:
     """Return mean and maximum (N, 2 C) over the lights of tokens (N, Q, C)."""
     return torch.cat([tokens.mean(dim=1), tokens.max(dim=1).values], dim=-1)
 
@@ -221,8 +232,8 @@ def object_pixels(seen: Observations) -> tuple[Tensor, Pixels]:
     return inside, Pixels(values, seen.directions[which].to(values.dtype), errors[which].to(values.dtype))
 
 
-def described(pixels: Pixels, axes: Tensor, start: Tensor, scale: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what the network is told of each light of a pixel, (N, Q, 11), and of the pixel, (N, 7).
+def pixel_inputs(pixels: Pixels, axes: Tensor, start: Tensor, scale: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what the network is given of each light of a pixel, (N, Q, 11), and of the pixel, (N, 7).
 
     Args:
         pixels: What they showed.
@@ -236,11 +247,11 @@ def described(pixels: Pixels, axes: Tensor, start: Tensor, scale: Tensor, residu
     local = directions @ axes.transpose(1, 2)  # (N, Q, 3)
     view = axes[:, :, 2]  # (N, 3), z of the camera
     half = functional.normalize(local + view[:, None], dim=-1)
-    # Brightness as it was exposed tells what is noise and what is clipped. The inverse hyperbolic sine keeps highlights
-    # in range, and zero at zero.
+    # Brightness as exposed shows what is noise and what is clipped. The inverse hyperbolic sine keeps highlights in
+    # range, and zero at zero.
     brightness = torch.asinh(4.0 * values.mean(dim=-1, keepdim=True))
-    doubt = errors[..., None] / _DOUBTFUL
-    seen = torch.cat([torch.asinh(2.0 * relative), local, half, brightness, doubt], dim=-1)
+    error = errors[..., None] / _ERROR_SCALE
+    seen = torch.cat([torch.asinh(2.0 * relative), local, half, brightness, error], dim=-1)
     facing = (view * start).sum(dim=1, keepdim=True)
     known = torch.cat([start[:, :2], facing, torch.log(scale + _DARK), residual[:, None]], dim=-1)
     return seen, known

@@ -12,7 +12,7 @@ from torch.nn import functional
 from sdps.core.lighting import LightClasses, ReadOut
 from sdps.core.losses import class_loss
 from sdps.models.base import LightingNetwork, Lights
-from sdps.models.blocks import conv, initialise
+from sdps.models.blocks import conv, initialise, max_over_images
 
 INPUT_SIZE = 128
 EARLY_SIZE = 64
@@ -28,46 +28,46 @@ class LightingLogits(NamedTuple):
 
 
 class LightingTrunk(LightingNetwork):
-    """The layers every lighting network shares: extractor, local-global fusion, and convolutions down to 1x1.
+    """The layers that LCNet and its variants share: extractor, local-global fusion, and convolutions down to 1x1.
 
     Args:
-        inputs: Input channels.
-        use_mask: One of them is the object mask.
+        use_mask: The object mask is a fourth input channel.
         use_global: Concatenate the feature shared by all images to each image's own.
-        widths: Channels of the extractor at 1/8 and 1/16 of the size, and of the classifier.
     """
 
-    def __init__(
-        self, *, inputs: int, use_mask: bool, use_global: bool, widths: tuple[int, int, int] = (128, 256, 256)
-    ) -> None:
+    def __init__(self, *, use_mask: bool, use_global: bool) -> None:
         super().__init__()
         self.use_mask, self.use_global = use_mask, use_global
-        middle, local, last = widths
         self.extractor = nn.Sequential(
-            conv(inputs, 64, stride=2),  # 64 x 64
+            conv(3 + use_mask, 64, stride=2),  # 64 x 64
             conv(64, 128, stride=2),  # 32 x 32
             conv(128, 128),
-            conv(128, middle, stride=2),  # 16 x 16
-            conv(middle, middle),
-            conv(middle, local, stride=2),  # 8 x 8
-            conv(local, local),
+            conv(128, 128, stride=2),  # 16 x 16
+            conv(128, 128),
+            conv(128, 256, stride=2),  # 8 x 8
+            conv(256, 256),
         )
         self.classifier = nn.Sequential(
-            conv(2 * local if use_global else local, last),
-            conv(last, last, stride=2),  # 4 x 4
-            conv(last, last, stride=2),  # 2 x 2
-            conv(last, last, stride=2),  # 1 x 1
+            conv(512 if use_global else 256, 256),
+            conv(256, 256, stride=2),  # 4 x 4
+            conv(256, 256, stride=2),  # 2 x 2
+            conv(256, 256, stride=2),  # 1 x 1
         )
 
-    def encode(self, images: Tensor, mask: Tensor, context: Tensor | None = None) -> Tensor:
+    def encode(self, images: Tensor, mask: Tensor) -> Tensor:
         """Return the local features (B, Q, F, 8, 8) of images (B, Q, 3, 128, 128); half of both sides is possible."""
         assert images.shape[-2:] in {(side, side) for side in (EARLY_SIZE, INPUT_SIZE)}, images.shape
-        return super().encode(images, mask, context)
+        inputs = images
+        if self.use_mask:
+            inputs = torch.cat([images, mask[:, None].expand(-1, images.shape[1], -1, -1, -1)], dim=2)
+        return self.extractor(inputs.flatten(0, 1)).unflatten(0, images.shape[:2])
 
-    def fuse(self, local: Tensor, shared: Tensor) -> Tensor:
-        """Return one vector per image, (B Q, F', 1, 1)."""
+    def fuse(self, local: Tensor, shared: Tensor | None) -> Tensor:
+        """Return one vector per image, (B Q, F', 1, 1); arguments as of `predict`."""
         if not self.use_global:
             return self.classifier(local.flatten(0, 1))
+        if shared is None:
+            shared = max_over_images(local, keepdim=True)
         # The first convolution sees [local, shared]. What it makes of the shared half is the same for every image of a
         # scene, so it is computed once per scene and added.
         begin: Any = self.classifier[0]
@@ -93,8 +93,6 @@ class LCNet(LightingTrunk):
         intensity_range: Relative intensities the classes cover.
         use_mask: Give the object mask as a fourth input channel (off: the paper's ablation A2).
         use_global: Concatenate the feature shared by all images (off: the paper's ablation A3).
-        context: Further input channels.
-        widths: See `LightingTrunk`.
     """
 
     def __init__(
@@ -105,19 +103,16 @@ class LCNet(LightingTrunk):
         intensity_range: tuple[float, float] = (0.2, 2.0),
         use_mask: bool = True,
         use_global: bool = True,
-        context: int = 0,
-        widths: tuple[int, int, int] = (128, 256, 256),
     ) -> None:
-        inputs = 3 + use_mask + context
-        super().__init__(inputs=inputs, use_mask=use_mask, use_global=use_global, widths=widths)
+        super().__init__(use_mask=use_mask, use_global=use_global)
         low, high = intensity_range
         self.classes = LightClasses(directions=direction_classes, intensities=intensity_classes, low=low, high=high)
-        self.azimuth = head(widths[2], direction_classes)
-        self.elevation = head(widths[2], direction_classes)
-        self.intensity = head(widths[2], intensity_classes)
+        self.azimuth = head(256, direction_classes)
+        self.elevation = head(256, direction_classes)
+        self.intensity = head(256, intensity_classes)
         initialise(self)
 
-    def predict(self, local: Tensor, shared: Tensor) -> LightingLogits:
+    def predict(self, local: Tensor, shared: Tensor | None = None) -> LightingLogits:
         """Return the class logits of every image."""
         feature = self.fuse(local, shared)
         heads = (self.azimuth, self.elevation, self.intensity)
@@ -130,7 +125,7 @@ class LCNet(LightingTrunk):
         terms = {name: class_loss(logits, target) for (name, logits), target in pairs}
         return {"total": torch.stack(list(terms.values())).sum(), **terms}
 
-    def lights(self, prediction: LightingLogits, read_out: ReadOut = "centre") -> Lights:
+    def read_lights(self, prediction: LightingLogits, read_out: ReadOut = "centre") -> Lights:
         """Return the lights of the likeliest classes, or another read-out of the class probabilities."""
         directions, intensities = self.classes.read_out(*prediction, read_out)
         peaks = [values.float().softmax(-1).amax(-1) for values in (prediction.azimuth, prediction.elevation)]

@@ -1,6 +1,6 @@
-"""Lighting networks beside LCNet: the paper's regression baseline, and two that go beyond the paper."""
+"""Variants of LCNet: the paper's regression baseline, and one that goes beyond the paper."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -35,13 +35,13 @@ class LCNetReg(LightingTrunk):
     """
 
     def __init__(self, *, intensity_range: tuple[float, float] = (0.2, 2.0)) -> None:
-        super().__init__(inputs=4, use_mask=True, use_global=True)
+        super().__init__(use_mask=True, use_global=True)
         self.classes = LightClasses(low=intensity_range[0], high=intensity_range[1])
         self.direction = head(256, 3)
         self.intensity = head(256, 1)
         initialise(self)
 
-    def predict(self, local: Tensor, shared: Tensor) -> RegressedLights:
+    def predict(self, local: Tensor, shared: Tensor | None = None) -> RegressedLights:
         """Return unit directions and intensities, float32."""
         feature = self.fuse(local, shared).float()
         # Never under autocast: a direction rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
@@ -56,7 +56,7 @@ class LCNetReg(LightingTrunk):
         intensity = (prediction.intensities - intensities).square().mean()
         return {"total": direction + intensity, "direction": direction, "intensity": intensity}
 
-    def lights(self, prediction: RegressedLights, read_out: ReadOut = "centre") -> Lights:
+    def read_lights(self, prediction: RegressedLights, read_out: ReadOut = "centre") -> Lights:
         """Return the regressed lights; there are no classes to read out."""
         return Lights(prediction.directions, prediction.intensities.clamp(min=_LEAST_INTENSITY))
 
@@ -74,31 +74,13 @@ class LCNetSoft(LCNet):
         targets = self.classes.encode_soft(directions, intensities)
         pairs = zip(prediction._asdict().items(), targets, strict=True)
         terms = {name: soft_class_loss(logits, target) for (name, logits), target in pairs}
-        expected = self.lights(prediction)
+        expected = self.read_lights(prediction)
         # The tiny constant keeps the gradient of the length finite where the estimate is perfect.
         chord = ((expected.directions - directions).square().sum(-1) + 1e-8).sqrt().mean()
         relative = ((expected.intensities - intensities).abs() / intensities).mean()
         total = torch.stack(list(terms.values())).sum() + _EXPECTATION_WEIGHT * (chord + relative)
         return {"total": total, **terms, "chord": chord, "relative": relative}
 
-    def lights(self, prediction: LightingLogits, read_out: ReadOut = "expectation") -> Lights:
-        """Return the expectation over the classes, whatever read-out is asked for elsewhere."""
-        return super().lights(prediction, "expectation")
-
-
-class LCNetSecond(LCNetSoft):
-    """A second look at the lights that also sees normals, and the shading the first lights would give.
-
-    GCNet's idea: its inputs are each image, the mask, the normals estimated from a first pass, and n . l of the first
-    light, 8 channels. Half as wide as LCNet behind the first layers.
-    """
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(context=4, widths=(128, 128, 128), **options)
-
-    @staticmethod
-    def context(normals: Tensor, mask: Tensor, directions: Tensor) -> Tensor:
-        """Return normals and shading (B, Q, 4, S, S) of normals (B, 3, S, S), mask (B, 1, S, S) and directions."""
-        normals = normals * mask
-        shading = torch.einsum("bchw,bqc->bqhw", normals, directions).clamp(min=0.0)[:, :, None]
-        return torch.cat([normals[:, None].expand(-1, directions.shape[1], -1, -1, -1), shading], dim=2)
+    def read_lights(self, prediction: LightingLogits, read_out: ReadOut = "expectation") -> Lights:
+        """Return the expectation over the classes, whichever read-out is asked for."""
+        return super().read_lights(prediction, "expectation")

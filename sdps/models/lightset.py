@@ -1,4 +1,4 @@
-"""A lighting network whose images see each other at every stage: what one image leaves open, the others tell.
+"""A lighting network whose images see each other at every stage: what one image leaves open, the others show.
 
 LCNet looks at every image by itself, and lets them meet once, at the end, by a maximum. Here each image is first
 divided by what its pixels show on average over all images, which takes the albedo away; before every convolution the
@@ -17,7 +17,7 @@ from torch.nn import functional
 from render.shared.errors import InputError
 from sdps.core.lighting import LightClasses, ReadOut
 from sdps.core.losses import expected_distance_loss
-from sdps.models.base import Lights, MeetingNetwork
+from sdps.models.base import LightingNetwork, Lights
 from sdps.models.blocks import LOG_USUAL, SLOPE, Convolution, chord_degrees
 
 SIDE = 64
@@ -31,7 +31,7 @@ _FLOOR = 0.01
 _BRIGHTEST = 6.0
 """Shading that counts as no more: highlights reach hundreds of times the average."""
 _USUAL_INTENSITY = 0.94
-"""Geometric mean of intensities drawn evenly from 0.2 to 2. Only their ratios can be told from images."""
+"""Geometric mean of intensities drawn evenly from 0.2 to 2. Images show only their ratios."""
 _TOGETHER = 32
 """Images that meet in use, about: many more than in training meet another mean, maximum and attention than it had."""
 
@@ -82,7 +82,7 @@ class Attention(nn.Module):
         return tokens + self.think(self.between(tokens))
 
 
-class LightSetNet(MeetingNetwork):
+class LightSetNet(LightingNetwork):
     """Regresses the light of every image, and the error to expect of it, from all images together.
 
     Args:
@@ -105,7 +105,7 @@ class LightSetNet(MeetingNetwork):
         self.blocks = nn.ModuleList(Attention(width, heads) for _ in range(blocks))
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 5))
 
-    def encode(self, images: Tensor, mask: Tensor, context: Tensor | None = None) -> Tensor:
+    def encode(self, images: Tensor, mask: Tensor) -> Tensor:
         """Return the object's radiance and the mask, (B, Q, 4, S, S), of images of any side, 128 in use."""
         masks = mask[:, None].expand(-1, images.shape[1], -1, -1, -1)
         both = torch.cat([images * masks, masks], dim=2)
@@ -116,7 +116,7 @@ class LightSetNet(MeetingNetwork):
     def predict(self, local: Tensor, shared: Tensor | None = None) -> SetPrediction:
         """Return the prediction of every image; `local` is of all images of the scenes."""
         with torch.no_grad(), torch.autocast(local.device.type, enabled=False):
-            seen, likeness = described(local.float())
+            seen, likeness = image_inputs(local.float())
         tokens = self.read(self.levels(seen).flatten(2))
         for block in self.blocks:
             tokens = block(tokens, likeness)
@@ -129,8 +129,9 @@ class LightSetNet(MeetingNetwork):
             intensities = _USUAL_INTENSITY * (strengths - strengths.mean(dim=1, keepdim=True)).exp()
             return SetPrediction(directions, intensities, (values[..., 4] + LOG_USUAL).exp())
 
-    def predict_many(self, local: Tensor, seed: int) -> SetPrediction:
+    def predict_parts(self, parts: list[Tensor], seed: int) -> SetPrediction:
         """Return what groups of images say; all images together give the intensities of a group their scale."""
+        local = torch.cat(parts, dim=1)
         together = self.predict(local)
         groups = local.shape[1] // _TOGETHER
         if groups < 2:
@@ -154,12 +155,12 @@ class LightSetNet(MeetingNetwork):
         total = chord.mean() + 0.5 * relative + 0.02 * likely
         return {"total": total, "chord": chord.mean(), "relative": relative, "expected": likely}
 
-    def lights(self, prediction: SetPrediction, read_out: ReadOut = "centre") -> Lights:
+    def read_lights(self, prediction: SetPrediction, read_out: ReadOut = "centre") -> Lights:
         """Return the regressed lights; there are no classes to read out."""
-        return Lights(prediction.directions, prediction.intensities, expected=chord_degrees(prediction.expected))
+        return Lights(prediction.directions, prediction.intensities, expected_error=chord_degrees(prediction.expected))
 
 
-def described(local: Tensor) -> tuple[Tensor, Tensor]:
+def image_inputs(local: Tensor) -> tuple[Tensor, Tensor]:
     """Return what the network sees of each image, (B, Q, 6, S, S), and how alike images look, (B, Q, Q, 2).
 
     Args:

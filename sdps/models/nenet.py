@@ -7,13 +7,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sdps.models.base import NormalNetwork, Observations
+from sdps.models.base import FusionNetwork, Observations
 from sdps.models.blocks import conv, deconv, initialise, max_over_images
 
-SIZE_MULTIPLE = 4
 
-
-class MaxFusionNet(NormalNetwork):
+class MaxFusionNet(FusionNetwork):
     """Extractor per image, maximum over the images, regressor: the frame NENet, PS-FCN and UPS-FCN share.
 
     Args:
@@ -21,8 +19,6 @@ class MaxFusionNet(NormalNetwork):
         widths: Channels of the extractor at full, half and quarter size.
         deeper: Further convolutions of the extractor at quarter size, and of the regressor at half size.
     """
-
-    size_multiple = SIZE_MULTIPLE
 
     def __init__(
         self, inputs: int, *, widths: tuple[int, int, int] = (64, 128, 256), deeper: tuple[int, int] = (0, 0)
@@ -53,7 +49,7 @@ class MaxFusionNet(NormalNetwork):
     def inputs(seen: Observations) -> Tensor:
         """Return the input channels of every image, (B, Q, C, H, W)."""
         _, count, _, height, width = seen.images.shape
-        assert height % SIZE_MULTIPLE == 0 and width % SIZE_MULTIPLE == 0, seen.images.shape
+        assert height % MaxFusionNet.size_multiple == 0 and width % MaxFusionNet.size_multiple == 0, seen.images.shape
         parts = [seen.images]
         if seen.directions is not None:
             lights = seen.directions.to(seen.images.dtype)[..., None, None]
@@ -89,5 +85,5 @@ class NENet(MaxFusionNet):
 
     def __init__(self, *, per_pixel: bool = False) -> None:
         super().__init__(6)
-        self.division = "norm" if per_pixel else "none"
+        self.normalised = per_pixel
         initialise(self)

@@ -14,16 +14,15 @@ from torch import nn
 
 from render.shared.config import read_yaml
 from render.shared.errors import InputError, unknown
-from sdps.models.attention import AttentionNet
 from sdps.models.cnnps import CNNPS
 from sdps.models.frames import FrameNet
 from sdps.models.lcnet import LCNet
-from sdps.models.lighting_variants import LCNetReg, LCNetSecond, LCNetSoft
+from sdps.models.lighting_variants import LCNetReg, LCNetSoft
 from sdps.models.lightset import LightSetNet
 from sdps.models.nenet import NENet
 from sdps.models.upsfcn import UPSFCN, UPSFCNLight
 
-Role = Literal["lighting", "second", "normals", "pixels"]
+Role = Literal["lighting", "normals", "pixels"]
 TRUE_LIGHTS = "true"
 
 
@@ -32,15 +31,13 @@ class ModelEntry:
     """A model.
 
     Attributes:
-        role: `lighting` tells lights from images; `second` does so from images and a first estimate; `normals` gives
-            normal maps; `pixels` gives normals pixel by pixel.
+        role: `lighting` finds lights from images; `normals` gives normal maps; `pixels` gives normals pixel by pixel.
         build: The network's class.
         options: Options of the network that make this model.
         parameters: Trainable scalars with default classes.
         summary: One line.
         paper: Row of the paper's tables, if any.
         lights: Lighting model whose lights it is trained on, `true`, or empty for models that see none.
-        normals: Normal model whose normals it is trained on (`second` only).
         recipe: Training settings where they differ from the role's, as published.
         reconstruction: What the paper leaves open and is decided here.
     """
@@ -52,7 +49,6 @@ class ModelEntry:
     options: Mapping[str, Any] = field(default_factory=dict)
     paper: str = ""
     lights: str = ""
-    normals: str = ""
     recipe: Mapping[str, Any] = field(default_factory=dict)
     reconstruction: str = ""
 
@@ -64,7 +60,6 @@ class Combination:
     Attributes:
         lighting: Lighting model.
         normals: Normal model.
-        second: Second lighting pass, or empty.
         summary: One line.
         paper: Row of the paper's table, if any.
         light_views: Test-time augmentation of lights: turned views averaged over; None for what the caller wants.
@@ -73,7 +68,6 @@ class Combination:
 
     lighting: str
     normals: str
-    second: str = ""
     summary: str = ""
     paper: str = ""
     light_views: int | None = None
@@ -81,7 +75,7 @@ class Combination:
 
     def members(self) -> tuple[str, ...]:
         """Return the names of the models."""
-        return tuple(name for name in (self.lighting, self.normals, self.second) if name)
+        return self.lighting, self.normals
 
     def parameters(self) -> int:
         """Return the trainable scalars of all of them."""
@@ -99,19 +93,7 @@ def _entries() -> tuple[dict[str, ModelEntry], dict[str, Combination]]:
 
 NETWORKS: dict[str, type[nn.Module]] = {
     kind.__name__: kind
-    for kind in (
-        LCNet,
-        LCNetReg,
-        LCNetSoft,
-        LCNetSecond,
-        LightSetNet,
-        NENet,
-        AttentionNet,
-        FrameNet,
-        UPSFCN,
-        UPSFCNLight,
-        CNNPS,
-    )
+    for kind in (LCNet, LCNetReg, LCNetSoft, LightSetNet, NENet, FrameNet, UPSFCN, UPSFCNLight, CNNPS)
 }
 MODELS, COMBINATIONS = _entries()
 
@@ -145,12 +127,5 @@ def create(name: str, **options: Any) -> nn.Module:
 
 
 def network_options(name: str) -> set[str]:
-    """Return the names of the options the network of a model takes, those of its base classes included."""
-    names: set[str] = set()
-    for kind in entry(name).build.__mro__:
-        if "__init__" in vars(kind):
-            parameters = inspect.signature(vars(kind)["__init__"]).parameters.values()
-            names |= {parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY}
-            if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-                break
-    return names
+    """Return the names of the options the network of a model takes."""
+    return set(inspect.signature(entry(name).build).parameters)

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from sdps.core.lighting import LightClasses
-from sdps.core.losses import class_loss
-from sdps.models.base import Observations
+from sdps.core.losses import NormalCriterion, class_loss
+from sdps.models.base import Observations, Truth
 from sdps.models.blocks import conv, initialise, max_over_images
 from sdps.models.lcnet import LightingLogits, head
 from sdps.models.nenet import MaxFusionNet
@@ -18,9 +18,9 @@ _WIDTHS = (64, 128, 256)
 class UPSFCN(MaxFusionNet):
     """PS-FCN without lights: images as they are, of unknown intensities.
 
-    `deep` and `width` are reconstructions that meet the published counts; the supplement with the tables was not to be
-    had. `width=1.7` widens every layer alike (6.39 M; published 6.4 M). `deep` adds six convolutions to the extractor
-    at quarter size and two to the regressor at half size (6.04 M; published 6.1 M).
+    `deep` and `width` are reconstructions that meet the published counts; the supplement with the tables is not
+    available. `width=1.7` widens every layer alike (6.39 M; published 6.4 M). `deep` adds six convolutions to the
+    extractor at quarter size and two to the regressor at half size (6.04 M; published 6.1 M).
 
     Args:
         width: Factor on the channels of every layer.
@@ -45,9 +45,9 @@ class NormalsAndLights(NamedTuple):
 
 
 class UPSFCNLight(MaxFusionNet):
-    """UPS-FCN that also learns to tell the lights, as additional supervision (B8).
+    """UPS-FCN that also learns to predict the lights, as additional supervision (B8).
 
-    A reconstruction: to the 3-channel UPS-FCN come, on each image's feature beside the fused one, six convolutions of
+    A reconstruction: the 3-channel UPS-FCN plus, on each image's feature and the fused one, six convolutions of
     stride 2 and LCNet's three heads. 5.80 M parameters; published 5.7 M. The lights are not used at test.
 
     Args:
@@ -83,6 +83,13 @@ class UPSFCNLight(MaxFusionNet):
         heads = (self.azimuth, self.elevation, self.intensity)
         logits = LightingLogits(*(part(vector).flatten(1).unflatten(0, local.shape[:2]) for part in heads))
         return NormalsAndLights(self.regress(fused), logits)
+
+    def loss(self, seen: Observations, truth: Truth, criterion: NormalCriterion) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of the normals plus, weighted, that of the lights."""
+        normals, logits = self.with_lights(seen)
+        loss, terms = criterion(normals, truth.normals, truth.mask)
+        terms["lighting_loss"] = self.lighting_loss(logits, truth.directions, truth.intensities)
+        return loss + criterion.lighting_weight * terms["lighting_loss"], terms
 
     def lighting_loss(self, logits: LightingLogits, directions: Tensor, intensities: Tensor) -> Tensor:
         """Return the summed cross-entropies of the true classes of directions (B, Q, 3) and intensities (B, Q)."""

@@ -1,12 +1,13 @@
 """The model card: one Markdown page about trained weights, with front matter as model hubs read it.
 
 Everything on it comes from the weights' metadata, the registry, the run's metrics and the data folder's manifest. What
-none of them tells is "not recorded".
+is in none of them is "not recorded".
 """
 
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -24,10 +25,11 @@ from sdps.models.blocks import parameter_count
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.publishing.learning_curves import Rows, read_metrics
+from sdps.training.recipes import CONFIGS
 
 UNKNOWN = "not recorded"
 _METRICS, _DATASET_CARD = "metrics.jsonl", "DATASET_CARD.md"
-_PRESET, _TRAINING = "config.yaml", "training.yaml"  # what `sdps train` leaves beside the weights
+_PRESET, _TRAINING = "config.yaml", "training.yaml"  # what `sdps train` leaves next to the weights
 _LICENCES = re.compile(r"^## Licences\n(.*?)(?=^## |\Z)", re.DOTALL | re.MULTILINE)  # section of a dataset card
 _OF_LIGHTS = ("direction_mae", "intensity_error")
 _TEMPLATE = Path(__file__).with_name("model_card.md.j2")
@@ -41,10 +43,10 @@ def _words() -> dict[str, Any]:
 def write_model_card(
     path: str | Path, weights: str | Path, data: str | Path | None = None, *, shipped: str | Path | None = None
 ) -> None:
-    """Write the card of trained weights; metrics and configuration of the run are looked for beside them.
+    """Write the card of trained weights; metrics and configuration of the run are read from their folder.
 
     Args:
-        path: The card, by convention `MODEL_CARD.md` beside the weights.
+        path: The card, by convention `MODEL_CARD.md` next to the weights.
         weights: The safetensors file, in its run's folder.
         data: The data folder trained on, for its composition.
         shipped: A copy of the weights, rounded, that the card is to travel with.
@@ -58,11 +60,11 @@ def write_model_card(
 def render_card(weights: str | Path, data: str | Path | None = None, shipped: str | Path | None = None) -> str:
     """Compose the card; see `write_model_card`."""
     model = load_weights(weights)
-    with decoding(weights, "weights that tell how they were trained", "train them again"):
-        return _composed(model, Path(weights), data, shipped)
+    with decoding(weights, "weights with the settings they were trained with", "train them again"):
+        return _compose(model, Path(weights), data, shipped)
 
 
-def _composed(model: TrainedModel, weights: Path, data: str | Path | None, shipped: str | Path | None) -> str:
+def _compose(model: TrainedModel, weights: Path, data: str | Path | None, shipped: str | Path | None) -> str:
     """Fill the template."""
     copy = Path(shipped or weights)
     metadata, config, entry = model.metadata, model.metadata["config"], registry.entry(model.name)
@@ -71,7 +73,7 @@ def _composed(model: TrainedModel, weights: Path, data: str | Path | None, shipp
     folder = Path(data) if data is not None and (Path(data) / MANIFEST).is_file() else None
     card = read_text(folder / _DATASET_CARD) if folder is not None and (folder / _DATASET_CARD).is_file() else ""
     lights = metadata.get("lights") or entry.lights
-    scores = _scores(metadata, told=lights == TRUE_LIGHTS)
+    scores = _scores(metadata, lights_given=lights == TRUE_LIGHTS)
     composition = _data(model, folder)
     return fill(
         _TEMPLATE,
@@ -93,17 +95,17 @@ def _composed(model: TrainedModel, weights: Path, data: str | Path | None, shipp
         settings=[(f"`{name}`", _value(value)) for name, value in _flat(config)],
         data=composition,
         data_card=card and "composition" not in dict(composition),
-        scores=[(name, f"{value:.4g}", *_defined(name), _best(rows, name)) for name, value in scores.items()],
+        scores=[(name, f"{value:.4g}", *_definition(name), _best(rows, name)) for name, value in scores.items()],
         pretrained=shipped is not None,
         data_terms="".join(_LICENCES.findall(card)).strip(),
         **_repeat(weights, model),
     )
 
 
-def _scores(metadata: Mapping[str, Any], *, told: bool) -> dict[str, float]:
-    """Return the metrics of validation, without the errors of lights that the network was told."""
+def _scores(metadata: Mapping[str, Any], *, lights_given: bool) -> dict[str, float]:
+    """Return the metrics of validation, without the errors of lights that the network was given."""
     scores = {name.removeprefix("val_"): float(value) for name, value in (metadata.get("metrics") or {}).items()}
-    return {name: value for name, value in scores.items() if not (told and name.startswith(_OF_LIGHTS))}
+    return {name: value for name, value in scores.items() if not (lights_given and name.startswith(_OF_LIGHTS))}
 
 
 def _repeat(weights: Path, model: TrainedModel) -> dict[str, Any]:
@@ -112,11 +114,13 @@ def _repeat(weights: Path, model: TrainedModel) -> dict[str, Any]:
     again = {"name": "repeat", "description": f"Trains {run} again.", "train": [run]}
     recorded = _plain(weights.parent / _PRESET)
     if "data" in recorded:
-        kept = {name: value for name, value in recorded.items() if name != "test"}
+        kept = {name: value for name, value in recorded.items() if name not in ("test", "joint")}
         return {"preset": {**kept, **again}, "recorded": recorded.get("name", UNKNOWN), "needed": []}
     base = _plain(weights.parent / _TRAINING).get("model") or model.name
-    needed = [f"`{config[key]}`" for key in ("lights", "normals") if config.get(key) not in (None, "", TRUE_LIGHTS)]
-    return {"preset": {**again, "runs": {run: {"base": str(base), **config}}}, "recorded": "", "needed": needed}
+    known = {field.name for field in fields(CONFIGS[model.role])}  # earlier versions had further settings
+    settings = {name: value for name, value in config.items() if name in known}
+    needed = [f"`{settings['lights']}`"] if settings.get("lights") not in (None, "", TRUE_LIGHTS) else []
+    return {"preset": {**again, "runs": {run: {"base": str(base), **settings}}}, "recorded": "", "needed": needed}
 
 
 def _plain(file: Path) -> dict[str, Any]:
@@ -153,7 +157,7 @@ def _front_matter(model: TrainedModel, name: str, scores: Mapping[str, float], *
 
 
 def _training(metadata: Mapping[str, Any], rows: Rows) -> list[tuple[str, str]]:
-    """List what the weights and the metrics tell about the run."""
+    """List what the weights and the metrics record of the run."""
     seconds, step = metadata.get("seconds"), metadata.get("step")
     parts = [f"{p['precision']} on {p['device']} from step {p['step']}" for p in metadata.get("computed") or ()]
     loss = [row["loss"] for row in rows if "loss" in row]
@@ -166,14 +170,13 @@ def _training(metadata: Mapping[str, Any], rows: Rows) -> list[tuple[str, str]]:
         ("last training loss", f"{loss[-1]:.4g}" if loss else UNKNOWN),
         ("code version (hash of the package's source)", f"`{metadata.get('code', UNKNOWN)}`"),
     ]
-    for use in ("lighting", "normals"):
-        if isinstance(metadata.get(use), Mapping):
-            facts.append((f"frozen {use} model it was trained with", _value(metadata[use])))
+    if isinstance(metadata.get("lighting"), Mapping):
+        facts.append(("frozen lighting model it was trained with", _value(metadata["lighting"])))
     return facts
 
 
 def _data(model: TrainedModel, folder: Path | None) -> list[tuple[str, Any]]:
-    """Tell the composition of the data folder, if it is at hand and the one trained on."""
+    """List the composition of the data folder, if it is there and the one trained on."""
     digest, scenes = model.metadata.get("data"), model.metadata.get("scenes")
     rows: list[tuple[str, Any]] = [("SHA-256 of the manifest", f"`{digest}`" if digest else UNKNOWN)]
     if scenes is not None:
@@ -181,7 +184,7 @@ def _data(model: TrainedModel, folder: Path | None) -> list[tuple[str, Any]]:
     if folder is None:
         return [*rows, ("composition", UNKNOWN)]
     if digest and digest != file_hash(folder / MANIFEST):
-        return [*rows, ("composition", f"{UNKNOWN}; the data folder at hand has another manifest now")]
+        return [*rows, ("composition", f"{UNKNOWN}; the data folder given has another manifest now")]
     return [*rows, *_composition(read_manifest(folder))]
 
 
@@ -197,7 +200,7 @@ def _composition(scenes: Sequence[SceneSpec]) -> list[tuple[str, str]]:
     ]
 
 
-def _defined(name: str) -> tuple[str, str]:
+def _definition(name: str) -> tuple[str, str]:
     """Return unit and definition of a metric."""
     for key, (unit, text) in _words()["metrics"].items():
         if name.startswith(key):

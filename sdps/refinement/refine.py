@@ -17,7 +17,7 @@ from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
 from sdps.core.integration import integrate
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
-from sdps.inference.tiles import Tile, give_back, tiles
+from sdps.inference.tiles import Tile, release_memory, tiles
 from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.fine import finer, pictures
 from sdps.refinement.image_model import LOBES, SHAPES, State, factors
@@ -133,7 +133,7 @@ def _every_pixel(
     for tile in parts:
         yield found(tile)
         if len(parts) > 1:
-            give_back()
+            release_memory()
 
 
 def _advance(bar: Any) -> Callable[[], None]:

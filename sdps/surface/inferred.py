@@ -19,7 +19,7 @@ from render.shared.progress import stage
 from sdps.core.estimate import Estimate
 from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import angle_degrees
-from sdps.inference.tiles import give_back
+from sdps.inference.tiles import release_memory
 from sdps.methods import pretrained
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
@@ -226,13 +226,13 @@ class Inference:
         if self.albedo is not None:  # for a screen, the brightest percent at white
             colour = np.concatenate([display(self.albedo[rows] / self._brightest) for rows in _bands(mask)])
         stage("meshes")
-        give_back()
+        release_memory()
         surface = mesh(self.depth, colour=colour, normals=normals, every=step_of(mask))
         for number, suffix in enumerate(("ply", "obj", "glb"), start=1):
             write_mesh(surface, folder / f"mesh.{suffix}")
             stage("meshes", number, 3)
         del surface, colour
-        give_back()
+        release_memory()
         (folder / "relit").mkdir()
         for name in RELIT:
             shown = [display(self.relit_view(name, (rows,))) for rows in _bands(mask)]

@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass
 from functools import cache
 from math import ceil
+from typing import cast
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from sdps.core.integration import LARGE
 from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES
 from sdps.methods.on_box import observed_bytes
 from sdps.methods.runner import Runner
-from sdps.models.frames import FrameNet
+from sdps.models.base import NormalNetwork
 from sdps.photos import Photographs
 from sdps.refinement import refine
 from sdps.surface.meshing import MOST_VERTICES
@@ -30,10 +31,8 @@ LONG = 600.0
 _SCALES = (0.5, 0.4, 0.3, 0.25, 0.2, 0.15, 0.1, 0.05)
 _GIB = 2.0**30
 _BASE = 0.45  # GiB: python, torch, weights, kernels
-_NETWORK, _FRAMES, _VIEW = 1.2e-6, 2.1e-6, 2.0e-6
-"""Seconds per pixel and image; the same of `frames`, and of each of its views per pixel."""
 _CONVOLUTION = 0.0103
-"""Seconds of the convolution that the above were measured with."""
+"""Seconds of the convolution where the networks' `inference_seconds` were measured."""
 _DECODED = {"JPEG": 12e-9}
 _DECODED_ELSE = 45e-9  # PNG, TIFF, EXR
 
@@ -152,7 +151,9 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
     if normals in classical.METHODS:
         found["normals"] = 8e-7 * size.pixels * images + 1e-5 * size.pixels
     elif estimator is not None and estimator.normals is not None:
-        found["normals"] = _normal_seconds(size, runner, slower) + once * _tile_count(size, runner)
+        views = runner.config.normal_views or 1
+        seconds = _normal_network(runner).inference_seconds(images, size.pixels, size.box, views)
+        found["normals"] = slower * seconds + once * _tile_count(size, runner)
     if runner.method.refined:
         coarse = 1500 * (1.5e-3 + 2800 * (0.6e-6 + 55e-9 * images))
         fine = 120 * size.pixels * (0.6e-6 + 55e-9 * images)
@@ -166,13 +167,9 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
     return found
 
 
-def _normal_seconds(size: Size, runner: Runner, slower: float) -> float:
-    """Return about how long the networks take for the normals."""
+def _normal_network(runner: Runner) -> NormalNetwork:
     assert runner.estimator is not None and runner.estimator.normals is not None
-    network, views = runner.estimator.normals.network, runner.config.normal_views or 1
-    if isinstance(network, FrameNet):
-        return slower * (_FRAMES * size.pictures * size.pixels + _VIEW * views * size.box)
-    return slower * _NETWORK * views * size.pictures * size.box
+    return cast(NormalNetwork, runner.estimator.normals.network)
 
 
 def _tile_count(size: Size, runner: Runner) -> int:
@@ -180,9 +177,7 @@ def _tile_count(size: Size, runner: Runner) -> int:
 
 
 def _tile_pixels(size: Size, runner: Runner) -> float:
-    assert runner.estimator is not None and runner.estimator.normals is not None
-    kept = getattr(runner.estimator.normals.network, "kept_bytes", 0)
-    return TILE_BYTES / (PIXEL_BYTES + size.pictures * kept)
+    return TILE_BYTES / (PIXEL_BYTES + size.pictures * _normal_network(runner).kept_bytes)
 
 
 def _memory(size: Size, runner: Runner) -> float:

@@ -65,7 +65,7 @@ class Team:
             distributed.barrier()
 
     def any(self, flag: bool) -> bool:
-        """Tell whether the flag is set in any process."""
+        """Return whether the flag is set in any process."""
         return self.mean({"flag": float(flag)})["flag"] > 0.0
 
 

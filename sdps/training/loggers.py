@@ -53,7 +53,7 @@ class JsonlLogger:
 
     def close(self) -> None:
         """Close the file."""
-        with suppress(OSError):  # of a line that `log` could not write, and told
+        with suppress(OSError):  # of a line that `log` could not write, and reported
             self._file.close()
 
 

@@ -1,4 +1,4 @@
-"""Muon: momentum whose update is made orthogonal, for the matrices of a network, beside AdamW for everything else.
+"""Muon: momentum whose update is made orthogonal, for the matrices of a network, with AdamW for everything else.
 
 Jordan et al., "Muon: An optimizer for hidden layers in neural networks" (2024); the scale of the update is that of Liu
 et al., "Muon is Scalable for LLM Training" (2025), so that learning rates of AdamW can be kept. `torch.optim.Muon`
@@ -20,7 +20,7 @@ _SMALLEST = 32
 """Rows and columns from which on a weight counts as a matrix: first and last layers are left to AdamW."""
 
 
-def orthogonalised(matrix: Tensor) -> Tensor:  # (R, C) float32
+def orthogonalise(matrix: Tensor) -> Tensor:  # (R, C) float32
     """Return the nearest matrix with singular values of about 1, by Newton-Schulz iteration in float32.
 
     The iterates of a matrix X are q X with q a polynomial in X X^T. So the iteration runs on these small square
@@ -68,7 +68,7 @@ class _Muon(torch.optim.Optimizer):
                 rows = update.reshape(len(update), -1)
                 scale = 0.2 * math.sqrt(max(rows.shape))
                 parameter.mul_(1.0 - group["lr"] * group["weight_decay"])
-                parameter.add_(orthogonalised(rows).reshape(parameter.shape), alpha=-group["lr"] * scale)
+                parameter.add_(orthogonalise(rows).reshape(parameter.shape), alpha=-group["lr"] * scale)
 
 
 class Muon:

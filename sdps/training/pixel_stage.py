@@ -23,15 +23,15 @@ from sdps.training.stages import NormalStage
 from sdps.training.training_config import PixelTraining
 
 VALIDATION_ROTATIONS = 3
-"""The test averages over `PixelTraining.rotations`; a third of them tells as well whether training goes on."""
+"""The test averages over `PixelTraining.rotations`; a third of them shows progress just as well."""
 VALIDATION_PIXELS = 256
-"""Pixels of a scene that are validated on, evenly spread over its mask."""
+"""PixelSamples of a scene that are validated on, evenly spread over its mask."""
 _CUT_DEGREES = (20.0, 90.0)
 _TINY = 1e-8
 
 
-class Pixels(NamedTuple):
-    """Pixels and what they showed under each light."""
+class PixelSamples(NamedTuple):
+    """PixelSamples and what they showed under each light."""
 
     values: Tensor  # (N, Q) float32, grey radiance under lights of intensity 1
     directions: Tensor  # (N, Q, 3) float32, unit
@@ -43,7 +43,7 @@ class PixelStage(NormalStage):
     """CNN-PS learns the normals of single pixels, under true lights or those of a frozen lighting model.
 
     Args:
-        config: The run's configuration; images are taken whole, whatever `crop`, and `loss` is not looked at.
+        config: The run's configuration; images are taken whole, and `crop` and `loss` are not looked at.
         lighting: Trained lighting model, where `config.lights` names one.
         model: Name in the registry.
         name: Name of the run.
@@ -59,7 +59,7 @@ class PixelStage(NormalStage):
         """
         config = self.config
         lights = self.training_lights(batch)
-        assert lights is not None  # a pixel network is always told them
+        assert lights is not None  # a pixel network is always given them
         pixels = draw_pixels(
             batch, lights, batch.seed.tolist(), count=config.pixels_per_scene, min_lights=config.min_lights
         )
@@ -70,7 +70,7 @@ class PixelStage(NormalStage):
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return loss and normal MAE over an even sample of the object's pixels, each given all lights."""
         lights = self.lights(batch)
-        assert lights is not None  # a pixel network is always told them
+        assert lights is not None  # a pixel network is always given them
         pixels = sample_pixels(batch, lights, VALIDATION_PIXELS)
         rotations = min(self.config.rotations, VALIDATION_ROTATIONS)
         normals = predict_normals(self.network, *pixels[:3], rotations=rotations)
@@ -82,7 +82,7 @@ class PixelStage(NormalStage):
         return values | self.light_scores(lights, batch)
 
 
-def draw_pixels(batch: Batch, lights: Lights, seeds: Sequence[int], *, count: int, min_lights: int) -> Pixels:
+def draw_pixels(batch: Batch, lights: Lights, seeds: Sequence[int], *, count: int, min_lights: int) -> PixelSamples:
     """Draw object pixels of every scene, with replacement, each with a random subset of the lights, turned at random.
 
     A pixel keeps the lights whose angle from the view axis is below a limit uniform in [20, 90] degrees, and of these
@@ -91,7 +91,7 @@ def draw_pixels(batch: Batch, lights: Lights, seeds: Sequence[int], *, count: in
     angle.
 
     Args:
-        batch: Scenes; images and normals are taken whole, whatever the crop.
+        batch: Scenes; images and normals are taken whole; their crop is not looked at.
         lights: Directions given to the network, and intensities the images are divided by.
         seeds: One per scene. They alone determine what is drawn, on any device and in any split of the batch.
         count: P, pixels per scene; a scene without object pixels gives none.
@@ -100,7 +100,7 @@ def draw_pixels(batch: Batch, lights: Lights, seeds: Sequence[int], *, count: in
     return _join([_draw_scene(batch, lights, scene, seed, count, min_lights) for scene, seed in enumerate(seeds)])
 
 
-def sample_pixels(batch: Batch, lights: Lights, count: int) -> Pixels:
+def sample_pixels(batch: Batch, lights: Lights, count: int) -> PixelSamples:
     """Return at most `count` object pixels of every scene, evenly spaced in reading order, under all lights."""
     scenes = []
     for scene in range(len(batch.images)):
@@ -110,8 +110,8 @@ def sample_pixels(batch: Batch, lights: Lights, count: int) -> Pixels:
     return _join(scenes)
 
 
-def _draw_scene(batch: Batch, lights: Lights, scene: int, seed: int, count: int, min_lights: int) -> Pixels:
-    # On the CPU whatever the batch's device: generators of different devices give different numbers.
+def _draw_scene(batch: Batch, lights: Lights, scene: int, seed: int, count: int, min_lights: int) -> PixelSamples:
+    # Always on the CPU: generators of different devices give different numbers.
     rng = torch.Generator().manual_seed(derived_seed(seed, "pixels"))
     inside = _inside(batch, scene)
     if not len(inside):
@@ -121,7 +121,7 @@ def _draw_scene(batch: Batch, lights: Lights, scene: int, seed: int, count: int,
     directions = lights.directions[scene].float().cpu()  # (Q, 3)
     valid = draw_lights(directions, count, min(min_lights, len(directions)), rng)
     angles = (2.0 * math.pi * torch.rand(count, generator=rng)).to(pixels.values.device)  # (P,)
-    return Pixels(
+    return PixelSamples(
         values=pixels.values,
         directions=rotate_about_view(pixels.directions, angles[:, None]),
         valid=valid.to(pixels.values.device),
@@ -151,11 +151,11 @@ def _inside(batch: Batch, scene: int) -> Tensor:
     return batch.mask[scene, 0].flatten().nonzero()[:, 0]
 
 
-def _gather(batch: Batch, lights: Lights, scene: int, places: Tensor) -> Pixels:
+def _gather(batch: Batch, lights: Lights, scene: int, places: Tensor) -> PixelSamples:
     """Return the pixels at flat positions (P,) of a scene under all lights."""
     grey = batch.images[scene].flatten(2)[..., places].mean(dim=1)  # (Q, P)
     values = (grey / (lights.intensities[scene][:, None] + _TINY)).T.float()  # (P, Q)
-    return Pixels(
+    return PixelSamples(
         values=values,
         directions=lights.directions[scene].float().expand(len(places), -1, -1),
         valid=torch.ones_like(values, dtype=torch.bool),
@@ -163,5 +163,5 @@ def _gather(batch: Batch, lights: Lights, scene: int, places: Tensor) -> Pixels:
     )
 
 
-def _join(scenes: list[Pixels]) -> Pixels:
-    return Pixels(*(torch.cat(parts) for parts in zip(*scenes, strict=True)))
+def _join(scenes: list[PixelSamples]) -> PixelSamples:
+    return PixelSamples(*(torch.cat(parts) for parts in zip(*scenes, strict=True)))

@@ -5,22 +5,14 @@ from typing import Any, NamedTuple
 
 from render.shared.config import build
 from render.shared.errors import InputError, unknown
-from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS, entry
-from sdps.training.training_config import JointTraining, LightingTraining, NormalTraining, PixelTraining, TrainingConfig
+from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS, Role, entry
+from sdps.training.training_config import LightingTraining, NormalTraining, PixelTraining, TrainingConfig
 
-JOINT = "sdps-joint"
-"""The run that fine-tunes two trained models together; it makes `lcnet-joint` and `nenet-joint`."""
-
-_CLASSES = {
-    "lighting": LightingTraining, "second": LightingTraining, "normals": NormalTraining, "pixels": PixelTraining,
-    "joint": JointTraining,
+CONFIGS: dict[Role, type[TrainingConfig]] = {
+    "lighting": LightingTraining, "normals": NormalTraining, "pixels": PixelTraining,
 }  # fmt: skip
-# Which sections of a preset a role reads, the later over the earlier.
-_SECTIONS = {
-    "lighting": ("lighting",), "second": ("lighting",), "normals": ("normals",), "pixels": ("pixels",),
-    "joint": ("normals", "joint"),
-}  # fmt: skip
-SECTIONS = ("lighting", "normals", "pixels", "joint")
+"""The configuration of each role; a preset has a section for each."""
+_LISTED = "`sdps models` lists what there is"
 
 
 class Run(NamedTuple):
@@ -28,10 +20,10 @@ class Run(NamedTuple):
 
     Attributes:
         name: Names the folder and the weights.
-        model: Name in the registry, or `sdps-joint`.
+        model: Name in the registry.
         config: Resolved configuration.
         requires: Runs whose weights it needs, or weights themselves (`shipped:<name>`, a `.safetensors` file), by what
-            they are for (`lighting`, `normals`, `start`).
+            they are for (`lighting`, `start`).
     """
 
     name: str
@@ -44,8 +36,8 @@ def run(name: str, sections: Mapping[str, Mapping[str, Any]], runs: Mapping[str,
     """Resolve a run: the role's defaults, the model's recipe, the role's section, and the run's own settings.
 
     Args:
-        name: A model's name, `sdps-joint`, or a name in `runs`.
-        sections: Settings per section of `SECTIONS`.
+        name: A model's name, or a name in `runs`.
+        sections: Settings per role.
         runs: Settings per run; `base` names the model of a run that is not called as its model.
 
     Raises:
@@ -53,40 +45,32 @@ def run(name: str, sections: Mapping[str, Mapping[str, Any]], runs: Mapping[str,
     """
     own = dict(runs.get(name, {}))
     model = own.pop("base", name)
-    if model != JOINT and model not in MODELS:
-        raise unknown("model", str(model), [*MODELS, JOINT, *(other for other in runs if other != name)])
-    role, recipe = ("joint", {}) if model == JOINT else (entry(model).role, entry(model).recipe)
+    if model not in MODELS:
+        field = f"correct runs.{name}.base; " if name in runs else ""
+        raise unknown("model", str(model), [*MODELS, *(other for other in runs if other != name)], field + _LISTED)
+    role, recipe, where = entry(model).role, entry(model).recipe, f"runs.{name}"
     values: dict[str, Any] = {}
-    where = f"runs.{name}"
-    for layer, settings in [("", recipe), *((part, sections.get(part, {})) for part in _SECTIONS[role]), (where, own)]:
-        build(_CLASSES[role], {**values, **settings}, layer)  # names the section a mistake is in
-        values |= {key: _joined(values.get(key), value) for key, value in settings.items()}
-    config: TrainingConfig = build(_CLASSES[role], values, where)
+    for layer, settings in (("", recipe), (role, sections.get(role, {})), (where, own)):
+        build(CONFIGS[role], {**values, **settings}, layer)  # names the section a mistake is in
+        values |= {key: _merge(values.get(key), value) for key, value in settings.items()}
+    config: TrainingConfig = build(CONFIGS[role], values, where)
     requires = _requires(name, model, config)
     return Run(name, model, config, requires | ({"start": config.start} if config.start else {}))
 
 
-def _joined(before: Any, value: Any) -> Any:
+def _merge(before: Any, value: Any) -> Any:
     """Lay one section's value over another's; of nested sections, only the fields named."""
     return {**before, **value} if isinstance(before, Mapping) and isinstance(value, Mapping) else value
 
 
 def _requires(name: str, model: str, config: TrainingConfig) -> dict[str, str]:
-    """Return the runs whose weights a run needs."""
-    lights = getattr(config, "lights", "")
-    needed = {"lighting": lights, "normals": getattr(config, "normals", "")}
-    if model != JOINT:
-        if entry(model).role == "lighting":
-            return {}
-        if entry(model).role in ("normals", "pixels") and not entry(model).lights:
-            if lights:
-                raise InputError(f"runs.{name}.lights: model {model!r} is told no lights; leave it out")
-            return {}
-        needed = {
-            "lighting": lights or entry(model).lights,
-            "normals": getattr(config, "normals", "") or entry(model).normals,
-        }
-    return {use: run for use, run in needed.items() if run and run != TRUE_LIGHTS}
+    """Return the lighting model whose weights a run needs, if any."""
+    if not isinstance(config, NormalTraining):
+        return {}
+    if config.lights and not entry(model).lights:
+        raise InputError(f"runs.{name}.lights: model {model!r} is not given lights; leave it out")
+    lights = config.lights or entry(model).lights
+    return {"lighting": lights} if lights and lights != TRUE_LIGHTS else {}
 
 
 def expand(names: list[str], known: Mapping[str, Any]) -> list[str]:
@@ -94,11 +78,11 @@ def expand(names: list[str], known: Mapping[str, Any]) -> list[str]:
     result: list[str] = []
     for name in names:
         if name == "all":
-            result += [*MODELS, JOINT, *known]
+            result += [*MODELS, *known]
         elif name in COMBINATIONS:
             result += COMBINATIONS[name].members()
-        elif name in MODELS or name in known or name == JOINT:
+        elif name in MODELS or name in known:
             result.append(name)
         else:
-            raise unknown("model", name, [*MODELS, JOINT, *COMBINATIONS, *known, "all"])
+            raise unknown("model", name, [*MODELS, *COMBINATIONS, *known, "all"], _LISTED)
     return list(dict.fromkeys(result))

@@ -6,11 +6,9 @@ from typing import cast
 from render.shared.errors import InputError
 from sdps.models import registry
 from sdps.models.checkpoint import TrainedModel
-from sdps.training.joint import JointStage, SecondStage
 from sdps.training.pixel_stage import PixelStage
-from sdps.training.recipes import JOINT
 from sdps.training.stages import LightingStage, NormalStage, Stage
-from sdps.training.training_config import JointTraining, LightingTraining, NormalTraining, TrainingConfig
+from sdps.training.training_config import LightingTraining, NormalTraining, TrainingConfig
 
 
 def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
@@ -18,13 +16,13 @@ def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping
 
     Args:
         name: Name of the run.
-        model: Name in the registry, or `sdps-joint`.
+        model: Name in the registry.
         config: The run's configuration, of the model's role.
-        trained: The models it needs, by what they are for: `lighting`, `normals`, and `start` for the weights that
-            training starts from.
+        trained: The models it needs, by what they are for: `lighting`, and `start` for the weights that training
+            starts from.
 
     Raises:
-        InputError: a start of another network.
+        InputError: a start of another network, or lights of a model that finds none.
     """
     stage = _stage(name, model, config, trained)
     if "start" in trained:
@@ -38,13 +36,11 @@ def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping
 
 def _stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
     """Return the stage with random weights."""
-    if model == JOINT:
-        return JointStage(cast(JointTraining, config), trained["lighting"], trained["normals"], name=name)
     role = registry.entry(model).role
     if role == "lighting":
         return LightingStage(cast(LightingTraining, config), model=model, name=name)
-    if role == "second":
-        second = cast(LightingTraining, config)
-        return SecondStage(second, trained["lighting"], trained["normals"], model=model, name=name)
+    lighting = trained.get("lighting")
+    if lighting is not None and lighting.role != "lighting":
+        raise InputError(f"runs.{name}.lights: {lighting.name!r} finds no lights; name a lighting model, or `true`")
     kind = PixelStage if role == "pixels" else NormalStage
-    return kind(cast(NormalTraining, config), trained.get("lighting"), model=model, name=name)
+    return kind(cast(NormalTraining, config), lighting, model=model, name=name)

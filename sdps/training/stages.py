@@ -1,4 +1,4 @@
-"""What models of each role ask of a batch: the network, its loss and its validation metrics.
+"""How models of each role are trained on a batch: the network, its loss and its validation metrics.
 
 The trainer (`sdps.training.trainer`) knows nothing else about them.
 """
@@ -6,7 +6,7 @@ The trainer (`sdps.training.trainer`) knows nothing else about them.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 import torch
@@ -15,34 +15,15 @@ from torch.nn import functional
 
 from render.shared.seeds import derived_seed, generator
 from sdps.core.lighting import ReadOut
-from sdps.core.losses import (
-    chord_normal_loss,
-    expected_error_loss,
-    faithful_normal_loss,
-    masked_normal_loss,
-    normal_gradient_loss,
-    shading_loss,
-)
+from sdps.core.losses import NormalCriterion, masked_normal_loss
 from sdps.core.metrics import angle_degrees, direction_mae, intensity_error
 from sdps.data.dataset import Batch, SampleOptions
 from sdps.models import registry
-from sdps.models.attention import AttentionNet
-from sdps.models.base import LightingNetwork, Lights, NormalNetwork, Observations
+from sdps.models.base import FusionNetwork, LightingNetwork, Lights, Truth
 from sdps.models.checkpoint import TrainedModel
-from sdps.models.frames import FrameNet
 from sdps.models.lcnet import resize_input
 from sdps.models.registry import TRUE_LIGHTS
-from sdps.models.upsfcn import UPSFCNLight
 from sdps.training.training_config import LightingTraining, NormalTraining, TrainingConfig
-
-
-class Part(NamedTuple):
-    """A network to be saved by itself."""
-
-    name: str  # of the weights file
-    model: str  # in the registry
-    network: nn.Module
-    options: dict[str, Any]
 
 
 class Stage(ABC):
@@ -62,11 +43,7 @@ class Stage(ABC):
         self.name, self.model, self.config, self.options = name, model, config, options
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derived_seed(config.seed, "weights", model))
-            self.network: nn.Module = self.build()
-
-    def build(self) -> nn.Module:
-        """Return the network with fresh weights."""
-        return registry.create(self.model, **self.options)
+            self.network: nn.Module = registry.create(model, **options)
 
     def frozen(self) -> list[nn.Module]:
         """Return the networks that are used but not trained."""
@@ -81,10 +58,6 @@ class Stage(ABC):
     def origin(self) -> dict[str, Any]:
         """Return what else these weights depend on, for their metadata."""
         return {}
-
-    def parts(self, network: nn.Module) -> list[Part]:
-        """Return what is saved of `network`, which is `self.network` or an average of its weights."""
-        return [Part(self.name, self.model, network, self.options)]
 
     def sample_options(self) -> SampleOptions:
         """Return how training samples are made."""
@@ -111,7 +84,7 @@ class Stage(ABC):
 
 
 class LightingStage(Stage):
-    """Models that tell lights from images and mask."""
+    """Models that find lights from images and mask."""
 
     config: LightingTraining
     network: LightingNetwork
@@ -119,22 +92,18 @@ class LightingStage(Stage):
     def __init__(self, config: LightingTraining, *, model: str = "lcnet", name: str | None = None) -> None:
         super().__init__(name or model, model, config, lighting_options(model, config))
 
-    def predict(self, batch: Batch) -> Any:
-        """Return the network's prediction."""
-        return self.network(batch.images, batch.mask)
-
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the network's own loss."""
-        terms = self.network.loss(self.predict(batch), batch.directions, batch.intensities)
+        terms = self.network.loss(self.network(batch.images, batch.mask), batch.directions, batch.intensities)
         return terms["total"], {f"{name}_loss": value for name, value in terms.items() if name != "total"}
 
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return the loss, and direction and intensity errors of every read-out."""
-        prediction = self.predict(batch)
+        prediction = self.network(batch.images, batch.mask)
         values = {"loss": float(self.network.loss(prediction, batch.directions, batch.intensities)["total"])}
         for how in get_args(ReadOut):
             suffix = "" if how == "centre" else f"_{how}"
-            values |= light_errors(self.network.lights(prediction, how), batch, suffix)
+            values |= light_errors(self.network.read_lights(prediction, how), batch, suffix)
         return values
 
 
@@ -143,13 +112,13 @@ class NormalStage(Stage):
 
     Args:
         config: The run's configuration.
-        lighting: Trained lighting model; may be absent for true lights, or a model that is told none.
+        lighting: Trained lighting model; may be absent for true lights, or a model that is given none.
         model: Name in the registry.
         name: Name of the run.
     """
 
     config: NormalTraining
-    network: NormalNetwork
+    network: FusionNetwork
     goal = "normal_mae"
     usual = "nenet"
     """Name in the registry where no other is given."""
@@ -177,7 +146,7 @@ class NormalStage(Stage):
         """Record the lights trained on, and the data and step of the model they came from."""
         if self.lighting is None:
             return {"lights": self.source or "none"}
-        return {"lights": self.source, "lighting": described(self.lighting)}
+        return {"lights": self.source, "lighting": model_identity(self.lighting)}
 
     def sample_options(self) -> SampleOptions:
         return replace(super().sample_options(), crop=self.config.crop, min_object=self.config.min_object)
@@ -190,34 +159,32 @@ class NormalStage(Stage):
         if self.lighting is None:
             return Lights(batch.directions, batch.intensities)
         network = cast(LightingNetwork, self.lighting.network)
-        return network.lights(network(*resize_input(batch.images, batch.mask)), self.config.read_out).doubted()
+        prediction = network(*resize_input(batch.images, batch.mask))
+        return network.read_lights(prediction, self.config.read_out).with_errors()
 
     def training_lights(self, batch: Batch) -> Lights | None:
         """Return the lights given in training: with drawn errors, then some of the way to the true ones."""
         lights, limit = self.lights(batch), self.config.light_blend
         if lights is not None and self.config.light_error:
-            lights = disturbed(lights, batch.seed.tolist(), self.config.light_error)
+            lights = disturb(lights, batch.seed.tolist(), self.config.light_error)
         if self.lighting is None or lights is None or not limit:
             return lights
         drawn = [min(generator(seed, "light_blend").uniform(0.0, limit), 1.0) for seed in batch.seed.tolist()]
         share = torch.tensor(drawn, device=batch.images.device)[:, None]  # (B, 1)
         directions = torch.lerp(lights.directions.float(), batch.directions, share[..., None])  # (B, Q, 3)
         intensities = torch.lerp(lights.intensities.float(), batch.intensities, share)  # (B, Q)
-        expected = None if lights.expected is None else (1.0 - share) * lights.expected.float()
-        return Lights(functional.normalize(directions, dim=-1), intensities, expected=expected)
+        error = None if lights.expected_error is None else (1.0 - share) * lights.expected_error.float()
+        return Lights(functional.normalize(directions, dim=-1), intensities, expected_error=error)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the configured normal loss on the crops, and the lighting loss of models that learn both."""
-        lights = self.training_lights(batch)
-        side = self.config.crop or self.config.size
-        images, mask, truth = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
+        """Return the network's own loss on the crops, as configured."""
+        lights, config = self.training_lights(batch), self.config
+        side = config.crop or config.size
+        images, mask, normals = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
         seen = self.network.observe(images, mask, lights)
-        if not isinstance(self.network, UPSFCNLight):
-            return normal_loss(self.config, self.network, seen, truth, mask, batch.directions)
-        normals, logits = self.network.with_lights(seen)
-        loss, terms = plain_normal_loss(self.config, normals, truth, mask)
-        terms["lighting_loss"] = self.network.lighting_loss(logits, batch.directions, batch.intensities)
-        return loss + self.config.lighting_weight * terms["lighting_loss"], terms
+        weights = config.gradient_weight, config.lighting_weight, config.expected_weight
+        truth = Truth(normals, mask, batch.directions, batch.intensities)
+        return self.network.loss(seen, truth, NormalCriterion(config.loss, *weights))
 
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return the normal MAE on whole images, and the errors of lights that a model found or that were drawn."""
@@ -228,7 +195,7 @@ class NormalStage(Stage):
             "normal_mae": normal_error(normals, batch),
         }
         if lights is not None and self.config.light_error:
-            drawn = disturbed(lights, batch.seed.tolist(), self.config.light_error)
+            drawn = disturb(lights, batch.seed.tolist(), self.config.light_error)
             seen = self.network.observe(batch.images, batch.mask, drawn)
             values |= light_errors(drawn, batch, "_drawn")
             values["normal_mae_drawn"] = normal_error(self.network(seen), batch)
@@ -239,56 +206,13 @@ class NormalStage(Stage):
         return {} if lights is None or self.lighting is None else light_errors(lights, batch, "")
 
 
-def normal_loss(
-    config: NormalTraining, network: NormalNetwork, seen: Observations, truth: Tensor, mask: Tensor, directions: Tensor
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the scalar to minimise of a normal network, and named parts.
-
-    Args:
-        config: Names the loss, and weighs the others beside it.
-        network: In training.
-        seen: What it is shown.
-        truth: (B, 3, H, W) unit normals.
-        mask: (B, 1, H, W), 0 or 1.
-        directions: (B, Q, 3), the true ones.
-    """
-    if isinstance(network, FrameNet):
-        staged = network.staged(seen)
-        loss, terms = plain_normal_loss(config, staged.normals, truth, mask)
-        terms["pixel_loss"], _ = plain_normal_loss(config, staged.alone, truth, mask)
-        terms["expected_loss"] = expected_error_loss(staged.expected, staged.normals, truth, mask)
-        return loss + terms["pixel_loss"] + config.expected_weight * terms["expected_loss"], terms
-    if not (isinstance(network, AttentionNet) and network.shades and config.shading_weight):
-        return plain_normal_loss(config, network(seen), truth, mask)
-    normals, maps = network.with_shading(seen)
-    loss, terms = plain_normal_loss(config, normals, truth, mask)
-    terms["shading_loss"] = torch.stack([shading_loss(shading, truth, mask, directions) for shading in maps]).mean()
-    return loss + config.shading_weight * terms["shading_loss"], terms
-
-
-def plain_normal_loss(
-    config: NormalTraining, normals: Tensor, truth: Tensor, mask: Tensor
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the loss of estimated normals alone, and named parts; see `normal_loss`."""
-    masked = masked_normal_loss(normals, truth, mask)
-    loss, terms = masked, {"masked_loss": masked}
-    if config.loss == "chord":
-        loss = chord_normal_loss(normals, truth, mask)
-    elif config.loss == "faithful":
-        loss = faithful_normal_loss(normals, truth)
-    if config.gradient_weight:
-        terms["gradient_loss"] = normal_gradient_loss(normals, truth, mask)
-        loss = loss + config.gradient_weight * terms["gradient_loss"]
-    return loss, terms
-
-
 _BENT, _SCATTERED, _UNEVEN = 0.10, 0.06, 0.08
-"""How far `disturbed` moves lights: all alike, each by itself, and in intensity."""
+"""How far `disturb` moves lights: all alike, each by itself, and in intensity."""
 _STRAYED = math.degrees(math.sqrt(math.pi / 2 * (_BENT**2 + _SCATTERED**2)))
-"""Mean error of directions that `disturbed` moves by the share 1: both parts move them across by Gaussian steps."""
+"""Mean error of directions that `disturb` moves by the share 1: both parts move them across by Gaussian steps."""
 
 
-def disturbed(lights: Lights, seeds: list[int], limit: float) -> Lights:
+def disturb(lights: Lights, seeds: list[int], limit: float) -> Lights:
     """Return lights with errors like those of estimated ones, drawn for each scene.
 
     A linear map bends the directions of a scene alike, as a relief that is taken too flat or too deep does; each light
@@ -309,7 +233,7 @@ def disturbed(lights: Lights, seeds: list[int], limit: float) -> Lights:
     moved = torch.from_numpy(np.stack(directions)).to(lights.directions)
     factors = torch.from_numpy(np.stack(intensities)).to(lights.intensities)
     errors = torch.from_numpy(np.stack(expected)).to(lights.intensities)
-    return Lights(functional.normalize(moved, dim=-1), lights.intensities * factors, expected=errors)
+    return Lights(functional.normalize(moved, dim=-1), lights.intensities * factors, expected_error=errors)
 
 
 def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:
@@ -329,8 +253,8 @@ def freeze(model: TrainedModel) -> TrainedModel:
     return model
 
 
-def described(model: TrainedModel) -> dict[str, Any]:
-    """Return what tells one trained model from another."""
+def model_identity(model: TrainedModel) -> dict[str, Any]:
+    """Return what distinguishes one trained model from another."""
     return {"model": model.name, **{key: model.metadata.get(key) for key in ("data", "step", "metrics")}}
 
 

@@ -79,7 +79,7 @@ def train(
     tensorboard: bool = False,
     on_save: Callable[[], None] | None = None,
 ) -> TrainingResult:
-    """Train a stage until its budget is spent, resuming whatever `out_folder` holds.
+    """Train a stage until its budget is spent, resuming what is in `out_folder`.
 
     Args:
         stage: What to train; carries the configuration.
@@ -87,7 +87,7 @@ def train(
         out_folder: Folder of the run.
         source: Where training batches come from; by default the stored scenes of `data_folder`.
         device: Torch device; CUDA when there is one, else CPU.
-        loggers: Receivers of metrics beside `metrics.jsonl`.
+        loggers: Further receivers of metrics, besides `metrics.jsonl`.
         tensorboard: Also log to `<out_folder>/tensorboard`.
         on_save: Called in the leading process whenever a checkpoint has been written.
 
@@ -263,7 +263,7 @@ class Trainer:
         # One transfer a step: a GPU is waited for once.
         totals = self.team.mean(dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True)))
         if not math.isfinite(totals["loss"]):
-            raise self._diverged(f"the loss became {totals['loss']} at step {self.step + 1}")
+            raise self._divergence(f"the loss became {totals['loss']} at step {self.step + 1}")
         if config.clip_gradient:
             norm = torch.nn.utils.clip_grad_norm_(self.stage.network.parameters(), config.clip_gradient)
             totals["gradient_norm"] = float(norm)
@@ -313,8 +313,8 @@ class Trainer:
             weight.copy_(last[name] if counts else torch.lerp(last[name], first[name], self.config.start_share))
         return self._blend
 
-    def _diverged(self, what: str) -> InputError:
-        """Build the error that ends a run which has left the numbers, and say what is left of it."""
+    def _divergence(self, what: str) -> InputError:
+        """Return the error that ends a run whose numbers are no longer finite, and says what is left of it."""
         path = self.folder / CHECKPOINT
         kept = "nothing was saved before"
         if self.saved is not None:
@@ -324,7 +324,7 @@ class Trainer:
     def _require_finite(self) -> None:
         """Refuse to write weights that a gradient has made infinite or NaN while the loss before it was finite."""
         if not all(bool(torch.isfinite(weight).all()) for weight in self._kept().state_dict().values()):
-            raise self._diverged(f"the weights became infinite or NaN at step {self.step}")
+            raise self._divergence(f"the weights became infinite or NaN at step {self.step}")
 
     def save(self) -> None:
         """Write the checkpoint: weights, optimiser, random state, and place in the data.
@@ -363,7 +363,7 @@ class Trainer:
             return
         state = load_state(path)
         self._compare(path, state.get("identity", {}))
-        with decoding(path, "a checkpoint of this run", "delete it to start this run afresh"):
+        with decoding(path, "a checkpoint of this run", "delete it to start this run again"):
             self.stage.network.load_state_dict(state["network"])
             self.optimiser.load_state_dict(state["optimiser"])
             if self.average is not None:
@@ -403,7 +403,7 @@ class Trainer:
                 raise InputError(f"{path}: of another run ({key} was {was!r}, now {value!r}); choose another --out")
 
     def save_weights(self, metrics: dict[str, float], suffix: str = "") -> None:
-        """Write each network with everything needed to use and to trace it; InputError where it is not finite."""
+        """Write the network with everything needed to use and to trace it; InputError where it is not finite."""
         self._require_finite()
         metadata = {
             "config": to_plain(self.config),
@@ -415,14 +415,13 @@ class Trainer:
             "metrics": metrics,
             **self.stage.origin(),
         }
-        for part in self.stage.parts(self._kept()):
-            model = TrainedModel(part.model, part.network, part.options, metadata)
-            save_weights(self.folder / f"{part.name}{suffix}.safetensors", model)
+        model = TrainedModel(self.stage.model, self._kept(), self.stage.options, metadata)
+        save_weights(self.folder / f"{self.stage.name}{suffix}.safetensors", model)
 
     def result(self, metrics: dict[str, float], waiting_share: float, *, interrupted: bool) -> TrainingResult:
         """Describe how the run ended."""
-        names = [part.name for part in self.stage.parts(self.stage.network)]
-        weights = None if interrupted else {name: self.folder / f"{name}.safetensors" for name in names}
+        name = self.stage.name
+        weights = None if interrupted else {name: self.folder / f"{name}.safetensors"}
         return TrainingResult(weights, self.step, self.seconds(), metrics, waiting_share, interrupted)
 
 

@@ -1,4 +1,4 @@
-"""What a training run is told: one frozen dataclass per kind of model, defaults as in the paper's code.
+"""The settings of a training run: one frozen dataclass per kind of model, defaults as in the paper's code.
 
 A run ends after `epochs`, or after `steps` or `minutes` when one of these is given; the learning rate
 follows the share of that budget already spent, so a shorter budget anneals fully all the same.
@@ -18,12 +18,12 @@ from sdps.models.lcnet import EARLY_SIZE, INPUT_SIZE
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
-    """What both stages share.
+    """What all kinds of models share.
 
     Attributes:
         seed: Root seed of weights, order, image subsets and augmentation.
-        start: What of the same network training starts from: a run, `shipped:<name>` or a `.safetensors` file; empty
-            for random weights.
+        start: Weights of the same network that training starts from: a run, `shipped:<name>` or a `.safetensors` file;
+            empty for random weights.
         start_share: Share of the start in the weights that are validated and saved; the rest is what was trained (0:
             all of it). Averages of fine-tuned weights and those before them are often better than both (Wortsman et
             al., Robust fine-tuning of zero-shot models, CVPR 2022, eq. 1, whose alpha is 1 less this).
@@ -41,8 +41,8 @@ class TrainingConfig:
         cooldown: See `schedule`.
         halve_after: Epochs after which `halving` halves; scaled with the budget when it is not `epochs`.
         warmup: Share of the budget over which the learning rate rises linearly from zero.
-        optimiser: `adam` or `adamw`, betas 0.9 and 0.999; or `muon` (`sdps.training.muon`), with AdamW for what is no
-            matrix.
+        optimiser: `adam` or `adamw`, betas 0.9 and 0.999; or `muon` (`sdps.training.muon`), with AdamW for what is not
+            a matrix.
         weight_decay: Weight decay (0 in the paper: its 4e-4 is parsed but never used).
         clip_gradient: Largest gradient norm; 0 leaves gradients alone.
         ema: Decay of an exponential moving average of the weights, which is then validated and saved (0: none).
@@ -146,19 +146,15 @@ class TrainingConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LightingTraining(TrainingConfig):
-    """Models that tell lights: LCNet, its variants, and the second pass.
+    """Models that find lights.
 
     Attributes:
         direction_classes: K_d, classes of azimuth and of elevation.
         intensity_classes: K_e.
-        lights: The run whose lights a second pass starts from (empty: the one its registry entry names).
-        normals: The run whose normals a second pass sees (empty: the one its registry entry names).
     """
 
     direction_classes: int = 36
     intensity_classes: int = 20
-    lights: str = ""
-    normals: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -167,17 +163,14 @@ class LightingTraining(TrainingConfig):
                 f"size must be {INPUT_SIZE} for LCNet, whose last layers need it, or {EARLY_SIZE} for a run that "
                 f"others start from, got {self.size}"
             )
-        self.classes()
+        low, high = self.intensity_range()
+        # Refuses numbers that make no classes.
+        LightClasses(directions=self.direction_classes, intensities=self.intensity_classes, low=low, high=high)
 
     def intensity_range(self) -> tuple[float, float]:
         """Return the range the intensity classes cover: the one intensities are drawn from."""
         low, high = self.augmentation.intensity_range
         return low, max(high, low + 1e-3)
-
-    def classes(self) -> LightClasses:
-        """Return the discretised lighting space."""
-        low, high = self.intensity_range()
-        return LightClasses(directions=self.direction_classes, intensities=self.intensity_classes, low=low, high=high)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,12 +188,11 @@ class NormalTraining(TrainingConfig):
             training sample; of shares drawn above 1 the lights are the true ones. Many images and test-time
             augmentation give better lights than a sample's few images.
         light_error: Size of the errors drawn onto the lights in training, 1 for those of lights estimated from few
-            images. So a network learns what estimated lights are worth, and no lighting model has to run.
+            images. So a network learns what estimated lights are worth, without a lighting model.
         crop: Side of the random crop the network sees (0: the whole image); the lighting model always sees the whole.
         min_object: Least share of object pixels a crop should have; the best of a few draws is taken.
-        lighting_weight: Weight of the lighting loss beside the normal loss, for models that learn both.
+        lighting_weight: Weight of the lighting loss next to the normal loss, for models that learn both.
         gradient_weight: Weight of the error of the normals' steps from pixel to pixel.
-        shading_weight: Weight of the errors of the shading maps, for models that learn them.
         expected_weight: Weight of the errors of the expected error, for models that learn it.
         options: Options of the network over those of its registry entry, for variants of a model.
     """
@@ -217,7 +209,6 @@ class NormalTraining(TrainingConfig):
     min_object: float = 0.3
     lighting_weight: float = 0.1
     gradient_weight: float = 0.0
-    shading_weight: float = 0.0
     expected_weight: float = 0.02
     options: dict[str, bool | int | float | str] = field(default_factory=dict)
 
@@ -229,15 +220,8 @@ class NormalTraining(TrainingConfig):
             raise InputError(f"light_blend must be in [0, 10], got {self.light_blend}")
         if not 0.0 <= self.min_object < 1.0:
             raise InputError(f"min_object must be in [0, 1), got {self.min_object}")
-        check_fields(
-            self,
-            "not negative",
-            "light_error",
-            "lighting_weight",
-            "gradient_weight",
-            "shading_weight",
-            "expected_weight",
-        )
+        weights = "lighting_weight", "gradient_weight", "expected_weight"
+        check_fields(self, "not negative", "light_error", *weights)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,34 +247,3 @@ class PixelTraining(NormalTraining):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_fields(self, "at least 1", "pixels_per_scene", "min_lights", "rotations")
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointTraining(NormalTraining):
-    """A lighting model and a normal model, both trained before, fine-tuned together.
-
-    Attributes:
-        normals: The run of the normal model.
-        lights: The run of the lighting model.
-        lighting_weight: Weight of the lighting loss.
-        normal_weight: Weight of the normal loss, whose gradients reach the lighting model through its lights.
-    """
-
-    lights: str = "lcnet"
-    normals: str = "nenet"
-    read_out: ReadOut = "expectation"
-    learning_rate: float = 1e-4
-    lighting_weight: float = 1.0
-    normal_weight: float = 10.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.read_out != "expectation":
-            raise InputError(f"read_out must be expectation, the only one with a gradient, got {self.read_out}")
-        if self.options:
-            raise InputError("options must be empty: the networks are those of the pair")
-        if self.light_blend:
-            raise InputError("light_blend must be 0: the normals' error reaches the lighting model through its lights")
-        if self.light_error:
-            raise InputError("light_error must be 0: the lights' own errors are what is to shrink")
-        check_fields(self, "positive", "normal_weight")

@@ -154,9 +154,9 @@ def _weights(folder: Path) -> None:
     from sdps.models import registry
     from sdps.models.checkpoint import TrainedModel, save_state, save_weights
 
-    network = registry.create("lcnet-second")
+    network = registry.create("frames")
     metadata = {"config": {"augmentation": to_plain(Augmentation())}, "data": "0", "code": "0", "step": 1}
-    save_weights(folder / "a.safetensors", TrainedModel("lcnet-second", network, {}, metadata), half=True)
+    save_weights(folder / "a.safetensors", TrainedModel("frames", network, {}, metadata), half=True)
     values = list(network.state_dict().values())[:3]
     save_state(folder / "checkpoint.pt", {"step": 3, "network": dict(enumerate(values)), "best": None, "names": ["a"]})
     (folder / "metrics.jsonl").write_text('{"step": 1, "loss": 0.5}\n{"step": 2, "loss": 0.4, "val_mae": 9.5}\n')
@@ -181,7 +181,7 @@ def _run(folder: Path) -> None:
     }  # fmt: skip
     run = folder / "run"
     run.mkdir()
-    model = TrainedModel("lcnet-second", registry.create("lcnet-second"), {}, metadata)
+    model = TrainedModel("frames", registry.create("frames"), {}, metadata)
     save_weights(run / "a.safetensors", model, half=True)
     rows = [{"step": 1, "loss": 0.5, "images_per_second": 9.0}, {"step": 2, "loss": 0.4, "val_direction_mae": 9.5}]
     (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))

@@ -57,7 +57,7 @@ def test_an_override_changes_one_run_and_not_those_that_share_its_settings(tmp_p
     """YAML's references, merged or not, are a short way to write settings, no bond between them."""
     (tmp_path / "own.yaml").write_text(
         "name: own\ndescription: runs that share settings\n"
-        "normals: &normals {augmentation: &noise {noise: 0.01}}\njoint: *normals\nruns:\n"
+        "normals: &normals {augmentation: &noise {noise: 0.01}}\npixels: *normals\nruns:\n"
         "  a: &a {base: nenet, seed: 3, augmentation: *noise}\n  b: *a\n  c: {<<: *a, seed: 4}\n"
     )
     ways = ["runs.a.seed=7", "runs.a.augmentation.noise=0.5"]
@@ -66,7 +66,7 @@ def test_an_override_changes_one_run_and_not_those_that_share_its_settings(tmp_p
         configs = [preset.run(name).config for name in "abc"]
         assert [config.seed for config in configs] == [7, 3, 4]
         assert [config.augmentation.noise for config in configs] == [0.5, 0.01, 0.01]
-        assert preset.normals == preset.joint == {"augmentation": {"noise": 0.01}}
+        assert preset.normals == preset.pixels == {"augmentation": {"noise": 0.01}}
 
 
 def test_overrides_reach_any_field_and_convert_types():
@@ -347,7 +347,7 @@ def evaluate_combinations(capsys, flags, out):
     scores = json.loads((out / "eval" / "results.json").read_text())["scenes"][0]["scores"]
     assert "direction_mae" not in scores["least-squares, true lights"]  # what was given is not scored
     assert "did you mean 'psfcn'" in fails(capsys, "eval-merltest", *flags, "--lights", "lcnet", "--normals", "psfnc")
-    line = fails(capsys, "eval-merltest", *flags, "--normals", "sdps-second")
+    line = fails(capsys, "eval-merltest", *flags, "--normals", "sdps-reg")
     assert "no such weights; train them with `sdps train --models" in line
 
 

@@ -1,6 +1,6 @@
 """Run by a test in a process of its own: estimate a scene made on demand, print the peak memory and the time.
 
-Usage: python tests/support/inference_memory.py COUNT NORMALS [LIGHTING [SECOND]]
+Usage: python tests/support/inference_memory.py COUNT NORMALS [LIGHTING]
 """
 
 import json
@@ -41,9 +41,9 @@ def trained(name: str) -> TrainedModel:
     return TrainedModel(name, network, {}, {"config": {"augmentation": to_plain(Augmentation())}})
 
 
-def main(count: int, normals: str, lighting: str = "", second: str = "") -> None:
+def main(count: int, normals: str, lighting: str = "") -> None:
     torch.manual_seed(0)
-    models = {"normals": normals, "lighting": lighting, "second": second}
+    models = {"normals": normals, "lighting": lighting}
     loaded = {place: trained(name) if name else None for place, name in models.items()}
     estimator = Estimator(**loaded, device=torch.device("cpu"), precision="float32")
     source = SphereSource(count)

@@ -12,7 +12,7 @@ import torch
 from sdps.models.base import Lights
 from sdps.models.lcnet import INPUT_SIZE
 from sdps.models.registry import MODELS, create
-from sdps.training.muon import _Muon, is_matrix, orthogonalised
+from sdps.training.muon import _Muon, is_matrix, orthogonalise
 
 META = torch.device("meta")
 NORMALS = [name for name, item in MODELS.items() if item.role == "normals" and name != "frames"]
@@ -38,7 +38,7 @@ def test_lighting_networks(name: str) -> None:
     loss = network.loss(prediction, vectors(2, 3, 3), torch.ones(2, 3, device=META))["total"]
     assert loss.device == META
     for how in ("centre", "expectation"):
-        assert network.lights(prediction, how).directions.device == META
+        assert network.read_lights(prediction, how).directions.device == META
     loss.backward()
 
 
@@ -53,7 +53,7 @@ def test_normal_networks(name: str) -> None:
 
 
 def test_muon() -> None:
-    assert orthogonalised(torch.rand(64, 128, device=META)).device == META
+    assert orthogonalise(torch.rand(64, 128, device=META)).device == META
     network = create("nenet").to(META)
     for parameter in network.parameters():
         parameter.grad = torch.zeros_like(parameter)

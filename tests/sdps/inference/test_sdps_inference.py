@@ -16,14 +16,11 @@ from render.shared.config import to_plain
 from render.shared.errors import InputError
 from sdps.core.metrics import score
 from sdps.data.augment import Augmentation, measure_exposure
-from sdps.data.dataset import Batch
 from sdps.inference import chunked, image_source
-from sdps.inference.estimator import Estimator, load_estimator
-from sdps.models.checkpoint import TrainedModel, save_weights
+from sdps.inference.estimator import Estimator
+from sdps.models.checkpoint import TrainedModel
 from sdps.models.cnnps import predict_normals
 from sdps.models.registry import create
-from sdps.training.joint import SecondStage
-from sdps.training.training_config import LightingTraining
 
 METADATA = {"config": {"augmentation": to_plain(Augmentation())}}
 
@@ -35,14 +32,9 @@ def trained(name: str, **options: Any) -> TrainedModel:
 
 
 @pytest.fixture(scope="module")
-def estimator(tmp_path_factory: pytest.TempPathFactory) -> Estimator:
-    folder = tmp_path_factory.mktemp("weights")
-    for name, options in (("lcnet", {"direction_classes": 36, "intensity_classes": 20}), ("nenet", {})):
-        save_weights(folder / f"{name}.safetensors", trained(name, **options))
-    return load_estimator(
-        lighting=folder / "lcnet.safetensors", normals=folder / "nenet.safetensors", device="cpu",
-        precision="float32", read_out="centre",
-    )  # fmt: skip
+def estimator() -> Estimator:
+    models = {"lighting": trained("lcnet"), "normals": trained("nenet")}
+    return Estimator(**models, device=torch.device("cpu"), precision="float32", read_out="centre")
 
 
 def scene(size: int = 90, count: int = 6) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -148,22 +140,11 @@ def test_unusable_input_is_refused_in_one_line(estimator: Estimator, change: dic
     assert "\n" not in str(error.value)
 
 
-def test_swapped_files_are_noticed(estimator: Estimator, tmp_path: Path) -> None:
-    file, normals = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
-    save_weights(file, estimator.lighting)
-    save_weights(normals, estimator.normals)
-    with pytest.raises(InputError, match="one for normals or pixels is needed"):
-        load_estimator(normals=file)
-    with pytest.raises(InputError, match="one for second is needed"):
-        load_estimator(lighting=file, second=file, normals=normals)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"lighting": "nenet"}, "lighting: 'nenet' is a model for 'normals', not for lighting"),
         ({"normals": "lcnet"}, "normals: 'lcnet' is a model for 'lighting', not for normals or pixels"),
-        ({"lighting": None, "second": "lcnet-second"}, "give a lighting model too"),
         ({"rotations": 0}, "rotations must be at least 1, got 0"),
         ({"chunk_pixels": 0}, "chunk_pixels must be at least 1"),
         ({"margin": -1}, "margin must be at least 0"),
@@ -303,14 +284,12 @@ def test_a_network_that_tells_the_error_of_lights_to_expect_tells_it(estimator: 
     assert "expected_light_error" not in estimator.estimate(images, mask).diagnostics
 
 
-@pytest.mark.parametrize(
-    "names", [("lcnet", "nenet"), ("lightset", "nenet"), ("lcnet-soft", "nenet-plus", "lcnet-second")]
-)
-def test_lights_found_before_change_nothing(names: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("lighting", ["lcnet", "lightset"])
+def test_lights_found_before_change_nothing(lighting: str) -> None:
     images, mask, lights = scene(size=72)
     gains = np.linspace(0.5, 2.0, 6)
-    places = dict(zip(("lighting", "normals", "second"), map(trained, names), strict=False))
-    estimator = Estimator(**places, device=torch.device("cpu"), precision="float32", light_views=2)
+    models = {"lighting": trained(lighting), "normals": trained("nenet")}
+    estimator = Estimator(**models, device=torch.device("cpu"), precision="float32", light_views=2)
     for given in ({}, {"intensities": gains}):
         expected = estimator.estimate(images, mask, **given)
         found = estimator.estimate_lights(images, mask, **given)
@@ -325,35 +304,23 @@ def test_lights_found_before_change_nothing(names: tuple[str, ...]) -> None:
             estimator.estimate(**{"images": images, "mask": mask, "found": found, **wrong})
 
 
-def test_second_pass_is_the_one_of_training() -> None:
-    """On images of 128x128 inference does what `SecondStage` did."""
+def test_inference_gives_what_training_sees() -> None:
+    """On images of 128x128, which are not resized."""
     images, mask, lights = scene(size=128)
-    models = {"lighting": trained("lcnet-soft"), "normals": trained("nenet-plus")}
-    second = trained("lcnet-second")
-    estimator = Estimator(**models, second=second, device=torch.device("cpu"), precision="float32", margin=None)
+    lighting, normals = trained("lcnet-soft"), trained("nenet-plus")
+    estimator = Estimator(
+        lighting=lighting, normals=normals, device=torch.device("cpu"), precision="float32", margin=None
+    )
     estimate = estimator.estimate(images, mask)
     exposed = measure_exposure(images[:, mask], Augmentation()).apply(images * mask[..., None])
-    batch = Batch(
-        images=torch.from_numpy(exposed).permute(0, 3, 1, 2)[None],
-        mask=torch.from_numpy(mask.astype(np.float32))[None, None],
-        normals=torch.zeros(1, 3, 128, 128),
-        directions=torch.from_numpy(lights)[None],
-        intensities=torch.ones(1, 6),
-        corner=torch.zeros(1, 2, dtype=torch.int64),
-        seed=torch.zeros(1, dtype=torch.int64),
-    )
-    stage = SecondStage(LightingTraining(), **models)
-    stage.network = second.network
+    seen = torch.from_numpy(exposed).permute(0, 3, 1, 2)[None], torch.from_numpy(mask.astype(np.float32))[None, None]
     with torch.no_grad():
-        expected = second.network.lights(stage.predict(batch))
-        network = models["normals"].network
-        normals = network(network.observe(batch.images, batch.mask, expected))[0].permute(1, 2, 0).numpy()
+        expected = lighting.network.read_lights(lighting.network(*seen))
+        found = normals.network(normals.network.observe(*seen, expected))[0].permute(1, 2, 0).numpy()
     np.testing.assert_allclose(estimate.light_directions, expected.directions[0], atol=1e-4)
     np.testing.assert_allclose(estimate.intensities, expected.intensities[0], atol=1e-4)
-    np.testing.assert_allclose(estimate.normals[mask], normals[mask], atol=1e-3)
-    assert estimate.diagnostics["exposure"].keys() == {"lighting", "second", "normals"}
-    first = replace(estimator, second=None).estimate(images, mask)
-    assert np.abs(first.light_directions - estimate.light_directions).max() > 1e-3
+    np.testing.assert_allclose(estimate.normals[mask], found[mask], atol=1e-3)
+    assert estimate.diagnostics["exposure"].keys() == {"lighting", "normals"}
     known = estimator.estimate(images, mask, lights, np.ones(6))
     assert known.diagnostics["exposure"].keys() == {"normals"}  # nothing was asked about lights
 
@@ -375,10 +342,9 @@ def test_pixel_networks_see_the_whole_pixel(estimator: Estimator, monkeypatch: p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("models", [("nenet", "lcnet"), ("nenet-plus", "lcnet-soft", "lcnet-second")])
-def test_a_thousand_images_fit_in_two_gibibytes(models: tuple[str, ...]) -> None:
+def test_a_thousand_images_fit_in_two_gibibytes() -> None:
     script = Path(__file__).parents[2] / "support" / "inference_memory.py"
-    command = [sys.executable, str(script), "1000", *models]
+    command = [sys.executable, str(script), "1000", "nenet", "lcnet"]
     done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=script.parent)
     measured = json.loads(done.stdout)
     assert measured["finite"]

@@ -9,7 +9,7 @@ from render.shared.errors import InputError
 from sdps.core.metrics import angle_degrees
 from sdps.core.symmetry import SYMMETRIES, Symmetry
 from sdps.inference.estimator import Estimator
-from sdps.inference.turned_views import mean_lights, turned_context
+from sdps.inference.turned_views import mean_lights
 from sdps.models.base import Lights
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.registry import create
@@ -47,16 +47,6 @@ def test_the_first_views_are_groups_and_all_are_different() -> None:
         assert products == set(seen[:count])
 
 
-@EVERY
-def test_the_context_of_a_second_pass_turns_with_its_vectors(symmetry: Symmetry) -> None:
-    context = torch.rand(1, 5, 4, 6, 6)
-    turned = turned_context(symmetry, lambda part: context[:, part])(slice(1, 3))
-    assert turned.shape == (1, 2, 4, 6, 6)
-    torch.testing.assert_close(turned[:, :, 3], symmetry.images(context[:, 1:3, 3]))
-    torch.testing.assert_close(turned[:, :, :3], symmetry.vectors(symmetry.images(context[:, 1:3, :3]), dim=2))
-    assert turned_context(symmetry, None) is None
-
-
 def test_the_mean_of_lights_undoes_the_turns() -> None:
     true = torch.nn.functional.normalize(torch.rand(1, 4, 3), dim=-1)
     gains = torch.rand(1, 4)
@@ -72,13 +62,15 @@ def test_the_mean_of_views_is_expected_to_err_less_by_what_averages_out() -> Non
     noise = torch.randn(8, 1, 4000, 2, generator=rng) * torch.deg2rad(torch.tensor(own)) / 2**0.5
     noise[..., 0] += torch.deg2rad(torch.tensor(common))
     directions = torch.nn.functional.normalize(torch.cat([noise, torch.ones(8, 1, 4000, 1)], dim=-1), dim=-1)
-    gains, told = torch.ones(1, 4000), torch.full((1, 4000), 5.0)
+    gains, each_error = torch.ones(1, 4000), torch.full((1, 4000), 5.0)
     views = zip(SYMMETRIES, directions, strict=True)
-    mean = mean_lights([(each, Lights(each.vectors(one), gains, expected=told)) for each, one in views])
+    mean = mean_lights([(each, Lights(each.vectors(one), gains, expected_error=each_error)) for each, one in views])
     made = angle_degrees(mean.directions.numpy(), np.array([0.0, 0.0, 1.0]))
-    assert mean.expected is not None
-    assert float(mean.expected.square().mean().sqrt()) == pytest.approx(float(np.sqrt((made**2).mean())), rel=0.03)
-    assert float(mean.expected.min()) > 4.99 / 8**0.5
+    assert mean.expected_error is not None
+    assert float(mean.expected_error.square().mean().sqrt()) == pytest.approx(
+        float(np.sqrt((made**2).mean())), rel=0.03
+    )
+    assert float(mean.expected_error.min()) > 4.99 / 8**0.5
 
 
 def estimator(lights: int, normals: int) -> Estimator:

@@ -1,6 +1,7 @@
 """The network that sees pixels in frames of their own, its first normals, and light errors in training."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,19 +9,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from render.shared.config import to_plain
 from render.shared.errors import InputError
 from sdps.core.first_normals import first_normals, frames
-from sdps.core.losses import chord_normal_loss, expected_error_loss
 from sdps.core.symmetry import Symmetry
+from sdps.data.augment import Augmentation
 from sdps.models.base import Lights, Observations
 from sdps.models.blocks import parameter_count
+from sdps.models.checkpoint import TrainedModel, load_weights, save_weights
 from sdps.models.cnnps import rotate_about_view
-from sdps.models.frames import FrameNet, Pixels, described, object_pixels
+from sdps.models.frames import FrameNet, FusedMap, Pixels, object_pixels, pixel_inputs
 from sdps.models.registry import MODELS
 from sdps.training import recipes
 from sdps.training.stage_factory import create_stage
-from sdps.training.stages import disturbed
-from sdps.training.training_config import JointTraining
+from sdps.training.stages import disturb
 
 
 def unit(*shape: int) -> Tensor:
@@ -34,6 +36,14 @@ def observations(images: int, side: int = 8) -> Observations:
     mask = torch.zeros(1, 1, side, side)
     mask[..., 1:-1, 2:] = 1.0
     return Observations(torch.rand(1, images, 3, side, side), unit(1, images), mask)
+
+
+def aggregated(network: FrameNet, parts: list[Observations]) -> FusedMap:
+    """Return the feature of images that come in parts."""
+    so_far = None
+    for part in parts:
+        so_far = network.accumulate(so_far, part)
+    return network.aggregate(so_far)
 
 
 @pytest.fixture(autouse=True)
@@ -92,13 +102,13 @@ def test_a_frame_has_the_normal_along_z_and_the_view_in_its_xz_plane():
 def test_what_a_pixel_is_told_does_not_change_when_it_turns_about_the_view():
     values, lights, errors = torch.rand(20, 9, 3), unit(20, 9), torch.rand(20, 9)
     turned = rotate_about_view(lights, 1.1)
-    told = []
+    inputs = []
     for directions in (lights, turned):
         first, scale, error = first_normals(values, directions)
         axes = frames(first)
         start = (axes @ first[..., None])[..., 0]
-        told.append(described(Pixels(values, directions, errors), axes, start, scale, error))
-    for one, other in zip(*told, strict=True):
+        inputs.append(pixel_inputs(Pixels(values, directions, errors), axes, start, scale, error))
+    for one, other in zip(*inputs, strict=True):
         torch.testing.assert_close(one, other, atol=2e-3, rtol=1e-3)
 
 
@@ -115,7 +125,7 @@ def test_the_map_turns_with_the_scene(trained, turns):
     seen, symmetry = observations(9), Symmetry(turns, False)
     turned = Observations(symmetry.images(seen.images), symmetry.vectors(seen.directions), symmetry.images(seen.mask))
     with torch.no_grad():
-        for one, other in zip(trained.turned(trained.encode(seen), symmetry), trained.encode(turned), strict=True):
+        for one, other in zip(trained.turn(trained.encode(seen), symmetry), trained.encode(turned), strict=True):
             torch.testing.assert_close(one, other, atol=5e-3, rtol=0)
 
 
@@ -128,14 +138,14 @@ def test_neither_order_nor_chunks_of_images_matter(trained, monkeypatch):
     with torch.no_grad():
         whole = trained(seen)
         torch.testing.assert_close(trained(shuffled), whole, atol=1e-4, rtol=0)
-        chunked = trained.regress(trained.fused([trained.kept(part) for part in parts]))
+        chunked = trained.regress(aggregated(trained, parts))
     torch.testing.assert_close(chunked, whole, atol=0.02, rtol=0)  # images are kept in 16 bits
 
 
 def test_chunks_are_joined_under_bfloat16(trained):
     parts = [observations(count) for count in (4, 5)]
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        found = trained.regress(trained.fused([trained.kept(part) for part in parts]))
+        found = trained.regress(aggregated(trained, parts))
     assert found.dtype == torch.float32 and found.isfinite().all()
 
 
@@ -165,14 +175,14 @@ def test_size_and_options():
 
 def test_light_errors_are_those_of_the_seed_and_grow_with_the_limit():
     lights = Lights(unit(2, 40), torch.rand(2, 40) + 0.5)
-    one, again, none = (disturbed(lights, [3, 4], limit) for limit in (1.0, 1.0, 0.0))
+    one, again, none = (disturb(lights, [3, 4], limit) for limit in (1.0, 1.0, 0.0))
     torch.testing.assert_close(one.directions, again.directions)
     torch.testing.assert_close(none.directions, lights.directions)
     torch.testing.assert_close(none.intensities, lights.intensities)
-    many = [disturbed(lights, [seed, seed + 1], 1.0) for seed in range(0, 200, 2)]
+    many = [disturb(lights, [seed, seed + 1], 1.0) for seed in range(0, 200, 2)]
     angles = torch.stack([(each.directions * lights.directions).sum(-1).clamp(-1, 1).acos() for each in many])
     assert 4.0 < math.degrees(angles.mean()) < 9.0
-    expected = torch.stack([each.expected for each in many])
+    expected = torch.stack([each.expected_error for each in many])
     assert 0.8 < math.degrees(angles.mean()) / expected.mean() < 1.25
     assert all((each.intensities > 0).all() for each in many)
 
@@ -191,32 +201,6 @@ def test_training_lights_err_and_validation_lights_do_not():
     assert scores["direction_mae_drawn"] > 0.1 and scores["normal_mae_drawn"] != scores["normal_mae"]
 
 
-def test_joint_training_draws_no_errors_onto_its_lights():
-    with pytest.raises(InputError, match="light_error must be 0"):
-        JointTraining(light_error=1.0)
-
-
-def test_the_chord_loss_grows_with_the_angle_and_knows_the_mask():
-    truth, mask = torch.zeros(1, 3, 1, 3), torch.tensor([1.0, 1.0, 0.0]).view(1, 1, 1, 3)
-    truth[:, 2] = 1.0
-    turned = truth.clone()
-    turned[0, :, 0, 0] = torch.tensor([math.sin(0.4), 0.0, math.cos(0.4)])
-    turned[..., 2] = -1.0
-    wanted = (math.hypot(2.0 * math.sin(0.2), 0.02) - 0.02) / 2.0
-    assert float(chord_normal_loss(turned, truth, mask)) == pytest.approx(wanted, rel=1e-5)
-    assert float(chord_normal_loss(turned, truth, 0.0 * mask)) == 0.0
-
-
-def test_the_expected_error_is_best_at_the_mean_of_the_errors():
-    truth = unit(1, 8, 8).permute(0, 3, 1, 2)
-    normals = unit(1, 8, 8).permute(0, 3, 1, 2).requires_grad_()
-    mask = torch.ones(1, 1, 8, 8)
-    mean = (normals.detach() - truth).norm(dim=1).mean()
-    losses = [float(expected_error_loss(scale * mean * mask, normals, truth, mask)) for scale in (0.8, 1.0, 1.25)]
-    assert losses[1] < min(losses[0], losses[2])
-    assert not expected_error_loss(mean * mask, normals, truth, mask).requires_grad
-
-
 def _batch():
     from sdps.data.dataset import Batch
 
@@ -225,15 +209,36 @@ def _batch():
                  torch.ones(1, 6), torch.zeros(1, 2, dtype=torch.int64), torch.tensor([5]))  # fmt: skip
 
 
-def test_the_network_knows_which_lights_to_doubt(trained):
+def test_the_errors_of_lights_make_a_difference(trained):
     seen, errors = observations(9), torch.full((1, 9), 8.0)
     with torch.no_grad():
-        exact, told, doubted = (trained(seen._replace(light_errors=each)) for each in (None, torch.zeros(1, 9), errors))
+        exact, zero, doubtful = (
+            trained(seen._replace(light_errors=each)) for each in (None, torch.zeros(1, 9), errors)
+        )
         parts = [
             Observations(seen.images[:, some], seen.directions[:, some], seen.mask, errors[:, some])
             for some in (slice(4), slice(4, 9))
         ]
-        joined = trained.regress(trained.fused(parts))
-    torch.testing.assert_close(exact, told)
-    torch.testing.assert_close(joined, doubted)
-    assert (exact - doubted).abs().max() > 1e-3
+        joined = trained.regress(trained.aggregate(parts))
+    torch.testing.assert_close(exact, zero)
+    torch.testing.assert_close(joined, doubtful)
+    assert (exact - doubtful).abs().max() > 1e-3
+
+
+def test_a_variant_goes_through_its_weights_file(tmp_path: Path) -> None:
+    run = recipes.run("small", {}, {"small": {"base": "frames", "options": {"width": 16, "blocks": 1}}})
+    stage = create_stage("small", run.model, run.config, {})
+    metadata = {"config": {"augmentation": to_plain(Augmentation())}}
+    file = tmp_path / "own.safetensors"
+    save_weights(file, TrainedModel(stage.model, stage.network, stage.options, metadata))
+    loaded, seen = load_weights(file), observations(3)
+    assert loaded.options == {"width": 16, "blocks": 1}
+    assert parameter_count(loaded.network) < MODELS["frames"].parameters
+    with torch.no_grad():
+        torch.testing.assert_close(loaded.network(seen), stage.network.eval()(seen))
+
+
+def test_a_mistaken_option_is_refused() -> None:
+    run = recipes.run("frames", {}, {"frames": {"options": {"bloks": 2}}})
+    with pytest.raises(InputError, match="did you mean 'blocks'"):
+        create_stage("frames", "frames", run.config, {})

@@ -11,7 +11,7 @@ from torch.nn import functional
 from render.shared.errors import InputError
 from sdps.inference.chunked import lighting_prediction
 from sdps.models.blocks import parameter_count
-from sdps.models.lightset import LightSetNet, SetPrediction, described
+from sdps.models.lightset import LightSetNet, SetPrediction, image_inputs
 from sdps.models.registry import MODELS
 
 
@@ -74,10 +74,10 @@ def test_many_images_meet_in_groups_that_share_one_scale(network, monkeypatch):
     with torch.no_grad():
         local = network.encode(images, mask)
         together = network.predict(local, local)
-        for first, second in zip(network.predict_many(local, 0), together, strict=True):
+        for first, second in zip(network.predict_parts([local], 0), together, strict=True):
             torch.testing.assert_close(first, second)  # too few to be parted
         monkeypatch.setattr("sdps.models.lightset._TOGETHER", 3)
-        found, again, other = (network.predict_many(local, seed) for seed in (0, 0, 1))
+        found, again, other = (network.predict_parts([local], seed) for seed in (0, 0, 1))
         order = torch.randperm(7, generator=torch.Generator().manual_seed(0))
         groups = [network.predict(local[:, part], local) for part in order.tensor_split(2)]
     for part, group in zip(order.tensor_split(2), groups, strict=True):
@@ -105,7 +105,7 @@ def test_albedo_does_not_change_the_shading():
     local[:, :, 3] = 1.0
     painted = local.clone()
     painted[:, :, :3] *= torch.rand(1, 1, 1, 64, 64) + 0.5
-    (one, alike), (other, painted_alike) = described(local), described(painted)
+    (one, alike), (other, painted_alike) = image_inputs(local), image_inputs(painted)
     torch.testing.assert_close(one[:, :, 3], other[:, :, 3], atol=0.02, rtol=0.02)  # but for the floor
     torch.testing.assert_close(alike, painted_alike, atol=0.02, rtol=0.02)
 
@@ -114,7 +114,7 @@ def test_images_that_look_alike_are_told_so():
     local = torch.rand(1, 3, 4, 64, 64)
     local[:, :, 3] = 1.0
     local[:, 1, :3] = 0.5 * local[:, 0, :3]
-    _, alike = described(local)
+    _, alike = image_inputs(local)
     assert alike[0, 0, 1].min() > 0.97 and alike[0, 0, 2, 1] < 0.5
 
 
@@ -146,10 +146,10 @@ def test_the_scale_of_intensities_costs_nothing_and_the_ratios_do(network):
     assert math.isclose(other, 0.375 * math.log(2.0), rel_tol=1e-4)
 
 
-def test_expected_errors_are_told_in_degrees(network):
+def test_expected_errors_are_in_degrees(network):
     chord = torch.tensor([[2.0 * math.sin(math.radians(5.0)), 3.0]])
-    lights = network.lights(SetPrediction(torch.zeros(1, 2, 3), torch.ones(1, 2), chord))
-    np.testing.assert_allclose(lights.expected, [[10.0, 180.0]], rtol=1e-5)
+    lights = network.read_lights(SetPrediction(torch.zeros(1, 2, 3), torch.ones(1, 2), chord))
+    np.testing.assert_allclose(lights.expected_error, [[10.0, 180.0]], rtol=1e-5)
 
 
 def test_options_that_build_nothing_are_refused():

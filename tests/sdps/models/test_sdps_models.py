@@ -8,7 +8,6 @@ from sdps.core.losses import faithful_normal_loss, masked_normal_loss
 from sdps.models.base import Lights, Observations
 from sdps.models.blocks import conv, parameter_count
 from sdps.models.lcnet import LCNet, LightingLogits, resize_input
-from sdps.models.lighting_variants import LCNetSecond
 from sdps.models.nenet import NENet
 from sdps.models.registry import COMBINATIONS, MODELS, create
 from sdps.models.upsfcn import UPSFCN
@@ -201,14 +200,3 @@ def test_a_network_sees_only_what_it_declares() -> None:
     assert seen.directions is lights.directions and seen.mask is None
     alone = UPSFCN(use_mask=True).observe(images, mask, None)
     assert alone.images is images and alone.directions is None and alone.mask is mask
-
-
-def test_the_second_pass_sees_the_shading_of_the_first_lights() -> None:
-    normals = torch.zeros(1, 3, 2, 2)
-    normals[:, 2] = 1.0
-    mask = torch.tensor([[[[1.0, 0.0], [1.0, 1.0]]]])
-    directions = torch.tensor([[[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]])
-    context = LCNetSecond.context(normals, mask, directions)
-    assert context.shape == (1, 3, 4, 2, 2)
-    torch.testing.assert_close(context[0, :, 3, 0, 0], torch.tensor([1.0, 0.8, 0.0]))
-    assert float(context[0, :, :, 0, 1].abs().max()) == 0.0  # outside the mask

@@ -10,7 +10,7 @@ from sdps_scenes import write_data
 from torch import nn
 
 from sdps.models.checkpoint import load_weights
-from sdps.training.muon import _COEFFICIENTS, Muon, is_matrix, orthogonalised
+from sdps.training.muon import _COEFFICIENTS, Muon, is_matrix, orthogonalise
 from sdps.training.stages import NormalStage
 from sdps.training.trainer import train
 from sdps.training.training_config import NormalTraining
@@ -19,9 +19,9 @@ from sdps.training.training_config import NormalTraining
 @pytest.mark.parametrize("shape", [(64, 64), (64, 576), (576, 64)])
 def test_updates_are_nearly_orthogonal(shape: tuple[int, int]) -> None:
     matrix = torch.randn(shape, generator=torch.Generator().manual_seed(0))
-    values = torch.linalg.svdvals(orthogonalised(matrix))
+    values = torch.linalg.svdvals(orthogonalise(matrix))
     assert values.max() < 1.3 and values.quantile(0.05) > 0.6  # the smallest of a square one may be far from 1
-    assert (orthogonalised(matrix) * matrix).sum() > 0  # the nearest, not any
+    assert (orthogonalise(matrix) * matrix).sum() > 0  # the nearest, not any
 
 
 @pytest.mark.parametrize("smallest", [1.0, 1e-6])
@@ -35,7 +35,7 @@ def test_gram_matrices_give_what_the_plain_iteration_does(shape: tuple[int, int]
         a, b, c = _COEFFICIENTS
         gram = x @ x.T
         x = a * x + (b * gram + c * gram @ gram) @ x
-    assert (orthogonalised(matrix) - x).norm() < 1e-3 * x.norm()
+    assert (orthogonalise(matrix) - x).norm() < 1e-3 * x.norm()
 
 
 def test_kernels_are_matrices_and_the_rest_is_not() -> None:

@@ -14,12 +14,11 @@ from sdps.data.dataset import Batch
 from sdps.inference.estimator import Estimator
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.registry import MODELS, TRUE_LIGHTS, create
-from sdps.training.recipes import JOINT
 from sdps.training.stage_factory import create_stage
 from sdps.training.stages import Stage
-from sdps.training.training_config import JointTraining, LightingTraining, NormalTraining, PixelTraining
+from sdps.training.training_config import LightingTraining, NormalTraining, PixelTraining
 
-LIGHTING = [name for name, entry in MODELS.items() if entry.role in ("lighting", "second")]
+LIGHTING = [name for name, entry in MODELS.items() if entry.role == "lighting"]
 NORMALS = [name for name, entry in MODELS.items() if entry.role in ("normals", "pixels")]
 
 
@@ -37,7 +36,7 @@ def models() -> dict[str, TrainedModel]:
 def combination(models: dict[str, TrainedModel], name: str, **options: Any) -> Estimator:
     """Return an estimator in which model `name` works, with the others it needs."""
     role = MODELS[name].role
-    places = {"lighting": "lcnet", "normals": "nenet", "second": ""}
+    places = {"lighting": "lcnet", "normals": "nenet"}
     if role == "normals" and not MODELS[name].lights:
         places["lighting"] = ""
     places["normals" if role == "pixels" else role] = name
@@ -65,13 +64,13 @@ class Scene(NamedTuple):
 
 
 def scene_for(name: str, count: int, size: int = 24) -> Scene:
-    """Return a scene whose lights are told to normal models, which spares the time of estimating them."""
+    """Return a scene whose lights are given to normal models, which spares the time of estimating them."""
     normals, mask = sphere_normals(size, radius=0.8)
     rng = np.random.default_rng(0)
     lights, gains = hemisphere_lights(count, rng), rng.uniform(0.5, 1.5, count)
     images = shade(normals, lights) * rng.uniform(0.2, 1.0, (size, size, 3)) * gains[:, None, None, None]
-    told = (lights, gains) if name in NORMALS else (None, None)
-    return Scene(images.astype(np.float32), mask, *told)
+    given = (lights, gains) if name in NORMALS else (None, None)
+    return Scene(images.astype(np.float32), mask, *given)
 
 
 def assert_same(first: Estimate, second: Estimate, order: np.ndarray) -> None:
@@ -103,8 +102,7 @@ def test_any_number_of_images(models: dict[str, TrainedModel], name: str, count:
 
 @pytest.mark.parametrize("index", range(len(NORMALS)))
 def test_any_lighting_model_works_with_any_normal_model(models: dict[str, TrainedModel], index: int) -> None:
-    first = [name for name in LIGHTING if MODELS[name].role == "lighting"]
-    pair = {"lighting": models[first[index % len(first)]], "normals": models[NORMALS[index]]}
+    pair = {"lighting": models[LIGHTING[index % len(LIGHTING)]], "normals": models[NORMALS[index]]}
     estimate = Estimator(**pair, device=torch.device("cpu"), precision="float32", rotations=1).estimate(
         *scene_for("", 2, 12)
     )
@@ -134,17 +132,11 @@ def test_black_and_saturated_images_give_finite_estimates(models: dict[str, Trai
 
 def stage_of(name: str) -> Stage:
     """Return the stage that trains `name`, with true lights where it can do with them."""
-    role = "joint" if name == JOINT else MODELS[name].role
-    if role in ("lighting", "second"):
-        config = LightingTraining()
-    elif role == "joint":
-        config = JointTraining()
-    else:
-        kind = PixelTraining if role == "pixels" else NormalTraining
-        config = kind(lights=TRUE_LIGHTS if MODELS[name].lights else "")
-    needs = {"lighting": "lcnet-soft", "normals": "nenet-plus"} if role in ("second", "joint") else {}
-    # A joint stage trains the networks it is given, so these are not shared with other tests.
-    return create_stage(name, name, config, {use: trained(model) for use, model in needs.items()})
+    role = MODELS[name].role
+    if role == "lighting":
+        return create_stage(name, name, LightingTraining(), {})
+    kind = PixelTraining if role == "pixels" else NormalTraining
+    return create_stage(name, name, kind(lights=TRUE_LIGHTS if MODELS[name].lights else ""), {})
 
 
 def difficult_batch(size: int) -> Batch:
@@ -169,10 +161,10 @@ def difficult_batch(size: int) -> Batch:
     )
 
 
-@pytest.mark.parametrize("name", [*MODELS, JOINT])
+@pytest.mark.parametrize("name", MODELS)
 def test_gradients_are_finite(name: str) -> None:
     stage = stage_of(name)
-    whole = name == JOINT or MODELS[name].role in ("lighting", "second")  # lighting networks work at 128x128 only
+    whole = MODELS[name].role == "lighting"  # these work at 128x128 only
     loss, terms = stage.loss(difficult_batch(128 if whole else 32))
     loss.backward()
     assert all(bool(torch.isfinite(value)) for value in (loss, *terms.values()))

@@ -5,23 +5,19 @@ a plate that faces the camera is 40 degrees off these spheres, a light at the ca
 """
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from sdps_scenes import errors, write_data
 
 from render.shared.config import build
-from render.shared.config import to_plain as plain
-from sdps.data.augment import Augmentation
-from sdps.models.checkpoint import TrainedModel
 from sdps.models.lcnet import EARLY_SIZE, INPUT_SIZE
-from sdps.models.registry import MODELS, create, entry
+from sdps.models.registry import MODELS, entry
 from sdps.training import recipes
 from sdps.training.stage_factory import create_stage
-from sdps.training.stages import LightingStage, Stage, lighting_options
+from sdps.training.stages import LightingStage, Stage
 from sdps.training.trainer import train
-from sdps.training.training_config import JointTraining, LightingTraining
+from sdps.training.training_config import LightingTraining
 
 COMMON = {
     "schedule": "cosine", "warmup": 0.05, "optimiser": "adamw", "workers": 0, "validation_scenes": 0,
@@ -29,23 +25,14 @@ COMMON = {
 }  # fmt: skip
 LIGHTING = {"batch_scenes": 3, "images": 6, "learning_rate": 1e-3, "clip_gradient": 5.0}
 NORMALS = {"batch_scenes": 3, "images": 6, "size": 16, "crop": 0, "learning_rate": 2e-3, "clip_gradient": 1.0}
-STEPS = {"lighting": 300, "second": 300, "normals": 600, "pixels": 900}
+STEPS = {"lighting": 300, "normals": 600, "pixels": 900}
 QUICK = {"nenet": 150}  # in fewer steps; the rest waits for `make test-slow`
 LEARNED = 6.0  # degrees; quick ones reach 1.6 to 2.7
 
 
-def fresh(name: str, **options: Any) -> TrainedModel:
-    """Return a model as if it had been trained, with random weights."""
-    return TrainedModel(
-        name, create(name, **options).eval(), options, {"config": {"augmentation": plain(Augmentation())}}
-    )
-
-
 def stage_of(name: str, role: str) -> Stage:
-    """Return the stage that trains a model on true lights where it is told lights, in few steps."""
-    settings = (
-        COMMON | (LIGHTING if role in ("lighting", "second") else NORMALS) | {"steps": QUICK.get(name, STEPS[role])}
-    )
+    """Return the stage that trains a model on true lights where it is given lights, in few steps."""
+    settings = COMMON | (LIGHTING if role == "lighting" else NORMALS) | {"steps": QUICK.get(name, STEPS[role])}
     if role == "pixels":
         # All lights at every step: with random subsets of them the observation maps of a pixel never repeat.
         settings |= {
@@ -58,8 +45,7 @@ def stage_of(name: str, role: str) -> Stage:
     if role in ("normals", "pixels") and entry(name).lights:
         settings["lights"] = "true"
     run = recipes.run(name, {}, {name: settings})
-    first = {"lighting": fresh("lcnet"), "normals": fresh("nenet")} if role == "second" else {}
-    return create_stage(name, name, run.config, first)
+    return create_stage(name, name, run.config, {})
 
 
 CASES = [
@@ -70,7 +56,7 @@ CASES = [
 @pytest.mark.parametrize(("name", "role"), CASES)
 def test_a_handful_of_scenes_is_learned(name: str, role: str, tmp_path: Path) -> None:
     torch.manual_seed(0)
-    lighting = role in ("lighting", "second")
+    lighting = role == "lighting"
     lights = {"pixels": 24}.get(role, 6)
     write_data(tmp_path, ("train",) * 3, lights=lights, size=128 if lighting else 16)
     stage = stage_of(name, role)
@@ -83,22 +69,6 @@ def test_a_handful_of_scenes_is_learned(name: str, role: str, tmp_path: Path) ->
     else:
         assert before["normal_mae"] > 20.0
         assert after["normal_mae"] < LEARNED, after
-
-
-@pytest.mark.slow
-def test_a_pair_is_learned_together(tmp_path: Path) -> None:
-    write_data(tmp_path, ("train",) * 3, lights=6, size=128)
-    settings = COMMON | {"batch_scenes": 3, "images": 6, "crop": 32, "learning_rate": 1.5e-3, "clip_gradient": 1.0}
-    config = build(JointTraining, settings | {"steps": 1400, "min_object": 0.5})
-    torch.manual_seed(0)
-    options = lighting_options("lcnet", recipes.run("lcnet", {}, {}).config)
-    stage = create_stage(
-        "sdps-joint", recipes.JOINT, config, {"lighting": fresh("lcnet", **options), "normals": fresh("nenet")}
-    )
-    train(stage, tmp_path, tmp_path / "run")
-    after = errors(stage, tmp_path)
-    assert after["direction_mae"] < 4.0, after
-    assert after["normal_mae"] < 6.0, after
 
 
 def overfit_lcnet(folder: Path, steps: int, size: int) -> tuple[dict[str, float], dict[str, float]]:
@@ -118,7 +88,7 @@ def test_lcnet_learns_the_light_directions_of_a_few_scenes(tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_lcnet_learns_the_light_intensities_of_a_few_scenes(tmp_path: Path) -> None:
-    # Intensities are drawn anew on every access, so these are learned rather than remembered, which takes longer.
+    # Intensities are drawn again on every access, so these are learned rather than remembered, which takes longer.
     before, after = overfit_lcnet(tmp_path, 600, INPUT_SIZE)
     assert before["intensity_error"] > 0.25
     assert after["intensity_error"] < 0.15

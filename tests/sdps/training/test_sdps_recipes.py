@@ -10,7 +10,7 @@ from render.shared.errors import InputError
 from sdps.methods import pretrained
 from sdps.models.registry import MODELS
 from sdps.training import recipes
-from sdps.training.training_config import JointTraining, LightingTraining, NormalTraining, PixelTraining
+from sdps.training.training_config import LightingTraining, NormalTraining, PixelTraining
 
 
 def test_published_recipes_are_the_default() -> None:
@@ -31,15 +31,9 @@ def test_sections_lie_over_recipes_and_runs_over_sections() -> None:
 
 
 def test_every_role_has_its_configuration() -> None:
-    kinds = {
-        "lighting": LightingTraining,
-        "second": LightingTraining,
-        "normals": NormalTraining,
-        "pixels": PixelTraining,
-    }
+    kinds = {"lighting": LightingTraining, "normals": NormalTraining, "pixels": PixelTraining}
     for name, item in MODELS.items():
         assert type(recipes.run(name, {}, {}).config) is kinds[item.role]
-    assert type(recipes.run(recipes.JOINT, {}, {}).config) is JointTraining
 
 
 def test_what_a_run_needs() -> None:
@@ -47,7 +41,6 @@ def test_what_a_run_needs() -> None:
     assert recipes.run("psfcn", {}, {}).requires == {}
     assert recipes.run("upsfcn-deep", {}, {}).requires == {}
     assert recipes.run("nenet-reg", {}, {}).requires == {"lighting": "lcnet-reg"}
-    assert recipes.run("lcnet-second", {}, {}).requires == {"lighting": "lcnet-soft", "normals": "nenet-plus"}
     runs = {"nenet-k72": {"base": "nenet", "lights": "lcnet-k72"}, "lcnet-k72": {"base": "lcnet"}}
     assert recipes.run("nenet-k72", {}, runs).requires == {"lighting": "lcnet-k72"}
 
@@ -60,8 +53,9 @@ def test_what_a_run_needs() -> None:
         ({"lighting": {"size": 96}}, {}, "lcnet", "must be 128 for LCNet"),
         ({}, {"nenet": {"crop": 30}}, "nenet", "crop must be"),
         ({}, {"mine": {"base": "lcnt"}}, "mine", "unknown model 'lcnt'"),
-        ({}, {"upsfcn": {"lights": "lcnet"}}, "upsfcn", "is told no lights"),
-        ({}, {"sdps-joint": {"read_out": "centre"}}, "sdps-joint", "read_out must be expectation"),
+        ({}, {"upsfcn": {"lights": "lcnet"}}, "upsfcn", "is not given lights"),
+        ({"normals": {"shading_weight": 0.1}}, {}, "nenet", "unknown key 'normals.shading_weight'"),
+        ({}, {"mine": {"base": "attention"}}, "mine", "unknown model 'attention'"),
     ],
 )
 def test_mistakes_name_the_field(sections: dict, runs: dict, name: str, message: str) -> None:
@@ -71,17 +65,15 @@ def test_mistakes_name_the_field(sections: dict, runs: dict, name: str, message:
 
 
 def test_names_expand_to_runs() -> None:
-    assert recipes.expand(["sdps-second", "nenet"], {}) == ["lcnet-soft", "nenet-plus", "lcnet-second", "nenet"]
-    assert set(recipes.expand(["all"], {"mine": {}})) == {*MODELS, "sdps-joint", "mine"}
+    assert recipes.expand(["sdps-plus", "nenet"], {}) == ["lcnet-soft", "nenet-plus", "nenet"]
+    assert set(recipes.expand(["all"], {"mine": {}})) == {*MODELS, "mine"}
     with pytest.raises(InputError, match="did you mean 'sdps-plus'"):
         recipes.expand(["sdps-pluss"], {})
 
 
 def test_runs_are_trained_after_what_they_need() -> None:
     preset = presets.load("smoke")
-    assert in_order(preset, ["nenet-reg", "lcnet-second"]) == [
-        "lcnet-reg", "nenet-reg", "lcnet-soft", "nenet-plus", "lcnet-second",
-    ]  # fmt: skip
+    assert in_order(preset, ["nenet-reg", "nenet-plus"]) == ["lcnet-reg", "nenet-reg", "lcnet-soft", "nenet-plus"]
     with pytest.raises(InputError, match="needs itself"):
         in_order(presets.load("smoke", ["runs.a={base: nenet, lights: a}"]), ["a"])
 
@@ -94,3 +86,12 @@ def test_weights_that_are_there_need_no_run(tmp_path: Path) -> None:
     gone = tmp_path / "gone.safetensors"
     with pytest.raises(InputError, match=r"gone.safetensors: no such weights"):
         in_order(presets.load("smoke", [f"runs.further={{base: nenet, start: {gone}}}"]), ["further"])
+
+
+def test_presets_saved_by_an_earlier_version_load_without_what_was_removed(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("name: x\ndescription: x\njoint: {}\n")
+    assert presets.load(str(file)).name == "x"
+    file.write_text("name: x\ndescription: x\njoint: {steps: 3}\n")
+    with pytest.raises(InputError, match=r"config.yaml: joint: .* was removed; delete the section"):
+        presets.load(str(file))

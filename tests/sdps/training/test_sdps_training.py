@@ -24,11 +24,10 @@ from sdps.data.dataset import SampleKey, SceneDataset, collate
 from sdps.models.checkpoint import TrainedModel, load_state, load_weights, save_state, save_weights
 from sdps.models.registry import MODELS, create
 from sdps.training import recipes, trainer
-from sdps.training.joint import JointStage
 from sdps.training.stage_factory import create_stage
 from sdps.training.stages import LightingStage, NormalStage
 from sdps.training.trainer import CHECKPOINT, METRICS, TrainingResult, train
-from sdps.training.training_config import JointTraining, LightingTraining, NormalTraining
+from sdps.training.training_config import LightingTraining, NormalTraining
 
 TIMES = {"seconds", "images_per_second", "waiting_share"}
 QUICK = NormalTraining(
@@ -248,22 +247,6 @@ def test_weights_that_are_kept_may_hold_a_share_of_the_start(folder: Path, tmp_p
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
 
 
-def test_fine_tuning_together_reaches_the_lighting_network_through_the_lights(folder: Path, tmp_path: Path) -> None:
-    def model(name: str) -> TrainedModel:
-        return TrainedModel(name, create(name), {}, {"config": {"augmentation": {}}, "data": "d", "step": 1})
-
-    config = JointTraining(
-        steps=2, batch_scenes=2, images=2, size=32, crop=16, workers=0, validation_scenes=1, lighting_weight=0.0
-    )
-    stage = JointStage(config, model("lcnet"), model("nenet"))
-    before = {name: tensor.clone() for name, tensor in stage.network.state_dict().items()}
-    result = train(stage, folder, tmp_path)
-    changed = {name for name, tensor in stage.network.state_dict().items() if not torch.equal(tensor, before[name])}
-    assert {"lighting.azimuth.1.weight", "lighting.intensity.1.weight", "normals.normal.weight"} <= changed
-    assert sorted(result.weights) == ["lcnet-joint", "nenet-joint"]
-    assert load_weights(result.weights["lcnet-joint"], "lighting").name == "lcnet"
-
-
 @pytest.mark.slow
 def test_compiled_networks_take_the_same_steps(folder: Path, tmp_path: Path) -> None:
     if shutil.which("g++") is None:
@@ -286,8 +269,7 @@ def test_a_stage_is_made_for_every_model(folder: Path) -> None:
             for use, run in needed.items()
         }
         stage = create_stage(name, name, recipes.run(name, {}, {}).config, trained)
-        assert stage.goal == ("direction_mae" if item.role in ("lighting", "second") else "normal_mae")
-        assert len(stage.parts(stage.network)) == 1
+        assert stage.goal == ("direction_mae" if item.role == "lighting" else "normal_mae")
 
 
 def test_loss_that_is_not_finite_ends_the_run(folder: Path, tmp_path: Path) -> None:
@@ -320,7 +302,7 @@ def test_stage_two_leaves_the_lighting_network_as_it_is(folder: Path, tmp_path: 
     stage = NormalStage(replace(QUICK, steps=2, lights="lcnet"), lighting)
     result = train(stage, folder, tmp_path)
     assert all(torch.equal(tensor, before[name]) for name, tensor in lighting.network.state_dict().items())
-    assert load_weights(result.weights["nenet"], "normals").metadata["lighting"]["data"] == "d"
+    assert load_weights(result.weights["nenet"]).metadata["lighting"]["data"] == "d"
     # NENet is given class centres, not the true lights.
     dataset = SceneDataset(folder, "train", stage.sample_options())
     lights = stage.lights(collate([dataset.sample(SampleKey(0, 0, 0))]))
@@ -358,7 +340,7 @@ def test_validation_may_see_more_images_than_training(folder: Path, tmp_path: Pa
 
 
 def test_weights_carry_their_origin(uninterrupted: tuple) -> None:
-    model = load_weights(uninterrupted[1].weights["nenet"], "normals")
+    model = load_weights(uninterrupted[1].weights["nenet"])
     assert model.metadata["step"] == 8
     assert len(model.metadata["data"]) == 64
     assert build(NormalTraining, model.metadata["config"]) == QUICK
@@ -370,7 +352,7 @@ def test_half_precision_weights_load_as_float32(tmp_path: Path) -> None:
     save_weights(tmp_path / "whole.safetensors", model)
     save_weights(tmp_path / "half.safetensors", model, half=True)
     assert (tmp_path / "half.safetensors").stat().st_size < 0.51 * (tmp_path / "whole.safetensors").stat().st_size
-    loaded = load_weights(tmp_path / "half.safetensors", "normals").network
+    loaded = load_weights(tmp_path / "half.safetensors").network
     for name, tensor in loaded.state_dict().items():
         assert tensor.dtype == torch.float32
         torch.testing.assert_close(tensor, model.network.state_dict()[name], atol=1e-3, rtol=1e-3)
@@ -401,13 +383,12 @@ def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path
     save_weights(headless, TrainedModel("nenet", create("nenet"), {}, {}))
     save_weights(foreign, TrainedModel("nenet2", create("nenet"), {}, {"config": {"augmentation": {}}}))
     cases = [
-        (weights, "lighting", "holds 'nenet', a model for 'normals'"),
-        (cut, "normals", "damaged or not a safetensors"),
-        (text, "normals", "damaged or not a safetensors"),
-        (tmp_path / "none.safetensors", "normals", "no such weights"),
-        (misfit, "lighting", "do not fit"),
-        (headless, "normals", "damaged header"),
-        (foreign, "normals", "a model this version does not know"),
+        (cut, "damaged or not a safetensors"),
+        (text, "damaged or not a safetensors"),
+        (tmp_path / "none.safetensors", "no such weights"),
+        (misfit, "do not fit"),
+        (headless, "damaged header"),
+        (foreign, "a model this version does not know"),
     ]
     for number, (options, message) in enumerate((
         ("abc", "damaged header"), ({"direction_classes": 10**12}, "do not fit"), ({"use_mask": {}}, "damaged header"),
@@ -415,10 +396,10 @@ def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path
     )):  # fmt: skip
         odd = tmp_path / f"odd{number}.safetensors"
         save_weights(odd, TrainedModel("lcnet", create("lcnet"), options, {"config": {"augmentation": {}}}))
-        cases.append((odd, "lighting", message))
-    for path, role, message in cases:
+        cases.append((odd, message))
+    for path, message in cases:
         with pytest.raises(InputError, match=message) as error:
-            load_weights(path, role)
+            load_weights(path)
         assert "\n" not in str(error.value)
 
 
@@ -457,7 +438,7 @@ def test_configuration_is_checked(values: dict, message: str) -> None:
         build(LightingTraining, values, "training")
 
 
-def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
+def test_a_run_takes_start_and_lights_of_others(tmp_path: Path) -> None:
     settings = {"runs": {"psfcn-late": {"base": "psfcn", "start": "nenet", "steps": 1}}}
     run = recipes.run("psfcn-late", {}, settings["runs"])
     assert run.requires == {"start": "nenet"}
@@ -468,3 +449,6 @@ def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
     other = TrainedModel("upsfcn", create("upsfcn"), {}, {"config": {"augmentation": {}}})
     with pytest.raises(InputError, match=r"runs.psfcn-late.start: 'upsfcn' has another network"):
         create_stage("psfcn-late", run.model, run.config, {"start": other})
+    run = recipes.run("nenet", {}, {"nenet": {"lights": "shipped:psfcn"}})
+    with pytest.raises(InputError, match=r"runs.nenet.lights: 'upsfcn' finds no lights; name a lighting model"):
+        create_stage("nenet", "nenet", run.config, {"lighting": other})

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from sdps_scenes import hemisphere_lights
 
+import sdps
 from pipelines.evaluate import eval_merltest, evaluation
 from pipelines.evaluate.evaluation import Evaluation, TestObject
 from pipelines.shared import presets
@@ -18,7 +19,7 @@ from sdps.core.baselines import constant_estimate
 from sdps.core.estimate import Estimate
 from sdps.core.precision import arithmetic
 from sdps.data.augment import Augmentation
-from sdps.inference.estimator import Estimator, load_estimator
+from sdps.inference.estimator import Estimator
 from sdps.inference.inference_config import InferenceConfig, inference_config
 from sdps.methods import pretrained, rows
 from sdps.methods.method import Method
@@ -97,11 +98,10 @@ def test_expressions(runs: Path, text: str, lights: str, normals: str, name: str
     ("text", "message"),
     [
         ("true", "say which normals"),
-        ("a+b+c+d", r"want METHOD, LIGHTS\+NORMALS"),
+        ("lcnet+lcnet-second+nenet", r"want METHOD or LIGHTS\+NORMALS"),
         ("lcnet++psfcn", r"want METHOD"),
         ("lcnet+pf14", "pf14 finds the lights itself; leave out --lights"),
-        ("lcnet+lcnet-second+nenet", "lcnet-second.*no such weights"),
-        ("lcnet-second", "needs LIGHTS.lcnet-second.NORMALS"),
+        ("lcnet-second", "unknown model or method 'lcnet-second'"),
     ],
 )
 def test_expressions_that_do_not_fit(runs: Path, text: str, message: str) -> None:
@@ -111,26 +111,24 @@ def test_expressions_that_do_not_fit(runs: Path, text: str, message: str) -> Non
 
 def test_flags_that_a_classical_method_would_not_look_at(runs: Path) -> None:
     find = finder(runs)
-    with pytest.raises(InputError, match="least-squares is told the lights; give --lights"):
-        combine(None, "least-squares", None, None, find)
-    for flags in (("lcnet", None, None), (None, None, "true")):
-        with pytest.raises(InputError, match="leave out --lights, --second and --intensities"):
-            combine(flags[0], "pf14", flags[1], flags[2], find)
+    with pytest.raises(InputError, match="least-squares needs lights; give --lights"):
+        combine(None, "least-squares", None, find)
+    for lights, intensities in (("lcnet", None), (None, "true")):
+        with pytest.raises(InputError, match="leave out --lights and --intensities"):
+            combine(lights, "pf14", intensities, find)
     for name, counts in (
         ("sdps-frames", (8, 8)),
         ("sdps-plus", (8, 4)),
         ("shipped:sdps-plus", (8, 4)),
         ("sdps", (None, None)),
     ):
-        method = combine(None, name, None, None, lambda name: Path(name))
+        method = combine(None, name, None, lambda name: Path(name))
         assert (method.light_views, method.normal_views) == counts
-    assert combine("lcnet-soft", "nenet-plus", None, None, lambda name: Path(name)).light_views is None
-    given = combine("true", "sdps-second", None, None, lambda name: Path(name))
-    assert given.second == ""  # of lights that are given nothing is left to correct
+    assert combine("lcnet-soft", "nenet-plus", None, lambda name: Path(name)).light_views is None
 
 
 def test_a_combination_has_one_label_however_it_is_asked_for() -> None:
-    asked = combine(None, "shipped:sdps-plus", None, None, lambda name: Path(name))
+    asked = combine(None, "shipped:sdps-plus", None, lambda name: Path(name))
     of_views = [rows.as_shipped(row) for row in rows._every_row() if row.light_views]
     assert asked in of_views and asked.name == "sdps-plus (lcnet-soft + nenet-plus) (shipped)"
     assert len(of_views) == len({row.name for row in of_views}) == 2  # sdps-frames, too
@@ -157,7 +155,7 @@ def test_lights_that_methods_share_are_estimated_once(
 ) -> None:
     item, find = hills(), finder(runs)
     named = [parse(text, find) for text in ("lcnet", "lcnet+nenet", "lcnet+psfcn", "lcnet+least-squares", "true+nenet")]
-    named += [replace(named[1], name="two views", light_views=2), combine("lcnet", "nenet", None, "true", find)]
+    named += [replace(named[1], name="two views", light_views=2), combine("lcnet", "nenet", "true", find)]
     runners = [Runner(method, find, InferenceConfig()) for method in named]
     alone = [Evaluation(tmp_path / "alone").results(item, [runner])[0] for runner in runners]
     asked = []
@@ -274,13 +272,9 @@ def test_the_page_shows_the_pair_trained_here_and_the_best_shipped_way(runs: Pat
     assert eval_merltest.shown(given) == ["psfcn, true lights", least_squares]
 
 
-def test_the_documented_call_uses_networks_as_every_command_does(runs: Path) -> None:
-    files = {
-        place: pretrained.trained_file(runs, name) for place, name in (("lighting", "lcnet"), ("normals", "nenet"))
-    }
-    assert load_estimator(**files).options() == InferenceConfig().options()
+def test_python_uses_networks_as_every_command_does(runs: Path) -> None:
     item, find = hills(), finder(runs)
-    one = load_estimator(**files).estimate(item.load(), item.mask)
+    one = sdps.estimate(item.load(), item.mask, "lcnet+nenet", models=runs)
     other = Runner(parse("sdps", find), find).estimate(item.load(), item.mask, None, None)
     np.testing.assert_array_equal(one.normals, other.normals)
     np.testing.assert_array_equal(one.light_directions, other.light_directions)
