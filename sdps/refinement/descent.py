@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from render.shared.errors import InputError
 from sdps.refinement.fused import data_term
 from sdps.refinement.image_model import DATA_FLOOR, Factors, State, factors
-from sdps.refinement.modes import factor, fitted
+from sdps.refinement.modes import evaluate_modes, fitted
 from sdps.refinement.priors import Neighbours, anchor, curl, neighbours, roughness
 
 RATES = {
@@ -96,7 +96,7 @@ class Problem(NamedTuple):
         """Return the images as the term of `fused` takes them: without the light that bounced, over G."""
         if self.ready:
             return self.images
-        bent = factor(made.normals.detach(), made.directions.detach(), state.modes)
+        bent = evaluate_modes(made.normals.detach(), made.directions.detach(), state.modes)
         return self.direct(made, float(state.whiteness)) / bent[:, None]
 
 

@@ -16,7 +16,7 @@ from sdps.inference.image_source import ObjectImages
 from sdps.inference.tiles import Tile
 from sdps.refinement.descent import Problem
 from sdps.refinement.image_model import State, difference, factors
-from sdps.refinement.modes import factor
+from sdps.refinement.modes import evaluate_modes
 from sdps.refinement.problems import log_albedo, parts_of, problem_of
 from sdps.refinement.refined import Refined
 
@@ -46,7 +46,7 @@ def finer(
             problem.images[:, :, number].sub_(up(share[:, :, number].numpy())).clamp_min_(0.0)
             lit = up(coarse.kept[:, number : number + 1].numpy())[:, 0] > 0.5
             problem.kept[:, number].mul_(lit)
-        problem.images[:, :, number].div_(factor(normals, made.directions[number : number + 1], state.modes))
+        problem.images[:, :, number].div_(evaluate_modes(normals, made.directions[number : number + 1], state.modes))
     problem = problem._replace(ready=True)
     state = state._replace(normals=normals, log_strength=up(state.log_strength.numpy()[:, None])[:, 0])
     return problem, state._replace(log_albedo=log_albedo(problem, state))

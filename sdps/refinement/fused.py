@@ -1,6 +1,6 @@
 """The data term and its gradient, fused: one pass over pixels and images, compiled by numba.
 
-`sdps.refinement.image_model.difference` is the same term written down plainly in torch; the tests hold both together.
+The tests compare it with `image_model.difference`, which takes the reflectance from `reflectance`.
 """
 
 import os
@@ -15,15 +15,13 @@ from torch import Tensor
 
 from sdps.refinement.image_model import (
     DATA_FLOOR,
-    LEAST_COSINE,
-    LOBES,
     ROBUST,
     SHADE_FLOOR,
     SHADOW_EXCESS,
     SHADOW_WEIGHT,
-    SHAPES,
     Factors,
 )  # fmt: skip
+from sdps.refinement.reflectance import LEAST_COSINE, LOBES, SHAPES
 
 # Threads that wait shall sleep: spinning, two of them took up to thirty times as long beside other busy processes.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

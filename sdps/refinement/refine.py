@@ -20,9 +20,9 @@ from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.inference.tiles import Tile, give_back, tiles
 from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.fine import finer, pictures
-from sdps.refinement.image_model import LOBES, SHAPES, State, factors
-from sdps.refinement.modes import MODES
+from sdps.refinement.image_model import State, factors
 from sdps.refinement.problems import gathered, log_albedo, on_grid, problem_of
+from sdps.refinement.reflectance import LOBES, MODES, SHAPES
 from sdps.refinement.refined import Refined
 from sdps.refinement.transport import trace
 

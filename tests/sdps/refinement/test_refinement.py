@@ -13,10 +13,10 @@ from sdps.methods import pretrained
 from sdps.methods.parse import parse
 from sdps.methods.runner import Runner
 from sdps.refinement.fused import data_term
-from sdps.refinement.image_model import LOBES, State, difference, factors
-from sdps.refinement.modes import MODES
+from sdps.refinement.image_model import State, difference, factors
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.refined import Refined
+from sdps.refinement.reflectance import LOBES, MODES
 
 QUICK = RefineConfig(coarse_pixels=700, iterations=600, bounces=0, fine_iterations=0)  # nothing here shades itself
 
