@@ -7,7 +7,7 @@ Pixel p, image i, channel c; f without G is rho D + S of `reflectance`:
     r_pic = w_pic sqrt((q_pic - y_pic)^2 / (sigma_pic^2 + 0.05) + 1e-4)                 robust difference
     sigma_pic = (rho_pc D_pi + S_pi) max(n_p . l_i, 0.05)                               constant in the gradient
 
-with I divided by its mean over the object, after light that other parts of it throw there is taken off, and e by its
+with I divided by its mean over the object, after light that bounced off other parts of it is subtracted, and e by its
 own mean. G is constant in the gradient; functions here take I / G. w is 0 where a pixel is black although it is lit
 elsewhere (`find_shadows`) or a cast shadow was traced (`transport`), 0.15 where it is darker than the model explains
 by half of sigma (perhaps another shadow), else 1.
@@ -38,11 +38,11 @@ class State(NamedTuple):
         log_albedo: (P, 3) logarithm of rho.
         log_strength: (P,) logarithm of s.
         body: (4,) b.
-        lobes: (K,) a_k before softplus.
+        lobes: (K,) a before softplus.
         log_sharpness: (K,) logarithm of kappa.
         directions: (L, 3) from the surface to the light, towards unit length.
         log_intensities: (L, 3).
-        whiteness: () albedo of the brightest parts, which tells how much light they throw on others.
+        whiteness: () albedo of the brightest parts, which decides how much light bounces.
         modes: (M,) m of `sdps.refinement.reflectance`.
     """
 
@@ -58,8 +58,8 @@ class State(NamedTuple):
     modes: Tensor
 
 
-class Factors(NamedTuple):
-    """The state as the model multiplies it.
+class Model(NamedTuple):
+    """The state as the equations use it.
 
     Attributes:
         normals: (P, 3) unit.
@@ -84,11 +84,11 @@ class Factors(NamedTuple):
     log_intensities: Tensor
 
 
-def factors(state: State) -> Factors:
-    """Return what the model multiplies; differentiable."""
+def build_model(state: State) -> Model:
+    """Return the state as the equations use it; differentiable."""
     normals, directions = normalize(state.normals, dim=-1), normalize(state.directions, dim=-1)
     logs = state.log_intensities
-    return Factors(
+    return Model(
         normals=normals,
         albedo=state.log_albedo.exp(),
         strength=state.log_strength.exp(),
@@ -101,7 +101,7 @@ def factors(state: State) -> Factors:
     )
 
 
-def shadowed(radiance: Tensor) -> Tensor:  # (P, L) bool
+def find_shadows(radiance: Tensor) -> Tensor:  # (P, L) bool
     """Return where a pixel is black: below a tenth of the mean of its darkest 90 % of images.
 
     Args:
@@ -113,24 +113,24 @@ def shadowed(radiance: Tensor) -> Tensor:  # (P, L) bool
     return grey < _BLACK * darker
 
 
-def difference(made: Factors, images: Tensor, dark: Tensor) -> Tensor:  # (P, 3, L)
+def measure_differences(model: Model, images: Tensor, dark: Tensor) -> Tensor:  # (P, 3, L)
     """Return r of the module's text, whose mean is `fused.data_term`; differentiable.
 
     Args:
-        made: The model.
+        model: The model.
         images: (P, 3, L), I / G.
-        dark: (P, L) bool, observations that count for nothing.
+        dark: (P, L) bool, observations that are ignored.
     """
-    cosine = made.normals @ made.directions.T  # (P, L)
-    reflected = reflect_without_modes(made)
-    observed = images / made.log_intensities.exp().T  # (P, 3, L)
+    cosine = model.normals @ model.directions.T  # (P, L)
+    reflected = reflect_without_modes(model)
+    observed = images / model.log_intensities.exp().T  # (P, 3, L)
     sigma = (reflected * cosine.clamp_min(SHADE_FLOOR)[:, None]).detach()
     gap = reflected * cosine.clamp_min(0.0)[:, None] - observed
     weight = torch.where(gap > SHADOW_EXCESS * sigma, SHADOW_WEIGHT, 1.0) * ~dark[:, None]
     return weight * (gap**2 / (sigma**2 + DATA_FLOOR) + ROBUST).sqrt()
 
 
-def reflect_without_modes(made: Factors) -> Tensor:  # (P, 3, L)
+def reflect_without_modes(model: Model) -> Tensor:  # (P, 3, L)
     """Return rho D + S."""
-    angles = measure_angles(made.normals, made.directions)
-    return reflect(angles, made.albedo, made.strength, made.body, made.amplitudes, made.sharpness)
+    angles = measure_angles(model.normals, model.directions)
+    return reflect(angles, model.albedo, model.strength, model.body, model.amplitudes, model.sharpness)

@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from render.shared.config import read_yaml
-from sdps.refinement.image_model import Factors, reflect_without_modes
+from sdps.refinement.image_model import Model, reflect_without_modes
 from sdps.refinement.reflectance import MODES, MOST_LOG_FACTOR, evaluate_factor, measure_angles, mode_terms
 
 _OBSERVATIONS = 100.0
-"""Observations all of an object's count as: what neighbouring pixels and lights differ by is the same error again."""
+"""What all observations of an object count as together: errors of neighbouring pixels and lights correlate."""
 _SPREAD = 0.04
-"""Of the logarithms, beside G."""
+"""Standard deviation of the logarithms, apart from G."""
 _LEAST_RADIANCE, _LEAST_LIT = 0.02, 0.1
 _LEAST_MOMENT = 1e-6
 _PART = 4096
@@ -28,34 +28,34 @@ ASSET = Path(str(resources.files("assets"))) / "reflectance_modes.yaml"
 
 
 def evaluate_modes(normals: Tensor, directions: Tensor, modes: Tensor) -> Tensor:  # (P, L)
-    """Return G of normals (P, 3) and lights (L, 3), both unit, a part of the pixels at a time."""
+    """Return G of normals (P, 3) and lights (L, 3), both unit, some pixels at a time."""
     return torch.cat([evaluate_factor(measure_angles(part, directions), modes) for part in normals.split(_PART)])
 
 
-def fitted(made: Factors, images: Tensor, kept: Tensor) -> Tensor:  # (MODES,)
+def fit_modes(model: Model, images: Tensor, usable: Tensor) -> Tensor:  # (MODES,)
     """Return m.
 
     Args:
-        made: The model.
-        images: (P, 3, L), without light that bounced.
-        kept: (P, L), 0 for observations that count for nothing.
+        model: The model.
+        images: (P, 3, L), without bounced light.
+        usable: (P, L), 0 for observations that are ignored.
     """
-    left, weights = left_over(made, images, kept)
-    terms = mode_terms(measure_angles(made.normals, made.directions))
+    left, weights = compare_logs(model, images, usable)
+    terms = mode_terms(measure_angles(model.normals, model.directions))
     shapes = torch.stack([torch.ones_like(left), *terms], dim=-1).flatten(0, 1)  # (P L, 1 + MODES)
     weighted = shapes.T * (weights.flatten() * (_OBSERVATIONS / _SPREAD**2))
     normal = (weighted @ shapes).double() + _precision()
     return torch.linalg.solve(normal, (weighted @ left.flatten()).double())[1:].float()
 
 
-def left_over(made: Factors, images: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
+def compare_logs(model: Model, images: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
     """Return the logarithm of observed over predicted radiance (P, L), and its weights, which add up to 1."""
-    cosine = made.normals @ made.directions.T  # (P, L)
-    predicted = (reflect_without_modes(made) * cosine.clamp_min(0.0)[:, None]).mean(dim=1)
-    observed = (images * torch.exp(-made.log_intensities).T).mean(dim=1)
-    left = torch.log((observed + _LEAST_RADIANCE) / (predicted + _LEAST_RADIANCE)).clamp(-MOST_LOG_FACTOR, MOST_LOG_FACTOR)
-    weights = cosine * ((cosine > _LEAST_LIT) & (kept > 0.0) & (predicted > _LEAST_RADIANCE))
-    return left, weights / weights.sum().clamp_min(1e-9)
+    cosine = model.normals @ model.directions.T  # (P, L)
+    predicted = (reflect_without_modes(model) * cosine.clamp_min(0.0)[:, None]).mean(dim=1)
+    observed = (images * torch.exp(-model.log_intensities).T).mean(dim=1)
+    left = torch.log((observed + _LEAST_RADIANCE) / (predicted + _LEAST_RADIANCE))
+    weights = cosine * ((cosine > _LEAST_LIT) & (usable > 0.0) & (predicted > _LEAST_RADIANCE))
+    return left.clamp(-MOST_LOG_FACTOR, MOST_LOG_FACTOR), weights / weights.sum().clamp_min(1e-9)
 
 
 @cache

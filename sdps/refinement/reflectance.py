@@ -61,7 +61,7 @@ SHAPES, MODES = (len(terms(Angles(0.0, 0.0, 0.0, 0.0, 0.0))) for terms in (body_
 
 
 def measure_angles(normals: Array, directions: Array) -> Angles:
-    """Return the angles between normals (P, 3) and lights (L, 3), both unit; y is (P, 1), l . v (L,), the rest (P, L)."""
+    """Return the angles of unit normals (P, 3) and lights (L, 3); y is (P, 1), l . v (L,), the others (P, L)."""
     xp = _library(normals)
     tilt = xp.clip(1.0 - normals @ half_vectors(directions).T, 0.0, None)
     return combine_cosines(normals @ directions.T, normals[:, 2:], directions[:, 2], tilt)
@@ -129,7 +129,7 @@ def shade(
     normals: Array, directions: Array, albedo: Array, strength: Array, *, body: Array, amplitudes: Array,
     sharpness: Array, modes: Array,
 ) -> Array:  # (P, 3, L)  # fmt: skip
-    """Return the radiance of pixels with normals (P, 3) under lights (L, 3) of intensity 1; the rest as of `reflect`."""
+    """Return the radiance of unit normals (P, 3) under lights (L, 3) of intensity 1; the rest is as in `reflect`."""
     angles = measure_angles(normals, directions)
     reflected = reflect(angles, albedo, strength, body, amplitudes, sharpness)
     lit = _library(normals).clip(normals @ directions.T, 0.0, None) * evaluate_factor(angles, modes)

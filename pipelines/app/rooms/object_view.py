@@ -29,9 +29,8 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
     """Write pictures, a mesh and arrays of an inference, and return what the page has to know of them.
 
     `basis.bin` holds little-endian int16 normals (h, w, 3), n * 32767, uint16 albedo (h, w, 3) and highlight strength
-    (h, w), each over its largest value in the description; `tables.bin` of a refined object what
-    `reflectance_tables.build_tables` returns; `observed.npy` (h, w, L) float16 the grey photographs and `model.npy` what
-    explains them.
+    (h, w), each over its largest value in the description; `tables.bin`, of a refined object, what `build_tables`
+    returns; `observed.npy` (h, w, L) float16 the grey photographs and `model.npy` what explains them.
     """
     mask, normals = result.photos.mask, result.normals
     step = -(-max(mask.shape) // SIDE)

@@ -61,10 +61,10 @@ def test_the_tables_interpolate_to_what_they_were_evaluated_from(lobes: dict) ->
     glossy = grid(values[size:], about["glossy"], [(0, 1), (0, 1)])
     normals, albedo, strength = ball()
     for light in LIGHTS:
-        l, v = (np.maximum(part, about["least"]) for part in (normals @ light, normals[..., 2]))
-        most = np.maximum(l, v)
-        balance = (l - v) / np.maximum(most - about["least"], 1e-12)
-        azimuth = (light[2] - l * v) / np.sqrt(np.maximum((1 - l**2) * (1 - v**2), 1e-12))
+        lit, seen = (np.maximum(part, about["least"]) for part in (normals @ light, normals[..., 2]))
+        most = np.maximum(lit, seen)
+        balance = (lit - seen) / np.maximum(most - about["least"], 1e-12)
+        azimuth = (light[2] - lit * seen) / np.sqrt(np.maximum((1 - lit**2) * (1 - seen**2), 1e-12))
         tilt = np.sqrt(np.maximum(1 - (normals @ light + normals[..., 2]) / np.sqrt(2 + 2 * light[2]), 0))
         body, bent = matte(np.stack([azimuth.clip(-1, 1), balance, np.arccosh(1 / most)], axis=-1)).T
         shine, tilted = glossy(np.stack([np.full_like(tilt, light[2]), tilt.clip(0, 1)], axis=-1)).T
