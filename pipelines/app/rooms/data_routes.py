@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from pipelines.app.rooms.handling import file_inside, queued
+from pipelines.app.rooms.handling import file_inside, make_tab_folder, queued, tab_folder
 from pipelines.app.work.jobs import finite
 from pipelines.report.sections import FOLDER as REPORT
 from pipelines.report.sections import read_sections
@@ -26,7 +26,7 @@ from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import read_whole_lines
 
-_PLACE = "shard"
+_ROOM = "data"
 _DEEP, _MOST = 4, 300
 _SIDE = 96
 _POINTS = 400  # of a learning curve
@@ -146,15 +146,14 @@ async def start(request: Request) -> Response:
     """Queue the preparation of a scene for the lamp."""
     folder = _folder(request)
     chosen = await asyncio.to_thread(_chosen, folder, request.query_params.get("id"))
-    place = request.state.session.folder / _PLACE
-    place.mkdir(exist_ok=True)
+    place = make_tab_folder(request, _ROOM)
     return queued(request, "shard", place=str(place), shard=str(folder / chosen.file))
 
 
 async def file(request: Request) -> Response:
     """Send what was made of the scene under the lamp."""
     name = request.path_params["name"]
-    path = request.state.session.folder / _PLACE / name
+    path = tab_folder(request, _ROOM) / name
     if name not in ("basis.bin", "truth.bin") or not path.is_file():
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path)

@@ -1,8 +1,10 @@
-"""What the request handlers of all rooms share: uploads, queueing a job, files below a folder, numbers in a path."""
+"""What the request handlers of all rooms share: uploads, jobs, a tab's own folder, files below a folder, numbers."""
 
 import asyncio
 import functools
+import os
 import re
+import shutil
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +17,8 @@ from pipelines.app.work.refusals import Refused
 from render.shared.errors import InputError
 
 _NUMBER = re.compile(r"[0-9]{1,9}")
+_TAB = re.compile(r"[0-9a-f]{0,16}")
+_MOST_TABS = 8
 _MOST_LEFT = 2**30
 _PATIENCE = 60.0
 Handler = Callable[[Request], Awaitable[Response]]
@@ -57,6 +61,30 @@ def queued(request: Request, task: str, **arguments: Any) -> Response:
     if job is None:
         raise Refused("too many jobs wait; try again in a minute", 503)
     return JSONResponse(jobs.describe(job))
+
+
+def tab_folder(request: Request, room: str) -> Path:
+    """Return a room's folder of the tab that asks, which may not exist yet: two tabs must not share a scene.
+
+    Raises:
+        InputError: the name that the tab gives itself is not one.
+    """
+    tab = request.query_params.get("tab", "")
+    if not _TAB.fullmatch(tab):
+        raise InputError("tab: must be at most 16 hexadecimal digits")
+    return request.state.session.folder / f"{room}-{tab}"
+
+
+def make_tab_folder(request: Request, room: str) -> Path:
+    """Return `tab_folder`, made where it does not exist; of too many tabs, those idle for longest lose theirs."""
+    folder = tab_folder(request, room)
+    folder.mkdir(exist_ok=True)
+    os.utime(folder)
+    others = sorted(folder.parent.glob(f"{room}-*"), key=lambda path: path.stat().st_mtime)
+    for old in others[:-_MOST_TABS]:
+        if not request.app.state.jobs.works_in(old):
+            shutil.rmtree(old, ignore_errors=True)
+    return folder
 
 
 def file_inside(folder: Path, name: str) -> Path | None:

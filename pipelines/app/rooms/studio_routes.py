@@ -7,7 +7,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from pipelines.app.rooms.handling import queued, taking_uploads
+from pipelines.app.rooms.handling import make_tab_folder, queued, tab_folder, taking_uploads
 from pipelines.app.work import uploads
 from pipelines.app.work.archives import unpack
 from pipelines.app.work.incoming import Incoming, incoming, off_loop, receive
@@ -17,7 +17,7 @@ from render.shared.errors import unknown
 
 UPLOADS = "uploads"
 MESHES, MATERIALS = (".ply", ".obj", ".stl", ".off", ".glb"), (".yaml", ".yml", ".binary", ".bsdf", ".zip")
-_PLACE = "studio"
+_ROOM = "studio"
 _ASKED = ("shape", "material", "yaw", "pitch", "roll", "bounces", "size", "direct")
 _TASKS = ("gallery", "scene", "keep", "preset")
 _MOST = 20
@@ -25,15 +25,13 @@ _MOST = 20
 
 async def start(request: Request) -> Response:
     """Queue a task: the gallery, a scene, its files or a preset of such scenes."""
-    session: Session = request.state.session
     task = request.path_params["task"]
     if task not in _TASKS:
         raise unknown("task", task, _TASKS)
     arguments: dict[str, Any] = {}
     if task != "gallery":
-        place = session.folder / _PLACE
-        place.mkdir(exist_ok=True)
         asked = await uploads.settings(request.stream())
+        place = make_tab_folder(request, _ROOM)
         arguments = {"place": str(place)} | {name: asked[name] for name in _ASKED if name in asked}
         if task != "scene":
             arguments.pop("direct", None)
@@ -65,9 +63,9 @@ def _take_in(coming: Incoming, path: Path, target: Path, limits: Limits) -> None
 
 
 async def file(request: Request) -> Response:
-    """Send what was made of the last scene."""
+    """Send what was made of the tab's last scene."""
     name = request.path_params["name"]
-    path = request.state.session.folder / _PLACE / name
+    path = tab_folder(request, _ROOM) / name
     if name not in ("basis.bin", "truth.bin", "direct.bin", "scene.zip") or not path.is_file():
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path, filename=name if name.endswith(".zip") else None)

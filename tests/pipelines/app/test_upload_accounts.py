@@ -171,7 +171,7 @@ def test_masks_at_the_same_time_do_not_meet(visitor: Visitor) -> None:
 def studio(visitor: Visitor) -> set[str]:
     """Leave files of the other rooms, as their jobs do; return their paths."""
     assert visitor.send("PUT", "/studio/uploads/ball.off", b"OFF")[0] == 200
-    for room in ("studio", "shard"):
+    for room in ("studio-", "data-"):
         (visitor.session.folder / room).mkdir()
         (visitor.session.folder / room / "basis.bin").write_bytes(b"")
     return set(visitor.files())
@@ -233,7 +233,7 @@ def test_sets_begun_at_the_same_time_give_back_what_is_pruned_once(visitor: Visi
     assert len(list(visitor.session.folder.iterdir())) == SETS
 
 
-@pytest.mark.parametrize("name", ["studio", "uploads", "shard", ".incoming-0", "0" * 15, "..", "%00"])
+@pytest.mark.parametrize("name", ["studio-", "uploads", "data-", ".incoming-0", "0" * 15, "..", "%00"])
 def test_what_is_no_set_cannot_be_uploaded_to(visitor: Visitor, name: str) -> None:
     studio(visitor)
     status, _ = visitor.send("PUT", f"/photographs/sets/{name}/uploads/a.png", png())
