@@ -12,10 +12,10 @@ from scipy.interpolate import RegularGridInterpolator
 from sdps_scenes import hemisphere_lights
 
 from pipelines import cli
-from pipelines.app.rooms import object_view
-from pipelines.app.rooms.object_view import shade_object
-from pipelines.app.rooms.reflectance_tables import build_tables
-from pipelines.app.rooms.studio_tasks import training_preset, triangles, wanted
+from pipelines.app.pages import object_view
+from pipelines.app.pages.object_view import shade_object
+from pipelines.app.pages.reflectance_tables import build_tables
+from pipelines.app.pages.studio_tasks import check_choice, make_training_preset, triangulate
 from pipelines.shared import presets
 from render.shared.errors import InputError
 from render.shared.imaging.sensor import to_srgb
@@ -119,25 +119,25 @@ view.lights.forEach((light, number) => {
 
 def test_triangles_cover_the_lights() -> None:
     lights = hemisphere_lights(40, RNG)
-    assert set(np.ravel(triangles(lights))) == set(range(40))
-    assert triangles(lights[:2]) == []
+    assert set(np.ravel(triangulate(lights))) == set(range(40))
+    assert triangulate(lights[:2]) == []
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../x.ply", "bunny;rm", "meshes:1", ""])
 def test_only_known_names_are_rendered(tmp_path, name: str) -> None:
     with pytest.raises(InputError, match="shape"):
-        wanted(tmp_path / "studio", shape=name, material="chrome")
+        check_choice(tmp_path / "studio", shape=name, material="chrome")
     for material in ("/etc/passwd", "x.yaml", "maps:1:folder", "stripes:7:a.binary+b", "lambertian:../x"):
         with pytest.raises(InputError, match="material"):
-            wanted(tmp_path / "studio", shape="bunny", material=material)
+            check_choice(tmp_path / "studio", shape="bunny", material=material)
 
 
 def test_the_training_preset_can_be_loaded(tmp_path) -> None:
-    text = training_preset(str(tmp_path), shape="blobby:4", material="stripes:7:chrome+nylon")
+    text = make_training_preset(str(tmp_path), shape="blobby:4", material="stripes:7:chrome+nylon")
     (tmp_path / "my-scenes.yaml").write_text(text)
     assert presets.load(str(tmp_path / "my-scenes.yaml")).data.families == {"blobby": 200}
     with pytest.raises(InputError, match="many shapes"):
-        training_preset(str(tmp_path), shape="bunny", material="chrome")
+        make_training_preset(str(tmp_path), shape="bunny", material="chrome")
 
 
 def test_a_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 
-from pipelines.app.work.refusals import Refused
+from pipelines.app.common.refusals import Refused
 from render.shared.errors import InputError
 
 _NUMBER = re.compile(r"[0-9]{1,9}")
@@ -24,7 +24,7 @@ _PATIENCE = 60.0
 Handler = Callable[[Request], Awaitable[Response]]
 
 
-def taking_uploads(handler: Handler) -> Handler:
+def accept_uploads(handler: Handler) -> Handler:
     """Return a handler that reads on to the end of a body it refuses; else the browser, which is still sending, would
     show a connection that was reset in place of the reason.
     """
@@ -50,7 +50,7 @@ async def _read_on(request: Request) -> None:
                     return
 
 
-def queued(request: Request, task: str, **arguments: Any) -> Response:
+def queue_task(request: Request, task: str, **arguments: Any) -> Response:
     """Queue a task for a request's session, and return the answer that describes it.
 
     Raises:
@@ -63,7 +63,7 @@ def queued(request: Request, task: str, **arguments: Any) -> Response:
     return JSONResponse(jobs.describe(job))
 
 
-def tab_folder(request: Request, room: str) -> Path:
+def find_tab_folder(request: Request, room: str) -> Path:
     """Return a room's folder of the tab that asks, which may not exist yet: two tabs must not share a scene.
 
     Raises:
@@ -76,8 +76,8 @@ def tab_folder(request: Request, room: str) -> Path:
 
 
 def make_tab_folder(request: Request, room: str) -> Path:
-    """Return `tab_folder`, made where it does not exist; of too many tabs, those idle for longest lose theirs."""
-    folder = tab_folder(request, room)
+    """Return `find_tab_folder`, made if necessary; of too many tabs, those idle for longest lose their folders."""
+    folder = find_tab_folder(request, room)
     folder.mkdir(exist_ok=True)
     os.utime(folder)
     others = sorted(folder.parent.glob(f"{room}-*"), key=lambda path: path.stat().st_mtime)
@@ -87,7 +87,7 @@ def make_tab_folder(request: Request, room: str) -> Path:
     return folder
 
 
-def file_inside(folder: Path, name: str) -> Path | None:
+def find_file(folder: Path, name: str) -> Path | None:
     """Return a file below a folder, None where there is none or the name leads out of it."""
     try:
         path = (folder / name).resolve()
@@ -96,7 +96,7 @@ def file_inside(folder: Path, name: str) -> Path | None:
         return None
 
 
-def number(request: Request, key: str) -> int:
+def read_number(request: Request, key: str) -> int:
     """Return a number of a request's path; -1, which nothing has, for other text and numbers without end."""
     text = request.path_params[key]
     return int(text) if _NUMBER.fullmatch(text) else -1
