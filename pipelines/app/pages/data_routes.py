@@ -1,4 +1,4 @@
-"""The room "Data and runs": what lies in one folder of this machine: scenes, learning curves, results."""
+"""The page "Data and runs": scenes, learning curves and results of one folder on this machine."""
 
 import asyncio
 import json
@@ -26,28 +26,28 @@ from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import read_whole_lines
 
-_ROOM = "data"
+_PAGE = "data"
 _DEEP, _MOST = 4, 300
 _SIDE = 96
 _POINTS = 400  # of a learning curve
 
 
 def _folder(request: Request) -> Path:
-    """Return the folder a request names, which must lie in the one that is shown.
+    """Return the folder a request names, which must be inside the one that is shown.
 
     Raises:
-        InputError: it does not, or is not there.
+        InputError: it is not inside, or does not exist.
     """
     root = Path(request.app.state.folder).resolve()
-    with suppress(OSError, ValueError):  # too long a name, or one with a zero
+    with suppress(OSError, ValueError):  # the name is too long or contains a zero byte
         folder = (root / request.query_params.get("folder", ".")).resolve()
         if folder.is_relative_to(root) and folder.is_dir():
             return folder
-    raise InputError("no such folder")
+    raise InputError("there is no such folder; load the page again")
 
 
 async def listing(request: Request) -> Response:
-    """Send the data folders and runs there are, newest first."""
+    """Send the list of data folders and runs, newest first."""
     root = Path(request.app.state.folder).resolve()
     rows = await asyncio.to_thread(_list_rows, root)
     return JSONResponse({"root": str(request.app.state.folder), "rows": rows})
@@ -61,7 +61,7 @@ def _list_rows(root: Path) -> list[dict[str, str]]:
 def _find_folders(root: Path) -> Iterator[tuple[float, str, Path]]:
     for place, folders, files in os.walk(root):
         path = Path(place)
-        # Folders may be removed while this looks at them, and names that are not valid text cannot be sent.
+        # Folders may be removed meanwhile, and names that are not valid text cannot be sent.
         with suppress(OSError, UnicodeEncodeError):
             place.encode()
             if MANIFEST in files:
@@ -73,7 +73,7 @@ def _find_folders(root: Path) -> Iterator[tuple[float, str, Path]]:
 
 
 async def scenes(request: Request) -> Response:
-    """Send the scenes of a data folder, and what became of each."""
+    """Send the scenes of a data folder and the state of each."""
     folder = _folder(request)
     return JSONResponse(await asyncio.to_thread(_scenes, folder))
 
@@ -118,14 +118,14 @@ def _draw_strip(path: Path, scene: SceneSpec, _time: int) -> dict[str, Any]:
 
 
 def _find_scene(folder: Path, name: str | None) -> SceneSpec:
-    """Return a scene of a data folder; of a large one this takes seconds, so not on the event loop.
+    """Return a scene of a data folder; for a large folder this takes seconds, so not on the event loop.
 
     Raises:
-        InputError: there is none of this name.
+        InputError: there is no scene of this name.
     """
     chosen = _manifest(folder, _read_time(folder / MANIFEST)).get(name or "")
     if chosen is None:
-        raise InputError("no such scene")
+        raise InputError("there is no such scene; load the page again")
     return chosen
 
 
@@ -135,7 +135,7 @@ def _manifest(folder: Path, _time: int) -> dict[str, SceneSpec]:
 
 
 def _read_time(path: Path) -> int:
-    """Return when a file was changed, in nanoseconds; 0 where there is none, which its reader then says."""
+    """Return when a file was changed, in nanoseconds; 0 if there is none, which its reader will report."""
     try:
         return path.stat().st_mtime_ns
     except OSError:
@@ -146,14 +146,14 @@ async def start(request: Request) -> Response:
     """Queue the preparation of a scene for the lamp."""
     folder = _folder(request)
     chosen = await asyncio.to_thread(_find_scene, folder, request.query_params.get("id"))
-    place = make_tab_folder(request, _ROOM)
+    place = make_tab_folder(request, _PAGE)
     return queue_task(request, "shard", place=str(place), shard=str(folder / chosen.file))
 
 
 async def file(request: Request) -> Response:
-    """Send what was made of the scene under the lamp."""
+    """Send a file of the tab's scene under the lamp."""
     name = request.path_params["name"]
-    path = find_tab_folder(request, _ROOM) / name
+    path = find_tab_folder(request, _PAGE) / name
     if name not in ("basis.bin", "truth.bin") or not path.is_file():
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path)
@@ -178,7 +178,7 @@ def _curves(folder: Path) -> dict[str, dict[str, list[list[float]]]]:
 
 
 def _can_be_drawn(value: object) -> bool:
-    """Tell whether a value has a place in a plot; those of a training that diverged have none."""
+    """Return whether a value can be plotted; those of a diverged training cannot."""
     return isinstance(value, int | float) and abs(value) < 1e300  # NaN is not below it either
 
 
@@ -188,7 +188,7 @@ def _thin(values: list[list[float]]) -> list[list[float]]:
 
 
 async def sections(request: Request) -> Response:
-    """Send what was evaluated: text, tables and the names of the pictures."""
+    """Send the evaluation: text, tables and the names of the pictures."""
     folder = _folder(request)
     return Response(await asyncio.to_thread(_sections, folder), media_type="application/json")
 

@@ -1,4 +1,4 @@
-"""What the worker does with photographs: the example, the checks, an inference and what the page shows of it.
+"""What the worker does with photographs: the example, the checks, an inference and the files the page shows.
 
 A set of photographs is a folder with `photos` (what was uploaded), `painted.png` (a mask painted on the page), `view`
 (thumbnails) and `runs/<number>`, each with `files` (what `sdps infer` writes) and `view`.
@@ -48,13 +48,13 @@ def check(place: str, **options: Any) -> dict[str, Any]:
 
     Args:
         place: The set's folder.
-        options: `gamma`, `frame`, `lights` (use those beside the photographs).
+        options: `gamma`, `frame`, `lights` (use the lights file among the photographs).
 
     Returns:
         What the page shows.
 
     Raises:
-        InputError: photographs that cannot be used; paths are told from the set's folder.
+        InputError: photographs that cannot be used; paths are relative to the set's folder.
     """
     from sdps import photos as photographs
 
@@ -95,7 +95,7 @@ def list_methods(lit: bool) -> list[dict[str, str]]:
     from sdps.models.registry import COMBINATIONS
 
     there = sdps.available_methods()
-    found = [{"name": "auto", "about": "the best there is for these photographs (recommended)"}]
+    found = [{"name": "auto", "about": "the best method for these photographs (recommended)"}]
     for name, about in there.items():
         combined = name in COMBINATIONS
         classical = name in METHODS and METHODS[name].calibrated == lit
@@ -144,14 +144,14 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
 
 
 def _remove_failed_runs(run: Path) -> None:
-    """Remove what earlier runs left that failed or were cancelled; this one's number is above theirs."""
+    """Remove files of earlier runs that failed or were cancelled; this run has the highest number."""
     for old in run.parent.glob("*"):
         if int(old.name) < int(run.name) and not (old / VIEW / "view.json").is_file():
             shutil.rmtree(old, ignore_errors=True)
 
 
 def _measure_error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float | None:
-    """Return the mean angular error in degrees where the truth is known, which it is of the example."""
+    """Return the mean angular error in degrees if the truth is known, as for the example."""
     if not (folder / TRUTH).is_file():
         return None
     from sdps.core.metrics import normal_mae
@@ -175,7 +175,7 @@ def _load(
 
 
 def _has_lights(folder: Path) -> bool:
-    """Tell whether there is a file of lights; of several, `_load` says so."""
+    """Return whether there is a lights file; if there are several, `_load` reports that."""
     from sdps.photos.light_files import find_lights
 
     try:
@@ -191,7 +191,7 @@ def _save(path: Path, picture: np.ndarray, side: int) -> None:
 
 
 class _ShortPaths:
-    """Take the temporary folder out of what an error says."""
+    """Remove the temporary folder from error messages."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -1,4 +1,4 @@
-"""Every room of `sdps app` in Chromium, at two widths: it works, without console errors, and axe is content."""
+"""Every page of `sdps app` in Chromium, at two widths: it works, without console errors, and axe is content."""
 
 from collections.abc import Iterator
 from pathlib import Path

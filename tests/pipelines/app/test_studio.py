@@ -1,4 +1,4 @@
-"""The room "Studio": what may be loaded, scenes of it, and files that repeat a scene."""
+"""The page "Studio": what may be loaded, scenes of it, and files that repeat a scene."""
 
 import io
 import json
@@ -77,7 +77,7 @@ def test_uploads(tmp_path: Path, maps: Path) -> None:
         for name, body, status, text in (
             ("Bricks.zip", archive(picture, "../../a_Color.png", "x/b_Roughness.png"), 200, "Bricks"),
             ("Bricks.zip", archive(picture, "a_Color.png"), 200, "Bricks"),  # in place of the first
-            ("none.zip", archive(picture, "a.exe"), 400, "no pictures in it"),
+            ("none.zip", archive(picture, "a.exe"), 400, "contains no pictures"),
             ("bad.zip", b"PK", 400, "cannot be unpacked"),
             ("big.zip", b"0" * 500_000, 400, "too large"),
             ("own.yaml", b"a: 1", 200, "own.yaml"),
