@@ -18,12 +18,12 @@ from render.shared.errors import InputError
 from render.shared.progress import listening
 
 TASKS = {
-    "example": "pipelines.app.pages.photo_tasks:example",
+    "example": "pipelines.app.pages.photo_tasks:render_example",
     "check": "pipelines.app.pages.photo_tasks:check",
     "infer": "pipelines.app.pages.photo_tasks:infer",
-    "gallery": "pipelines.app.pages.studio_tasks:gallery",
-    "scene": "pipelines.app.pages.studio_tasks:scene",
-    "keep": "pipelines.app.pages.studio_tasks:keep",
+    "gallery": "pipelines.app.pages.studio_tasks:render_gallery",
+    "scene": "pipelines.app.pages.studio_tasks:render_scene",
+    "keep": "pipelines.app.pages.studio_tasks:pack_scene",
     "preset": "pipelines.app.pages.studio_tasks:make_training_preset",
     "shard": "pipelines.app.pages.studio_tasks:prepare_shard",
 }

@@ -35,7 +35,7 @@ _MOST_SETS = 12
 _PACKING = threading.Lock()
 
 
-async def new(request: Request) -> Response:
+async def make_set(request: Request) -> Response:
     """Start a set of photographs; if there are a dozen, the one unused for longest is removed."""
     session: Session = request.state.session
     gone = session.set_aside(_MOST_SETS - 1, request.app.state.jobs.works_in)
@@ -72,7 +72,7 @@ def _accept(coming: Incoming, path: Path, folder: Path, limits: Limits) -> int:
 
 
 @accept_uploads
-async def paint(request: Request) -> Response:
+async def upload_mask(request: Request) -> Response:
     """Receive a mask painted on the page, a PNG of the photographs' size; an empty body removes the painted mask."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
@@ -103,7 +103,7 @@ def _store_mask(coming: Incoming, source: Path, target: Path, limits: Limits) ->
     coming.put(made, target)
 
 
-async def start(request: Request) -> Response:
+async def start_task(request: Request) -> Response:
     """Queue a task for a set: the example, the checks or an inference."""
     session: Session = request.state.session
     name, task = request.path_params["set"], request.path_params["task"]
@@ -141,7 +141,7 @@ def _read_choice(asked: dict[str, Any], key: str, known: tuple[str, ...]) -> str
     return value
 
 
-async def file(request: Request) -> Response:
+async def send_file(request: Request) -> Response:
     """Send a file of the session's set, and nothing outside it."""
     path = find_file(request.state.session.find_place(request.path_params["set"]), request.path_params["path"])
     if path is None:
@@ -149,7 +149,7 @@ async def file(request: Request) -> Response:
     return FileResponse(path)
 
 
-async def pixel(request: Request) -> Response:
+async def send_pixel(request: Request) -> Response:
     """Send the values of one pixel in every photograph, and those of the model."""
     view = _find_run(request) / "view"
     try:
@@ -170,7 +170,7 @@ def _read_pixel(view: Path, row: int, column: int) -> dict[str, list[float]]:
     return found
 
 
-async def download(request: Request) -> Response:
+async def send_archive(request: Request) -> Response:
     """Send all files that `sdps infer` writes as one ZIP."""
     run = _find_run(request)
     archive = run / "sdps-infer.zip"
@@ -196,11 +196,11 @@ def _find_run(request: Request) -> Path:
 
 
 ROUTES = [
-    Route("/sets", new, methods=["POST"]),
+    Route("/sets", make_set, methods=["POST"]),
     Route("/sets/{set}/uploads/{name}", upload, methods=["PUT"]),
-    Route("/sets/{set}/mask", paint, methods=["PUT"]),
-    Route("/sets/{set}/start/{task}", start, methods=["POST"]),
-    Route("/sets/{set}/files/{path:path}", file),
-    Route("/sets/{set}/runs/{run}/pixel", pixel),
-    Route("/sets/{set}/runs/{run}/download", download),
+    Route("/sets/{set}/mask", upload_mask, methods=["PUT"]),
+    Route("/sets/{set}/start/{task}", start_task, methods=["POST"]),
+    Route("/sets/{set}/files/{path:path}", send_file),
+    Route("/sets/{set}/runs/{run}/pixel", send_pixel),
+    Route("/sets/{set}/runs/{run}/download", send_archive),
 ]

@@ -28,7 +28,7 @@ _INFERRING = {
 """Stages and about how long each takes with the recommended method."""
 
 
-def example(place: str) -> dict[str, Any]:
+def render_example(place: str) -> dict[str, Any]:
     """Render the bunny under 48 lights of unequal strength as 16-bit photographs with a mask; then check them."""
     import render
     from pipelines.evaluate.workbench import write_photographs

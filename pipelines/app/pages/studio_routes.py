@@ -23,7 +23,7 @@ _TASKS = ("gallery", "scene", "keep", "preset")
 _MOST = 20
 
 
-async def start(request: Request) -> Response:
+async def start_task(request: Request) -> Response:
     """Queue a task: the gallery, a scene, its files or a preset of such scenes."""
     task = request.path_params["task"]
     if task not in _TASKS:
@@ -62,7 +62,7 @@ def _accept(coming: Incoming, path: Path, target: Path, limits: Limits) -> None:
     coming.put(path, target, _MOST)
 
 
-async def file(request: Request) -> Response:
+async def send_file(request: Request) -> Response:
     """Send a file of the tab's last scene."""
     name = request.path_params["name"]
     path = find_tab_folder(request, _PAGE) / name
@@ -72,7 +72,7 @@ async def file(request: Request) -> Response:
 
 
 ROUTES = [
-    Route("/start/{task}", start, methods=["POST"]),
+    Route("/start/{task}", start_task, methods=["POST"]),
     Route("/uploads/{name}", upload, methods=["PUT"]),
-    Route("/files/{name}", file),
+    Route("/files/{name}", send_file),
 ]

@@ -34,7 +34,7 @@ _TILE = 56
 _SEEDED = ("blobby", "sculpture")
 
 
-def gallery() -> dict[str, Any]:
+def render_gallery() -> dict[str, Any]:
     """Return the built-in materials by category and a strip of spheres, rendered once and kept in the user's cache."""
     import render
     from render.materials import library
@@ -54,7 +54,7 @@ def gallery() -> dict[str, Any]:
     return {"groups": groups, "tile": _TILE, "picture": pictures.data_uri(Image.open(picture))}
 
 
-def scene(place: str, direct: bool = False, **asked: Any) -> dict[str, Any]:
+def render_scene(place: str, direct: bool = False, **asked: Any) -> dict[str, Any]:
     """Render a scene for the page.
 
     Args:
@@ -119,18 +119,18 @@ def triangulate(lights: np.ndarray) -> list[list[int]]:
 
 
 def prepare_shard(place: str, shard: str) -> dict[str, Any]:
-    """Prepare a shard for the page, as `scene` does with what it renders."""
+    """Prepare a shard for the page, as `render_scene` does with what it renders."""
     read: Shard = read_shard(Path(shard))
     images = read.images.astype(np.float32)
     exposure = pictures.auto_exposure(images, read.mask)
     return write_basis(Path(place), images, read.light_directions, read.normals, read.depth, read.mask, exposure)
 
 
-def keep(place: str, **asked: Any) -> str:
+def pack_scene(place: str, **asked: Any) -> str:
     """Render the scene with little noise and pack shard, preset and a program that repeats it; return the ZIP's name.
 
     Raises:
-        InputError: as `scene`.
+        InputError: as `render_scene`.
     """
     import render
 
