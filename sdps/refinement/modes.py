@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from render.shared.config import read_yaml
-from sdps.refinement.image_model import Model, reflect_without_modes
-from sdps.refinement.reflectance import MODES, MOST_LOG_FACTOR, evaluate_factor, measure_angles, mode_terms
+from sdps.refinement.image_model import Model
+from sdps.refinement.reflectance import MODES, MOST_LOG_FACTOR, evaluate_factor, measure_angles, mode_terms, reflect
 
 _OBSERVATIONS = 100.0
 """What all observations of an object count as together: errors of neighbouring pixels and lights correlate."""
@@ -51,7 +51,8 @@ def fit_modes(model: Model, images: Tensor, usable: Tensor) -> Tensor:  # (MODES
 def compare_logs(model: Model, images: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
     """Return the logarithm of observed over predicted radiance (P, L), and its weights, which add up to 1."""
     cosine = model.normals @ model.directions.T  # (P, L)
-    predicted = (reflect_without_modes(model) * cosine.clamp_min(0.0)[:, None]).mean(dim=1)
+    reflected = reflect(measure_angles(model.normals, model.directions), model)
+    predicted = (reflected * cosine.clamp_min(0.0)[:, None]).mean(dim=1)
     observed = (images * torch.exp(-model.log_intensities).T).mean(dim=1)
     left = torch.log((observed + _LEAST_RADIANCE) / (predicted + _LEAST_RADIANCE))
     weights = cosine * ((cosine > _LEAST_LIT) & (usable > 0.0) & (predicted > _LEAST_RADIANCE))

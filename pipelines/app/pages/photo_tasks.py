@@ -5,6 +5,8 @@ A set of photographs is a folder with `photos` (what was uploaded), `painted.png
 """
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +61,7 @@ def check(place: str, **options: Any) -> dict[str, Any]:
     from sdps import photos as photographs
 
     folder = Path(place)
-    with together(_CHECKING), _ShortPaths(folder):
+    with together(_CHECKING), _shorten_paths(folder):
         stage("reading")
         photos = _load(folder, anyway=True, **options)
         stage("checks")
@@ -128,7 +130,7 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
     run = folder / "runs" / str(number)
     _remove_failed_runs(run)
     shares = _INFERRING | ({"refinement": 40.0} if refine or method.endswith("+refine") else {})
-    with together(shares), _ShortPaths(folder):
+    with together(shares), _shorten_paths(folder):
         stage("reading")
         photos = _load(folder, anyway=anyway, **options)
         result = sdps.infer(
@@ -190,16 +192,11 @@ def _save(path: Path, picture: np.ndarray, side: int) -> None:
     image.save(path, quality=88)
 
 
-class _ShortPaths:
+@contextmanager
+def _shorten_paths(folder: Path) -> Iterator[None]:
     """Remove the temporary folder from error messages."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, InputError):
-            text = str(error).replace(f"{self.folder / PHOTOS}/", "").replace(str(self.folder / PHOTOS), "photographs")
-            raise InputError(text.replace(f"{self.folder}/", "")) from error
+    try:
+        yield
+    except InputError as error:
+        text = str(error).replace(f"{folder / PHOTOS}/", "").replace(str(folder / PHOTOS), "photographs")
+        raise InputError(text.replace(f"{folder}/", "")) from error
