@@ -84,5 +84,5 @@ def test_uploads(tmp_path: Path, maps: Path) -> None:
             ("a.exe", b"", 400, "cannot be used here"),
         ):
             answered, found = client.send("PUT", f"/studio/uploads/{name}", body)
-            told = json.loads(found)
-            assert answered == status and text in told["name" if status == 200 else "message"], (name, told)
+            said = json.loads(found)
+            assert answered == status and text in said["name" if status == 200 else "message"], (name, said)
