@@ -90,7 +90,7 @@ def uploads(folder: Path) -> None:
 
 
 def room(folder: Path) -> None:
-    """Write what the room Data and runs shows: scenes, a failure, learning curves, a section."""
+    """Write what the page Data and runs shows: scenes, a failure, learning curves, a section."""
     folder = folder / "root"
     data_folders.good_folder(folder)
     failed = {"id": "sphere-00000", "seed": 1, "shape": "sphere", "material": "chrome", "reason": "it broke",
@@ -152,7 +152,7 @@ def read_upload(folder: Path, path: Path) -> None:
 
 
 def read_room(folder: Path, path: Path) -> None:
-    """Look at everything the room Data and runs shows."""
+    """Look at everything the page Data and runs shows."""
     with Page(folder) as page:
         for name in ("list", "scenes", "strip", "curves", "sections"):
             page.send("GET", _REQUESTS[name][1])
@@ -162,7 +162,7 @@ class Page:
     """A browser's session with the application.
 
     Args:
-        folder: Its `root` is what the room Data and runs shows.
+        folder: Its `root` is what the page Data and runs shows.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -172,7 +172,7 @@ class Page:
 
     def __enter__(self) -> "Page":
         from pipelines.app import server
-        from pipelines.app.work.uploads import Limits
+        from pipelines.app.common.uploads import Limits
 
         kept = tempfile.tempdir, server.Jobs
         tempfile.tempdir, server.Jobs = self.temporary.name, AtOnce
@@ -189,11 +189,11 @@ class Page:
 
     def photographs(self, source: Path | None) -> None:
         """Begin a set with photographs, if there are some, and a finished run."""
-        self.set = self.session.new_place()
+        self.set = self.session.make_place()
         place = self.session.folder / self.set
         shutil.copytree(source, place / "photos") if source else (place / "photos").mkdir()
         self.app.state.jobs.number = 1
-        studio = self.session.folder / "studio"
+        studio = self.session.folder / "studio-"
         studio.mkdir(exist_ok=True)
         (studio / "scene.zip").write_bytes(b"")
         view = place / "runs" / "1" / "view"
@@ -250,7 +250,7 @@ class AtOnce:
 
     def submit(self, owner: str, task: str, **arguments: Any) -> int:
         """Run a job; its refusal goes to standard error."""
-        from pipelines.app.rooms import photo_tasks, studio_tasks
+        from pipelines.app.pages import photo_tasks, studio_tasks
         from render.materials import library
         from render.shapes.files.mesh_file import load_mesh
 
@@ -258,12 +258,12 @@ class AtOnce:
             if task in ("check", "infer"):
                 json.dumps(getattr(photo_tasks, task)(**arguments))
             elif task == "shard":
-                studio_tasks.shard_scene(**arguments)
+                studio_tasks.prepare_shard(**arguments)
             elif task == "preset":
-                studio_tasks.training_preset(**arguments)
+                studio_tasks.make_training_preset(**arguments)
             elif task in ("scene", "keep"):
                 arguments["place"] = Path(arguments["place"])
-                spec = studio_tasks.wanted(**{key: value for key, value in arguments.items() if key != "direct"})
+                spec = studio_tasks.check_choice(**{key: value for key, value in arguments.items() if key != "direct"})
                 if Path(spec["shape"]).is_file():
                     load_mesh(Path(spec["shape"]))
                 library.load(spec["material"])

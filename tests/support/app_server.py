@@ -26,8 +26,8 @@ def application(folder: Path, **limits: int) -> Iterator[tuple[str, Any]]:
     """Serve on a free port; yield the address and the application."""
     import uvicorn
 
+    from pipelines.app.common.uploads import Limits
     from pipelines.app.server import build
-    from pipelines.app.work.uploads import Limits
 
     app = build(folder, Limits(**limits))
     config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning")
@@ -67,11 +67,11 @@ def contents(folder: Path) -> dict[str, int]:
 class Client:
     """A browser's requests: it keeps its cookie and names its origin."""
 
-    def __init__(self, address: str, room: str = "photographs") -> None:
+    def __init__(self, address: str, page: str = "photographs") -> None:
         self.address, self.origin = address, address
         self.cookies = http.cookiejar.CookieJar()
         self.opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(self.cookies))
-        self.get(f"/{room}")
+        self.get(f"/{page}")
 
     @property
     def token(self) -> str:

@@ -13,10 +13,10 @@ from sdps.methods import pretrained
 from sdps.methods.parse import parse
 from sdps.methods.runner import Runner
 from sdps.refinement.fused import data_term
-from sdps.refinement.image_model import LOBES, State, difference, factors
-from sdps.refinement.modes import MODES
+from sdps.refinement.image_model import State, build_model, measure_differences
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.refined import Refined
+from sdps.refinement.reflectance import LOBES, MODES
 
 QUICK = RefineConfig(coarse_pixels=700, iterations=600, bounces=0, fine_iterations=0)  # nothing here shades itself
 
@@ -87,11 +87,11 @@ def random_state(pixels: int, lights: int, seed: int = 0) -> tuple[State, torch.
 
 
 def test_the_fused_term_and_its_gradient_are_those_of_the_plain_one() -> None:
-    state, images, kept = random_state(200, 13)
+    state, images, usable = random_state(200, 13)
     plain = State(*(part.double().requires_grad_() for part in state))
     fused = State(*(part.clone().requires_grad_() for part in state))
-    slow = difference(factors(plain), images.double(), kept == 0.0).mean()
-    fast = data_term(factors(fused), images, kept)
+    slow = measure_differences(build_model(plain), images.double(), usable == 0.0).mean()
+    fast = data_term(build_model(fused), images, usable)
     slow.backward()
     fast.backward()
     assert float(fast.detach()) == pytest.approx(float(slow.detach()), rel=1e-5)
@@ -132,15 +132,15 @@ def test_given_directions_stay_and_intensities_are_found() -> None:
     normals, mask = bumpy()
     images, lights, intensities = lit(normals, 16, seed=4)
     start = turned(normals, 10.0, seed=2) * mask[..., None]
-    told = intensities * np.random.default_rng(3).uniform(0.9, 1.1, 16)
-    found = refine(images, mask, start, lights, told, directions_given=True, config=QUICK)
+    given = intensities * np.random.default_rng(3).uniform(0.9, 1.1, 16)
+    found = refine(images, mask, start, lights, given, directions_given=True, config=QUICK)
     assert np.allclose(found.light_directions, lights, atol=1e-6)
     share = found.intensities.mean(axis=1) / intensities
-    assert np.std(share) / np.mean(share) < 0.01 < 0.04 < np.std(told / intensities)
+    assert np.std(share) / np.mean(share) < 0.01 < 0.04 < np.std(given / intensities)
     assert errors(found, normals, mask, lights)[0] < 1.0
 
 
-def test_a_corrupted_image_among_good_ones_does_not_matter_and_is_told() -> None:
+def test_a_corrupted_image_among_good_ones_hardly_matters_and_is_found() -> None:
     normals, mask = bumpy()
     images, lights, _ = lit(normals, 24, seed=5, gloss=1.0)
     images[7] = images[7][::-1, ::-1]

@@ -18,24 +18,24 @@ from render.shared.errors import InputError
 from render.shared.progress import listening
 
 TASKS = {
-    "example": "pipelines.app.rooms.photo_tasks:example",
-    "check": "pipelines.app.rooms.photo_tasks:check",
-    "infer": "pipelines.app.rooms.photo_tasks:infer",
-    "gallery": "pipelines.app.rooms.studio_tasks:gallery",
-    "scene": "pipelines.app.rooms.studio_tasks:scene",
-    "keep": "pipelines.app.rooms.studio_tasks:keep",
-    "preset": "pipelines.app.rooms.studio_tasks:training_preset",
-    "shard": "pipelines.app.rooms.studio_tasks:shard_scene",
+    "example": "pipelines.app.pages.photo_tasks:render_example",
+    "check": "pipelines.app.pages.photo_tasks:check",
+    "infer": "pipelines.app.pages.photo_tasks:infer",
+    "gallery": "pipelines.app.pages.studio_tasks:render_gallery",
+    "scene": "pipelines.app.pages.studio_tasks:render_scene",
+    "keep": "pipelines.app.pages.studio_tasks:pack_scene",
+    "preset": "pipelines.app.pages.studio_tasks:make_training_preset",
+    "shard": "pipelines.app.pages.studio_tasks:prepare_shard",
 }
-"""Task by name: module and function. Loaded when first asked for."""
-_STEP = 0.004  # smallest advance of a share that is told
+"""Tasks by name: module and function, loaded when first used."""
+_STEP = 0.004  # smallest progress that is reported
 
 
 def serve(pipe: Connection) -> None:
     """Run jobs until the other end of the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
     end_with_parent()
-    _warm()
+    _warm_up()
     while True:
         try:
             name, arguments = pipe.recv()
@@ -43,54 +43,54 @@ def serve(pipe: Connection) -> None:
             return
         answer: tuple[Any, ...]
         try:
-            with listening(_teller(pipe)):
-                result = task(name)(**arguments)
-            _tidy()
-            answer = ("done", result, memory())
+            with listening(_make_reporter(pipe)):
+                result = load_task(name)(**arguments)
+            _clean_up()
+            answer = ("done", result, measure_memory())
         except InputError as error:
             answer = ("failed", str(error))
         except MemoryError:
             answer = ("failed", "there is not enough memory; try fewer or smaller pictures")
-        except Exception as error:  # a defect: its traceback is for the terminal, a line for the page
+        except Exception as error:  # a bug: traceback in the terminal, one line on the page
             traceback.print_exc()
-            answer = ("failed", f"this should not have happened ({type(error).__name__}); see the terminal")
+            answer = ("failed", f"unexpected error ({type(error).__name__}); the terminal shows its traceback")
         try:
             pipe.send(answer)
         except OSError:
             return
 
 
-def task(name: str) -> Callable[..., Any]:
+def load_task(name: str) -> Callable[..., Any]:
     """Return the function of a task."""
     module, function = TASKS[name].split(":")
     return getattr(importlib.import_module(module), function)
 
 
-def memory() -> int:
-    """Return the bytes this process holds now; where the system does not say, the most it ever held."""
+def measure_memory() -> int:
+    """Return the bytes this process holds now, or its peak where the system does not tell the current size."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
     except OSError:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def _tidy() -> None:
-    """Give back what the libraries keep for later; a rare large scene would otherwise stay for good."""
+def _clean_up() -> None:
+    """Release memory that libraries cache; otherwise one large scene would occupy it for good."""
     gc.collect()
     if "drjit" in sys.modules:
         sys.modules["drjit"].flush_malloc_cache()
-    with suppress(OSError, AttributeError):  # other systems have no such call
+    with suppress(OSError, AttributeError):  # other systems do not have this call
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _warm() -> None:
-    """Load what the first job would wait for."""
+def _warm_up() -> None:
+    """Load the libraries that the first job would wait for."""
     for name in ("sdps.api", "render.api"):
         importlib.import_module(name)
 
 
-def _teller(pipe: Connection) -> Callable[[str, float], None]:
-    """Return what passes stages on, but not every one of thousands."""
+def _make_reporter(pipe: Connection) -> Callable[[str, float], None]:
+    """Return a function that sends stages through the pipe, but not each of thousands."""
     last: list[Any] = ["", -1.0]
 
     def tell(name: str, share: float) -> None:

@@ -1,0 +1,1 @@
+"""What all pages share: sessions, uploads, the queue of jobs and its worker."""

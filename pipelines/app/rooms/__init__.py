@@ -1,1 +1,0 @@
-"""The rooms of the page: what the server answers, and what the worker does, one pair of modules each."""

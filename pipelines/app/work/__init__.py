@@ -1,1 +1,0 @@
-"""What all rooms share: visitors, uploads, the queue and its worker."""
