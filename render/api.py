@@ -26,7 +26,7 @@ from render.materials.model import Material
 from render.materials.surfaces import Surface
 from render.planning import light_sets
 from render.records.manifest import SceneSpec, View, claim
-from render.running.rendered import RenderedView, rendered_views
+from render.running.rendered_view import RenderedView, rendered_views
 from render.shapes import TriangleMesh, registry
 from render.shapes.files.mesh_file import from_trimesh
 from render.shared.errors import InputError
@@ -237,7 +237,7 @@ def render_plan(scenes: Sequence[SceneSpec], folder: str | Path, *, workers: int
         raise InputError("the plan is empty; there is nothing to render")
     claim(folder, scenes)
     if workers == 1:
-        from render.running.worker import render_scenes
+        from render.running.scene_rendering import render_scenes
 
         render_scenes(scenes, folder)
     else:
@@ -246,7 +246,8 @@ def render_plan(scenes: Sequence[SceneSpec], folder: str | Path, *, workers: int
         failed = render_supervised(scenes, folder, RunOptions(workers=workers, retry_failed=True)).failed
         if failed:
             raise InputError(
-                f"{folder}: {len(failed)} of {len(scenes)} scenes failed, {failed[0]['id']} thus: {failed[0]['reason']}"
+                f"{folder}: {len(failed)} of {len(scenes)} scenes failed, the first was {failed[0]['id']}: "
+                f"{failed[0]['reason']}"
             )
     return [folder / scene.file for scene in scenes]
 

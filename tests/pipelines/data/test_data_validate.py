@@ -309,7 +309,7 @@ def test_imported_scenes_of_one_name_are_no_twins(tmp_path):
 
 def test_rendered_scenes_are_sound_and_their_flips_found(tmp_path):
     """Real renders of the hardest materials: mirror-like, black and white with interreflections."""
-    from render.running.worker import render_scenes
+    from render.running.scene_rendering import render_scenes
 
     lights = tuple(tuple(round(float(c), 6) for c in row) for row in light_directions(16))
     base = scene_of(sphere_shard(), shape="blobby:3", lights=lights, bounces=1)

@@ -13,7 +13,7 @@ from render.planning.mesh_family import MeshFamily, mesh_files
 from render.planning.plan import DataConfig, plan
 from render.planning.provenance import UNSTATED, mesh_terms
 from render.records.manifest import SceneSpec, read_manifest
-from render.running.worker import render_scenes
+from render.running.scene_rendering import render_scenes
 from render.shared.config import build, to_plain
 from render.shared.errors import InputError
 

@@ -18,7 +18,7 @@ from render.planning import plan as planning
 from render.planning.data_config import DataConfig
 from render.records.manifest import SceneSpec, View
 from render.records.shards import read_shard, write_shard
-from render.running.rendered import rendered_views
+from render.running.rendered_view import rendered_views
 from render.shapes import compositions
 from render.shapes.files.mesh_file import from_trimesh
 from render.shapes.geometry.contact import CLEARANCE, free_path

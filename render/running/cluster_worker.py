@@ -1,15 +1,15 @@
-"""Rendering a chunk for a run on another machine: what a worker of a cluster does, whatever engine brings it the task.
+"""What a worker of a cluster does with a task, whichever engine brings it: render a chunk for a run on another machine.
 
-A station keeps its rendering process from one task to the next, so that kernels are compiled once, and supervises it as
-a local run does: a crash or a hang costs one view, never the worker. Shards return as bytes; nothing is shared.
+It keeps its rendering process from one task to the next, so that kernels are compiled once, and watches it as a local
+run does: a crash or a hang costs one view, never the worker. Shards return as bytes; nothing is shared.
 """
 
 import hashlib
 import shutil
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -23,13 +23,13 @@ from render.planning.chunks import Chunk
 from render.planning.composition import components
 from render.records.manifest import SceneSpec
 from render.records.shards import file_hash
-from render.running.crew import LocalCrew, News
-from render.running.isolation import serve
-from render.running.messages import Done, Fatal
+from render.running.protocol import Fatal, Outcome, Result
+from render.running.worker_pool import LocalPool
+from render.running.worker_process import serve
 from render.shared.errors import InputError
 from render.shared.files import source_digest
 
-_FILE = "file "  # before the path of what is no part of the package
+_FILE = "file "  # before the path of what is not part of the package
 IDLE = 60.0  # seconds after which a process without work ends: its run may be gone
 
 
@@ -40,9 +40,9 @@ class Task(NamedTuple):
         run: Name of the run, for `stop`.
         chunk: What to render.
         digest: Of the manifest lines of its scenes, as planned.
-        needs: What the worker must have (`needed`).
+        needs: What the worker must have (`requirements`).
         timeout: Seconds without a finished scene after which the process is stopped.
-        commit: The run's commit, for the shards' headers: workers of the same code may be no checkouts.
+        commit: The run's commit, for the shards' headers: workers may have the same code outside a checkout.
         serve: What the rendering process runs.
     """
 
@@ -55,10 +55,10 @@ class Task(NamedTuple):
     serve: Callable[..., None] = serve
 
 
-class Rendered(NamedTuple):
-    """What came of a chunk: news in order, and the bytes of the shards by scene id."""
+class TaskResult(NamedTuple):
+    """What came of a task: outcomes in order, and the bytes of the shards by scene id."""
 
-    news: list[News]
+    outcomes: list[Outcome]
     shards: dict[str, bytes]
 
 
@@ -78,28 +78,28 @@ def installed() -> dict[str, str]:
     return found | {"code of the renderer": code, "fitted materials": materials.hexdigest()[:12]}
 
 
-def needed(shapes: Iterable[str], materials: Iterable[str]) -> dict[str, str]:
+def requirements(shapes: Iterable[str], materials: Iterable[str]) -> dict[str, str]:
     """Return what is `installed`, and {path: hash} of the meshes, material files and folders of maps that names are."""
     from render.shapes import registry  # loads what meshes need
 
     parts = {part for material in set(materials) for part in components(material)}
     places = {*map(registry.own_file, shapes), *map(library.own_file, parts)}
-    return installed() | {f"{_FILE}{place}": _content(place) for place in places if place is not None}
+    return installed() | {f"{_FILE}{place}": _content_hash(place) for place in places if place is not None}
 
 
-def _content(place: Path) -> str:
+def _content_hash(place: Path) -> str:
     """Return the first digits of the hash of a file, or of a folder of maps."""
     try:
         files = map_names.find(place).paths if place.is_dir() else (place,)
         states = [(str(file), (state := file.stat()).st_mtime_ns, state.st_size) for file in files]
-        return _hashed(tuple(states))
+        return _hash(tuple(states))
     except (OSError, InputError):
         return "missing"
 
 
 @lru_cache(maxsize=4096)
-def _hashed(files: tuple[tuple[str, int, int], ...]) -> str:
-    """Return one hash of files, given with time of change and size, which tell when to read them again."""
+def _hash(files: tuple[tuple[str, int, int], ...]) -> str:
+    """Return one hash of files; time of change and size, given with each, decide when they are read again."""
     whole = hashlib.sha256()
     for path, _, _ in files:
         whole.update(Path(path).name.encode() + bytes.fromhex(file_hash(path)))
@@ -111,8 +111,8 @@ def _commit() -> str:
     return provenance.commit()
 
 
-def _needs(chunk: Chunk) -> dict[str, str]:
-    return needed([chunk.shape], (scene.material for group in chunk.groups for scene in group))
+def _requirements_of(chunk: Chunk) -> dict[str, str]:
+    return requirements([chunk.shape], (scene.material for group in chunk.groups for scene in group))
 
 
 def lines_digest(scenes: Sequence[SceneSpec]) -> str:
@@ -120,9 +120,9 @@ def lines_digest(scenes: Sequence[SceneSpec]) -> str:
     return hashlib.sha256("".join(scene.digest() for scene in scenes).encode()).hexdigest()
 
 
-def task_of(run: str, chunk: Chunk, timeout: float, serve: Callable[..., None] = serve) -> Task:
+def make_task(run: str, chunk: Chunk, timeout: float, serve: Callable[..., None] = serve) -> Task:
     """Return the task of a chunk, with what a worker must agree on."""
-    return Task(run, chunk, lines_digest(chunk.scenes()), _needs(chunk), timeout, _commit(), serve)
+    return Task(run, chunk, lines_digest(chunk.scenes()), _requirements_of(chunk), timeout, _commit(), serve)
 
 
 def check(task: Task) -> None:
@@ -131,116 +131,109 @@ def check(task: Task) -> None:
     Raises:
         Mismatch: the first thing that differs.
     """
-    here = _needs(task.chunk)
+    here = _requirements_of(task.chunk)
     for name, there in task.needs.items():
         if (found := here.get(name, "missing")) != there:
             remedy = "put it under the same path there" if name.startswith(_FILE) else "install the same sdps on both"
             raise Mismatch(f"has {name} {found}, the run {there}; {remedy}")
     if lines_digest(task.chunk.scenes()) != task.digest:
-        raise Mismatch("reads the plan otherwise than it was written; install the same sdps on both")
+        raise Mismatch("reads the plan differently from how it was written; install the same sdps on both")
 
 
-class Station:
+class ClusterWorker:
     """The rendering processes of a worker, one per task at a time, kept while there is work.
 
-    Where there is a GPU, tasks take turns on it: side by side they would fill its memory.
+    Where there is a GPU, tasks take turns on it: together they would fill its memory.
 
     Args:
-        folder: Folder for what is on its way.
+        folder: Folder for shards on their way.
         memory: Bytes of memory each process may take; 0: any.
     """
 
     def __init__(self, folder: Path, memory: int = 0) -> None:
         self.folder, self.memory = folder, memory
-        self.idle: dict[LocalCrew, threading.Timer] = {}
+        self.idle: list[tuple[float, LocalPool]] = []  # since when
         self.lock, self.gpu = threading.Lock(), threading.Lock()
         self.stopped: set[str] = set()
 
-    def render(self, task: Task) -> Rendered:
+    def render(self, task: Task) -> TaskResult:
         """Render a chunk, if its run was not stopped.
 
         Raises:
             Mismatch: this machine would give other bytes.
         """
         check(task)
-        with self._turn():
-            return self._rendered(task)
+        if variant.choose().variant == "cuda_ad_rgb":
+            with self.gpu:
+                return self._render(task)
+        return self._render(task)
 
-    def _turn(self) -> AbstractContextManager[object]:
-        return self.gpu if variant.choose().variant == "cuda_ad_rgb" else nullcontext()
-
-    def _rendered(self, task: Task) -> Rendered:
-        crew = self._borrow(task)
-        news: list[News] = []
+    def _render(self, task: Task) -> TaskResult:
+        pool = self._borrow(task)
+        outcomes: list[Outcome] = []
+        reusable = False
         try:
-            crew.give([task.chunk])
-            while crew.busy() and task.run not in self.stopped:
-                step = crew.step()
-                news += step
-                if any(isinstance(item, Fatal) for item in step):
-                    break  # what concerns the whole run
-            ended = not crew.busy()
-            shards = {item.line["id"]: self._collect(crew, item) for item in news if isinstance(item, Done)}
-        except BaseException:
-            self._remove(crew)
-            raise
-        if ended:
-            self._give_back(crew)
-        else:
-            self._remove(crew)
-        return Rendered(news, shards)
+            pool.submit([task.chunk])
+            while pool.busy() and task.run not in self.stopped:
+                outcomes += pool.poll()
+                if any(isinstance(outcome, Fatal) for outcome in outcomes):
+                    break  # it concerns the whole run
+            shards = {item.line["id"]: _collect(pool, item) for item in outcomes if isinstance(item, Result)}
+            reusable = not pool.busy()
+        finally:
+            if reusable:
+                self._keep(pool)
+            else:
+                _remove(pool)
+        return TaskResult(outcomes, shards)
 
     def stop(self, run: str) -> None:
         """Let the tasks of a run end, those under way within about a second, and the idle processes."""
         self.stopped.add(run)
         self.dismiss()
 
-    def dismiss(self) -> None:
-        """End the idle processes."""
+    def dismiss(self, after: float = 0.0) -> None:
+        """End the processes that have been idle for some seconds."""
         with self.lock:
-            idle, self.idle = self.idle, {}
-        for crew, timer in idle.items():
-            timer.cancel()
-            self._remove(crew)
+            ended = [pool for since, pool in self.idle if time.monotonic() - since >= after]
+            self.idle = [(since, pool) for since, pool in self.idle if pool not in ended]
+        for pool in ended:
+            _remove(pool)
 
-    def _borrow(self, task: Task) -> LocalCrew:
+    def _borrow(self, task: Task) -> LocalPool:
+        """Return an idle process that fits a task, or a new one."""
         with self.lock:
-            for crew in self.idle:
-                if crew.serve is task.serve and crew.commit == task.commit:
-                    self.idle.pop(crew).cancel()
-                    crew.timeout = task.timeout
-                    return crew
+            for entry in self.idle:
+                pool = entry[1]
+                if pool.serve is task.serve and pool.commit == task.commit:
+                    self.idle.remove(entry)
+                    pool.timeout = task.timeout
+                    return pool
         self.folder.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(prefix="sdps-", dir=self.folder))
-        return LocalCrew(
+        return LocalPool(
             folder, folder, workers=1, timeout=task.timeout, threads=1, memory=self.memory, serve=task.serve,
             commit=task.commit,
         )  # fmt: skip
 
-    def _give_back(self, crew: LocalCrew) -> None:
-        timer = threading.Timer(IDLE, self._expire, [crew])
-        timer.daemon = True
+    def _keep(self, pool: LocalPool) -> None:
+        """Keep a process for the next task, and see to it that it ends if none comes."""
         with self.lock:
-            self.idle[crew] = timer
+            self.idle.append((time.monotonic(), pool))
+        timer = threading.Timer(IDLE, self.dismiss, [0.99 * IDLE])
+        timer.daemon = True
         timer.start()
 
-    def _expire(self, crew: LocalCrew) -> None:
-        """End a process whose timer ran out, unless it has worked meanwhile: it has another timer, or none, then."""
-        with self.lock:
-            if self.idle.get(crew) is not threading.current_thread():
-                return
-            del self.idle[crew]
-        self._remove(crew)
 
-    @staticmethod
-    def _collect(crew: LocalCrew, done: Done) -> bytes:
-        """Return the bytes of a shard and remove its file."""
-        path = crew.folder / "shards" / f"{done.line['id']}.exr"
-        data = path.read_bytes()
-        path.unlink()
-        return data
+def _collect(pool: LocalPool, result: Result) -> bytes:
+    """Return the bytes of a shard and remove its file."""
+    assert pool.folder is not None
+    path = pool.folder / "shards" / f"{result.line['id']}.exr"
+    data = path.read_bytes()
+    path.unlink()
+    return data
 
-    @staticmethod
-    def _remove(crew: LocalCrew) -> None:
-        crew.close()
-        shutil.rmtree(crew.folder, ignore_errors=True)
+
+def _remove(pool: LocalPool) -> None:
+    pool.close()
+    shutil.rmtree(pool.errors, ignore_errors=True)
