@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipelines.shared.flags import add_cache_argument
 from render.checks.folder_checks import CHECKSUMS
-from render.planning.composition import Composition, compose
+from render.planning.plan_counts import PlanCounts, count_plan
 from render.publishing import croissant, dataset_card
 from render.records.manifest import MANIFEST, read_manifest
 from render.records.mirror import finished, opened, shown
@@ -73,7 +73,7 @@ def write_card(
     there = finished(folder, scenes)
     if not there:
         raise InputError(f"{folder}: no shard is there yet; run `sdps render-data` first")
-    counts = compose(scenes)
+    counts = count_plan(scenes)
     text = croissant.Description(
         name=name or _name(folder),
         about=_about(counts),
@@ -101,7 +101,7 @@ def _name(folder: Path) -> str:
     return f"Photometric stereo, {name or (resolved.parent if resolved.name == 'data' else resolved).name}"
 
 
-def _about(counts: Composition) -> str:
+def _about(counts: PlanCounts) -> str:
     """Say in two sentences what the data are."""
     sizes = ", ".join(counts.sizes)
     families = ", ".join(counts.families)

@@ -11,7 +11,7 @@ from pipelines.data.preview import preview_page
 from pipelines.data.preview.preview_sample import Sample, caption, read_sample
 from pipelines.shared import pictures
 from pipelines.shared.flags import add_cache_argument
-from render.planning.composition import compose
+from render.planning.plan_counts import count_plan
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.mirror import finished, opened, shown
 from render.shared.errors import InputError
@@ -59,7 +59,9 @@ def preview(folder: str | Path, count: int = PER_SHEET) -> list[Path]:
     if not sample.tiles:
         raise InputError(f"{folder}: none of the {len(sample.damaged)} shards read is whole; run `sdps data validate`")
     written = write_sheets(folder, sample.tiles)
-    page = preview_page.render(folder, scenes, there, compose(scenes), sample, shown=sample.tiles[:: _stride(sample)])
+    page = preview_page.render(
+        folder, scenes, there, count_plan(scenes), sample, shown=sample.tiles[:: _stride(sample)]
+    )
     write_text(folder / "preview.html", page)
     return [*written, folder / "preview.html"]
 

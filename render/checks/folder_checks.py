@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from render.checks.known_checks import Finding
-from render.planning.composition import IMPORTED, family
+from render.planning.plan_counts import IMPORTED, family
 from render.records.ledger import SHARDS
 from render.records.manifest import MANIFEST, SceneSpec
 from render.records.mirror import CHECKSUMS

@@ -12,7 +12,7 @@ import numpy as np
 
 from render.materials import library
 from render.materials.textures import textured
-from render.planning.composition import IMPORTED, Composition, components
+from render.planning.plan_counts import IMPORTED, PlanCounts, components
 from render.records.manifest import OWN_MESHES, SceneSpec
 from render.records.mirror import shard_path
 from render.records.shards import read_shard
@@ -124,7 +124,7 @@ def _terms_of(name: str) -> tuple[str, str]:
     return source, terms or ("none needed" if source == "analytic" else UNSTATED)
 
 
-def mesh_terms(counts: Composition, own: str = "") -> dict[str, str]:
+def mesh_terms(counts: PlanCounts, own: str = "") -> dict[str, str]:
     """Return {shape family or mesh file: terms of use} of a composition; `own` are those of the family `meshes`."""
     known = MESHES | {IMPORTED: ORIGINAL} | ({OWN_MESHES: own} if own else {})
     return {name: known.get(name, UNSTATED) for name in counts.families}

@@ -20,7 +20,7 @@ from render.materials import library
 from render.materials.textures import map_names
 from render.planning import provenance
 from render.planning.chunks import Chunk
-from render.planning.composition import components
+from render.planning.plan_counts import components
 from render.records.manifest import SceneSpec
 from render.records.shards import file_hash
 from render.running.protocol import Fatal, Outcome, Result

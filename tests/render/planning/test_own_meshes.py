@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from render import shapes
-from render.planning import composition
+from render.planning import plan_counts
 from render.planning.mesh_family import MeshFamily, mesh_files
 from render.planning.plan import DataConfig, plan
 from render.planning.provenance import UNSTATED, mesh_terms
@@ -165,7 +165,7 @@ def test_a_changed_or_moved_file_is_told(folder, tmp_path):
 
 
 def test_counted_as_one_family_with_its_terms(folder):
-    counts = composition.compose(plan(config(folder, 3)))
+    counts = plan_counts.count_plan(plan(config(folder, 3)))
     assert counts.families == {"meshes": 3} and counts.shapes == 3
     assert mesh_terms(counts) == {"meshes": UNSTATED} and mesh_terms(counts, "CC0") == {"meshes": "CC0"}
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from render.materials import surfaces
-from render.planning import composition, light_sets
+from render.planning import light_sets, plan_counts
 from render.planning.framing import measure
 from render.planning.plan import DataConfig, is_validation, material_pool, plan
 from render.records.manifest import SceneSpec, View, read_manifest, write_manifest
@@ -466,6 +466,6 @@ def test_procedural_materials_beside_others_are_weighed_and_stay_unmixed():
     names = [scene.material for scene in plan(config)]
     textured = [name for name in names if "procedural" in name]
     assert len(textured) > 60 and all(name.startswith("procedural:wood:") for name in textured)
-    counted = composition.compose(plan(config))
+    counted = plan_counts.count_plan(plan(config))
     assert counted.categories["procedural-wood"] == len(textured)
     assert counted.materials["procedural:wood"] == len(textured)

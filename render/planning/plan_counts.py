@@ -17,7 +17,7 @@ IMPORTED = "imported"  # family of shapes, and prefix of materials, that came wi
 
 
 @dataclass(frozen=True)
-class Composition:
+class PlanCounts:
     """Counts over the scenes of a manifest; every mapping is sorted, the most frequent first.
 
     Attributes:
@@ -79,7 +79,7 @@ def category(material: str) -> str:
         return "other"
 
 
-def compose(scenes: Sequence[SceneSpec]) -> Composition:
+def count_plan(scenes: Sequence[SceneSpec]) -> PlanCounts:
     """Count what a manifest holds."""
     per_family: dict[str, list[Any]] = {}
     for scene in scenes:
@@ -90,7 +90,7 @@ def compose(scenes: Sequence[SceneSpec]) -> Composition:
     parts = [tuple(map(textured.unseeded, components(scene.material))) for scene in scenes]
     names = Counter(name for names in parts for name in set(names))
     kinds = {name: category(name) for name in names}
-    return Composition(
+    return PlanCounts(
         scenes=len(scenes),
         images=sum(len(scene.lights) for scene in scenes),
         shapes=sum(len(entry[1]) for entry in per_family.values()),

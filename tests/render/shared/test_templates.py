@@ -8,7 +8,7 @@ from jinja2 import UndefinedError
 
 from render.shared.templates import fill, inline, markdown_table, spelled
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_html_escapes_every_value_and_markdown_what_is_inline(tmp_path: Path) -> None:
