@@ -71,7 +71,7 @@ def material(source: MaterialLike) -> Surface:
             (`procedural:wood:7`, a folder of maps; `render.materials.textures.textured`), or a loaded material.
 
     Raises:
-        InputError: an unknown name (with the nearest), a malformed pattern, or a file that is no material.
+        InputError: an unknown name (with the nearest), a malformed pattern, or a file that is not a material.
     """
     if isinstance(source, Surface):
         return source
@@ -169,7 +169,7 @@ def render_views(
         material=covers[0].name, view=_view(rotation, scale, offset, camera_distance), size=size, spp=spp,
         bounces=bounces, seed=seed, **_lit(_lights(lights), light_distance),
     )  # fmt: skip
-    return _rendered(_shape(shape), covers, first)
+    return _render(_shape(shape), covers, first)
 
 
 def _check_options(size: int, spp: int, bounces: int, seed: int) -> None:
@@ -180,7 +180,7 @@ def _check_options(size: int, spp: int, bounces: int, seed: int) -> None:
         )
 
 
-def _rendered(mesh: TriangleMesh, covers: Sequence[Surface], first: SceneSpec) -> Iterator[RenderedView]:
+def _render(mesh: TriangleMesh, covers: Sequence[Surface], first: SceneSpec) -> Iterator[RenderedView]:
     """Render scenes that differ from the first in their material only."""
     from render.kernel.scene import build
     from render.materials.kernels.packed import PackedSurfaces
@@ -224,7 +224,7 @@ def render_plan(scenes: Sequence[SceneSpec], folder: str | Path, *, workers: int
         scenes: Of `plan`; of a shape or material that is a file, the name is its path.
         folder: Data folder: gets `manifest.jsonl` and a shard `shards/<id>.exr` per scene.
         workers: 1 renders in this process. More render in as many processes, which start this program's main module
-            anew: call it below `if __name__ == "__main__":`. 0 takes what cores and memory allow.
+            again: call it below `if __name__ == "__main__":`. 0 takes what cores and memory allow.
 
     Returns:
         The shards' paths, in the order of the plan.
@@ -268,7 +268,7 @@ def fit_material(
         terms: Terms of use, for the file.
 
     Raises:
-        InputError: another suffix, values that are no BRDF, or a file that cannot be written.
+        InputError: another suffix, values that are not a BRDF, or a file that cannot be written.
     """
     from render.materials.fit.fitting import Fitter, to_yaml
     from render.shared.files import write_text

@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 
 def _first_of_machine() -> bool:
-    """Tell whether this process is the one of its machine that fetches for the others."""
+    """Return whether this process is the one of its machine that fetches for the others."""
     return os.environ.get("LOCAL_RANK", "0") == "0"
 
 

@@ -48,7 +48,7 @@ def fetch() -> str:
 def _prepare(folder: Path) -> list[str]:
     """Return the options of an apt that has its lists and packages below a folder, and no package installed.
 
-    So it downloads all that a package needs, whatever the system has, and takes no lock of the system's.
+    So it downloads all that a package needs, even what the system has, and takes no lock of the system's.
     """
     for place in ("state/lists/partial", "cache/archives/partial"):
         (folder / place).mkdir(parents=True)

@@ -113,7 +113,7 @@ def load_companions(llvm: Path) -> list[Path]:
             files = sorted(root.rglob(missing[1])) if missing else []
             found = next((path for path in files if path.is_file()), None)
             if found is None or found in wanted:
-                break  # Dr.Jit tells
+                break  # Dr.Jit says so
             wanted.append(found)
         else:
             loaded.append(wanted.pop())
@@ -121,7 +121,7 @@ def load_companions(llvm: Path) -> list[Path]:
 
 
 def has_cuda_driver() -> bool:
-    """Tell whether the CUDA driver library can be loaded and sees at least one device."""
+    """Return whether the CUDA driver library can be loaded and sees at least one device."""
     try:
         driver = ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -153,7 +153,7 @@ def choose() -> Choice:
 
 
 def _choose_llvm(why: str) -> Choice:
-    """Pick the libLLVM for `llvm_ad_rgb`; `why` tells why the GPU is not used."""
+    """Pick the libLLVM for `llvm_ad_rgb`; `why` says why the GPU is not used."""
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         path = Path(given)

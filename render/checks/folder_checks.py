@@ -75,7 +75,7 @@ def _groups(items: Sequence[Any]) -> dict[Any, list[int]]:
 
 
 def find_duplicates(pixels: dict[str, list[str]]) -> list[Finding]:
-    """Tell scenes of different ids whose images are the same bytes."""
+    """Find scenes of different ids whose images are the same bytes."""
     return [
         Finding("duplicates", first, f"same pixels as {', '.join(others[:5])}", len(others))
         for first, *others in pixels.values()

@@ -136,7 +136,7 @@ def _mapping(processes: int) -> Iterator[Any]:
 
 
 def is_validation(number: int, share: float) -> bool:
-    """Tell whether shape `number` of a family is held out for validation.
+    """Return whether shape `number` of a family is held out for validation.
 
     Every 1/share-th shape is, the first one included, so of the first N shapes exactly ceil(share N), and whether a
     shape is does not depend on how many there are.

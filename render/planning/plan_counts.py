@@ -95,18 +95,18 @@ def count_plan(scenes: Sequence[SceneSpec]) -> PlanCounts:
         images=sum(len(scene.lights) for scene in scenes),
         shapes=sum(len(entry[1]) for entry in per_family.values()),
         views=sum(len(entry[2]) for entry in per_family.values()),
-        families=_counted(family(scene.shape) for scene in scenes),
-        splits=_counted(scene.split for scene in scenes),
+        families=_count(family(scene.shape) for scene in scenes),
+        splits=_count(scene.split for scene in scenes),
         materials=dict(names.most_common()),
-        categories=_counted(kind for names in parts for kind in {kinds[name] for name in names}),
+        categories=_count(kind for names in parts for kind in {kinds[name] for name in names}),
         near=sum(bool(scene.light_distances) for scene in scenes),
         perspective=sum(scene.view.camera_distance is not None for scene in scenes),
         varying=sum(len(names) > 1 for names in parts),
         per_family={name: (count, len(shapes), len(views)) for name, (count, shapes, views) in per_family.items()},
-        light_counts=_counted(len(scene.lights) for scene in scenes),
-        sizes=_counted("{1}x{0}".format(*scene.resolution) for scene in scenes),
-        spp=_counted(scene.spp for scene in scenes),
-        bounces=_counted(scene.bounces for scene in scenes),
+        light_counts=_count(len(scene.lights) for scene in scenes),
+        sizes=_count("{1}x{0}".format(*scene.resolution) for scene in scenes),
+        spp=_count(scene.spp for scene in scenes),
+        bounces=_count(scene.bounces for scene in scenes),
     )
 
 
@@ -120,5 +120,5 @@ def _view_key(scene: SceneSpec) -> tuple[Hashable, ...]:
     return scene.shape, scene.view, scene.lights, scene.light_distances
 
 
-def _counted(items: Iterable[Any]) -> dict[Any, int]:
+def _count(items: Iterable[Any]) -> dict[Any, int]:
     return dict(Counter(items).most_common())

@@ -310,7 +310,7 @@ def shard_path(folder: Path, scene: SceneSpec) -> Path:
 
 
 def kept(folder: Path, *paths: Path) -> bool:
-    """Tell whether files made of shards are all there; in a mirror they are then kept for another minute at least."""
+    """Return whether files made of shards are all there; in a mirror they are then kept for another minute at least."""
     if mirror_of(folder) is None:
         return all(path.is_file() for path in paths)
     try:

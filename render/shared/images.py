@@ -36,7 +36,7 @@ def read_image(path: str | Path, *, channels: int | None = 3) -> np.ndarray:
     Raises:
         InputError: missing, damaged, another number of channels, or neither 8 nor 16 bits.
     """
-    pixels = _decoded(path)
+    pixels = _decode(path)
     found = 1 if pixels.ndim == 2 else pixels.shape[2]
     if channels is None:
         return pixels if pixels.ndim == 2 else pixels[..., 2 if found >= 3 else 0]
@@ -54,13 +54,13 @@ def read_channels(path: str | Path) -> np.ndarray:
     Raises:
         InputError: missing, damaged, or neither 8 nor 16 bits.
     """
-    pixels = _decoded(path)
+    pixels = _decode(path)
     if pixels.ndim == 2:
         return pixels[..., None]
     return np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], axis=2) if pixels.shape[2] >= 3 else pixels
 
 
-def _decoded(path: str | Path) -> np.ndarray:
+def _decode(path: str | Path) -> np.ndarray:
     """Return the pixels as OpenCV has them, BGR, uint8 or uint16."""
     data = read_bytes(path, "no such picture; copy it there or drop it from the list that names it")
     with decoding(path, "a picture"):

@@ -1,4 +1,4 @@
-"""Pages and cards from Jinja2 templates, `*.html.j2` and `*.md.j2`, which lie beside the code that fills them."""
+"""Pages and cards from Jinja2 templates, `*.html.j2` and `*.md.j2`, which lie next to the code that fills them."""
 
 import html
 import re
@@ -42,7 +42,7 @@ def _environment(folder: Path) -> Environment:
 
 
 def inline(value: Any) -> str:
-    """Escape what is no Markdown for one line or one cell of a table; code in backticks stays code."""
+    """Escape what is not Markdown for one line or one cell of a table; code in backticks stays code."""
     parts = _CODE.split(str(value).replace("\n", " ").replace("|", "\\|"))
     return "".join(part if number % 2 else html.escape(part, quote=False) for number, part in enumerate(parts))
 

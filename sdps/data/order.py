@@ -103,7 +103,7 @@ class PackedOrder:
             )
 
     def identity(self) -> dict[str, Any]:
-        """Return what the order depends on beside the scenes and the seed."""
+        """Return what the order depends on besides the scenes and the seed."""
         if self.windows is None:
             return {}
         return {"pack": file_hash(self.dataset.store.folder / PACK), "shuffle_window": self.windows.window}

@@ -20,7 +20,7 @@ _ROW = 8  # floats of an entry of `PackedMaterials.rows`
 
 
 class Coordinates(NamedTuple):
-    """What evaluation needs of a pair of directions, whatever the material; from `PackedMaterials.prepare`."""
+    """What evaluation needs of a pair of directions, for any material; from `PackedMaterials.prepare`."""
 
     corner: Any  # UInt32, first of the four table entries around (theta_h, theta_d)
     weights: tuple  # 4 Float, bilinear weights of the four entries

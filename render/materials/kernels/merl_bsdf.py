@@ -24,7 +24,7 @@ MOST_TABLES = ((1 << 32) - 1) // (4 * _ENTRIES)  # the array is indexed by 32 bi
 
 
 class MerlCoordinates(NamedTuple):
-    """What evaluation needs of a pair of directions, whatever the table; from `PackedMerl.prepare`."""
+    """What evaluation needs of a pair of directions, for any table; from `PackedMerl.prepare`."""
 
     entries: tuple  # 2 UInt32, first of the four knots around (theta_h, theta_d) at either of two cells of phi_d
     weights: tuple  # 4 Float, bilinear weights of the four knots

@@ -44,7 +44,7 @@ class SurfaceBSDF(mi.BSDF):
     def parts(self, si: "mi.SurfaceInteraction3f") -> list[tuple]:
         """Return (family, index, weight) of each material at N points; the weights sum to 1."""
         weights = self.pattern.at(self.to_object @ si.p, si.prim_index) if self.pattern else [mi.Float(1)]
-        return self._weighted(weights)
+        return self._weigh(weights)
 
     def seen(self, si: "mi.SurfaceInteraction3f") -> tuple[list[tuple], "mi.Frame3f | None"]:
         """Return `parts`, and the frame that a relief turns the shading frame into, in its coordinates, or None."""
@@ -59,9 +59,9 @@ class SurfaceBSDF(mi.BSDF):
         frame = mi.Frame3f(dr.normalize(si.to_local(world)))
         if not self.packed.parts[0]:
             return [(Gloss(values), mi.UInt32(0), mi.Float(1))], frame
-        return self._weighted(values), frame
+        return self._weigh(values), frame
 
-    def _weighted(self, weights: list) -> list[tuple]:
+    def _weigh(self, weights: list) -> list[tuple]:
         places = self.packed.parts[0]
         return [(self.families[p.family], mi.UInt32(p.member), w) for p, w in zip(places, weights, strict=True)]
 
@@ -69,7 +69,7 @@ class SurfaceBSDF(mi.BSDF):
         """Choose a material by its weight, then a direction from its lobes; the weight is f cos / pdf of the sum."""
         active &= mi.Frame3f.cos_theta(si.wi) > 0
         parts, frame = self.seen(si)
-        wi = _turned(frame, si.wi)
+        wi = _local(frame, si.wi)
         wo, reached = mi.Vector3f(0, 0, 1), mi.Float(0)
         for family, index, weight in parts:
             mine = (sample1 >= reached) & (weight > 0)
@@ -113,21 +113,21 @@ class SurfaceBSDF(mi.BSDF):
         return f"SurfaceBSDF[material={self.packed.names[0]}]"
 
 
-def _turned(frame: Any, direction: Any) -> Any:
+def _local(frame: Any, direction: Any) -> Any:
     return direction if frame is None else frame.to_local(direction)
 
 
 def _eval(parts: list[tuple], frame: Any, si: Any, wo: Any, active: Any) -> "mi.Color3f":
     total = mi.Color3f(0)
     for family, index, weight in parts:
-        total += weight * family.eval(index, _turned(frame, si.wi), _turned(frame, wo), active & _above(frame, si, wo))
+        total += weight * family.eval(index, _local(frame, si.wi), _local(frame, wo), active & _above(frame, si, wo))
     return total
 
 
 def _pdf(parts: list[tuple], frame: Any, si: Any, wo: Any, active: Any) -> "mi.Float":
     total = mi.Float(0)
     for family, index, weight in parts:
-        total += weight * family.pdf(index, _turned(frame, si.wi), _turned(frame, wo), active & _above(frame, si, wo))
+        total += weight * family.pdf(index, _local(frame, si.wi), _local(frame, wo), active & _above(frame, si, wo))
     return total
 
 

@@ -5,7 +5,7 @@
 with DG the GGX distribution and the height-correlated Smith term (Walter et al. 2007; Heitz 2014), F Schlick's Fresnel
 term from 0.04 (dielectric) or the base colour c (metal). T_d = 1 - E_d is what the dielectric's coat lets through to a
 diffuse base (Kelemen and Szirmay-Kalos 2001), T_s = 1 - E_s what single scattering loses at F = 1, given back as in
-Kulla and Conty (2017). So a white material reflects all light, whatever its roughness and metallic, and none reflects
+Kulla and Conty (2017). So a white material reflects all light, at any roughness and metallic, and none reflects
 more; it is reciprocal. This module is the slow, plain numpy form; `render.materials.kernels.textures.gloss` evaluates
 the same in a kernel.
 """

@@ -59,7 +59,7 @@ class Textured:
 
 
 def is_textured(name: str) -> bool:
-    """Tell whether a name is one of this module's."""
+    """Return whether a name is one of this module's."""
     head = name.partition(":")[0]
     if head in (PROCEDURAL, MAPS, UV):
         return True
@@ -68,7 +68,7 @@ def is_textured(name: str) -> bool:
 
 
 def is_open(name: str) -> bool:
-    """Tell whether a name leaves the seed, or kind and seed, to be drawn: `procedural`, `procedural:wood`."""
+    """Return whether a name leaves the seed, or kind and seed, to be drawn: `procedural`, `procedural:wood`."""
     kind = name.removeprefix(f"{PROCEDURAL}:")
     return name == PROCEDURAL or (name != kind and kind in KINDS)
 

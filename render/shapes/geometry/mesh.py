@@ -171,7 +171,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:  # (F,) bool
-    """Tell which triangles have an area."""
+    """Return which triangles have an area."""
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     return distinct & (np.linalg.norm(face_normals(vertices.astype(np.float64), faces), axis=1) > 0)
 

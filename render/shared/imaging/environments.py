@@ -54,11 +54,11 @@ def load(name: str) -> np.ndarray:  # (H, 2H, 3) float32
     Built-in maps are scaled so that white Lambertian facing the camera has radiance 1; those of files are as they are.
 
     Raises:
-        InputError: an unknown name, or a file that is no map: not twice as wide as high, negative, infinite or NaN.
+        InputError: an unknown name, or a file that is not a map: not twice as wide as high, negative, infinite or NaN.
     """
     require_name(name)
     if is_file(name):
-        return _checked(_read(Path(name)), name)
+        return _check(_read(Path(name)), name)
     kind, _, seed = name.partition(":")
     vectors = directions(HEIGHT)
     radiance = BUILT_IN[kind](vectors, generator(int(seed or 0), "environment", kind))
@@ -67,7 +67,7 @@ def load(name: str) -> np.ndarray:  # (H, 2H, 3) float32
 
 
 def is_file(name: str) -> bool:
-    """Tell whether a name is that of an .hdr or .exr file."""
+    """Return whether a name is that of an .hdr or .exr file."""
     return Path(name).suffix.lower() in SUFFIXES
 
 
@@ -192,8 +192,8 @@ def _read(path: Path) -> np.ndarray:
     return pixels
 
 
-def _checked(pixels: np.ndarray, name: str) -> np.ndarray:
-    """Refuse what is no map; shrink a large one, keeping its light."""
+def _check(pixels: np.ndarray, name: str) -> np.ndarray:
+    """Refuse what is not a map; shrink a large one, keeping its light."""
     height, width = pixels.shape[:2]
     if width != 2 * height:
         raise InputError(f"{name}: is {width}x{height}; a latitude-longitude map is twice as wide as high")

@@ -104,7 +104,7 @@ def test_a_damaged_tar_is_named(folder: Path, tmp_path: Path, how: slice | str) 
         shard_path(place, read_manifest(folder)[0])
     (tmp_path / names[0]).write_bytes(b"")
     (tmp_path / PACK).write_text("[]")
-    with pytest.raises(InputError, match=r"pack\.json: is no list of tars"), opened(tmp_path) as place:
+    with pytest.raises(InputError, match=r"pack\.json: not a list of tars"), opened(tmp_path) as place:
         finished(place, read_manifest(folder))
 
 

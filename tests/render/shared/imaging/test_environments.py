@@ -93,4 +93,4 @@ def test_what_is_no_map_is_refused_in_one_line(tmp_path):
     bad = good.copy()
     bad[2, 3, 1] = np.nan
     with pytest.raises(InputError, match="NaN, infinite or negative at column 3, row 2"):
-        environments._checked(bad, "map.hdr")
+        environments._check(bad, "map.hdr")
