@@ -43,9 +43,8 @@ class Ledger:
         self.path = folder / LOG / f"done-{host() or 'host'}-{os.getpid()}-{start}.jsonl"
         self._handle: TextIO | None = None
 
-    @property
-    def crowded(self) -> bool:
-        """Whether no further work should be handed out for now."""
+    def is_crowded(self) -> bool:
+        """Return whether no further work should be handed out for now."""
         return False
 
     def __enter__(self) -> Self:

@@ -28,7 +28,7 @@ LOG = "log"
 SHARDS = "shards"
 CHECKSUMS = "checksums.txt"
 _STATE = ".storage.json"
-_IN_USE = 60.0  # seconds for which a file of the cache is kept after it was asked for, whatever the limit
+_IN_USE = 60.0  # seconds for which a file of the cache is kept after it was asked for, even over the limit
 _FAILURES = f"{LOG}/failed-"
 
 
@@ -123,7 +123,7 @@ class Mirror:
             total -= status.st_size
 
     def refresh(self) -> None:
-        """Bring listing and small files up to date; forget what was written anew since."""
+        """Bring listing and small files up to date; forget what has been written again since."""
         before = self.objects
         self.objects = self._listing()
         stale = [name for name, what in before.items() if self.objects.get(name) != what]
@@ -224,7 +224,7 @@ def _mirror_at(folder: Path, _: int, __: int) -> Mirror:
 def opened(place: str | Path, cache_gb: float = CACHE_GB, purpose: str = "read") -> Iterator[Path]:
     """Yield a folder of this disk that stands for a data folder: itself, or a mirror of one in a store, or packed.
 
-    What a command writes into the mirror beside shards (a report, a card) is sent when it ends well.
+    What a command writes into the mirror apart from shards (a report, a card) is sent when it ends well.
 
     Raises:
         InputError: the store cannot be read; a cache of no size.
@@ -331,7 +331,7 @@ def finished(folder: str | Path, scenes: Iterable[SceneSpec]) -> list[SceneSpec]
 
 
 def stored_size(folder: Path, scene: SceneSpec) -> tuple[int, str]:
-    """Return a shard's bytes and what tells it from one written later.
+    """Return a shard's bytes and what distinguishes it from one written later.
 
     Raises:
         FileNotFoundError: there is no such shard.

@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +21,6 @@ from render.materials.textures import map_names
 from render.planning import provenance
 from render.planning.chunks import Chunk
 from render.planning.plan_counts import components
-from render.records.manifest import SceneSpec
 from render.records.shards import file_hash
 from render.running.protocol import Fatal, Outcome, Result
 from render.running.worker_pool import LocalPool
@@ -39,7 +38,6 @@ class Task(NamedTuple):
     Attributes:
         run: Name of the run, for `stop`.
         chunk: What to render.
-        digest: Of the manifest lines of its scenes, as planned.
         needs: What the worker must have (`requirements`).
         timeout: Seconds without a finished scene after which the process is stopped.
         commit: The run's commit, for the shards' headers: workers may have the same code outside a checkout.
@@ -48,7 +46,6 @@ class Task(NamedTuple):
 
     run: str
     chunk: Chunk
-    digest: str
     needs: dict[str, str]
     timeout: float
     commit: str
@@ -115,14 +112,9 @@ def _requirements_of(chunk: Chunk) -> dict[str, str]:
     return requirements([chunk.shape], (scene.material for group in chunk.groups for scene in group))
 
 
-def lines_digest(scenes: Sequence[SceneSpec]) -> str:
-    """Return one hash of manifest lines."""
-    return hashlib.sha256("".join(scene.digest() for scene in scenes).encode()).hexdigest()
-
-
 def make_task(run: str, chunk: Chunk, timeout: float, serve: Callable[..., None] = serve) -> Task:
     """Return the task of a chunk, with what a worker must agree on."""
-    return Task(run, chunk, lines_digest(chunk.scenes()), _requirements_of(chunk), timeout, _commit(), serve)
+    return Task(run, chunk, _requirements_of(chunk), timeout, _commit(), serve)
 
 
 def check(task: Task) -> None:
@@ -136,8 +128,6 @@ def check(task: Task) -> None:
         if (found := here.get(name, "missing")) != there:
             remedy = "put it under the same path there" if name.startswith(_FILE) else "install the same sdps on both"
             raise Mismatch(f"has {name} {found}, the run {there}; {remedy}")
-    if lines_digest(task.chunk.scenes()) != task.digest:
-        raise Mismatch("reads the plan differently from how it was written; install the same sdps on both")
 
 
 class ClusterWorker:

@@ -114,12 +114,6 @@ def test_what_differs_is_refused(tmp_path, address, monkeypatch, name):
     assert not files(tmp_path)
 
 
-def test_a_plan_that_is_read_otherwise_is_refused(tmp_path, address, monkeypatch):
-    monkeypatch.setattr(cluster_worker, "lines_digest", lambda scenes: "other")
-    with pytest.raises(InputError, match="reads the plan differently"):
-        run(planned([["ok"]]), tmp_path, address)
-
-
 @pytest.mark.parametrize(
     ("shape", "material", "file"),
     [
