@@ -11,7 +11,7 @@ from render.planning.plan import material_pool
 from render.records.manifest import SceneSpec, View
 from render.shapes import load as load_shape
 from render.shared.errors import InputError
-from render.shared.seeds import derived_seed, generator
+from render.shared.seeds import derive_seed, generator
 
 _MEASURED = (".binary", ".bsdf")
 
@@ -34,7 +34,7 @@ def test_scenes(config: TestConfig) -> list[SceneSpec]:
     scenes = [
         SceneSpec(
             id=f"{slug(shape)}-{slug(material)}",
-            seed=derived_seed(config.seed, "test", shape),
+            seed=derive_seed(config.seed, "test", shape),
             split="test",
             shape=shape,
             material=material,

@@ -20,7 +20,7 @@ from render.planning.mesh_family import choose
 from render.records.manifest import COMPOSITION, OWN_MESHES, SceneSpec, View
 from render.shared.errors import InputError, unknown
 from render.shared.progress import progress_bar
-from render.shared.seeds import derived_seed, generator
+from render.shared.seeds import derive_seed, generator
 
 __all__ = ["DataConfig", "is_validation", "material_pool", "plan", "random_view"]
 
@@ -177,7 +177,7 @@ def _plan_shape(config: DataConfig, materials: _Materials, meshes: list[str], ke
     held_out = is_validation(number % len(meshes) if own else number, config.validation)
     for attempt in range(1 if own else SHAPES_TRIED):
         replaced = ("instead", attempt) if attempt else ()
-        shape = own[0] if own else f"{family}:{derived_seed(config.seed, family, number, *replaced)}"
+        shape = own[0] if own else f"{family}:{derive_seed(config.seed, family, number, *replaced)}"
         views = _views(config, family, number, shape)
         if views is not None:
             return [
@@ -265,7 +265,7 @@ def _plan_view(
     streams = (generator(config.seed, *keys, "texture", slot) for slot in range(len(surface)))
     surface = [textured.drawn(name, rng) for name, rng in zip(surface, streams, strict=True)]
     common: dict[str, Any] = {
-        "seed": derived_seed(config.seed, *keys, "sampler"),
+        "seed": derive_seed(config.seed, *keys, "sampler"),
         "split": "val" if held_out else "train",
         "shape": shape,
         "view": pose,

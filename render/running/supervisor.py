@@ -171,9 +171,7 @@ class _Run:
                 pool.submit(cut(self.scenes, self.wanted, pool.slots, pool.chunk_bytes))
                 note = ""
                 while pool.busy():
-                    while (
-                        self.ledger.is_crowded()
-                    ):  # shards that wait for their store fill the disk
+                    while self.ledger.is_crowded():  # shards that wait for their store fill the disk
                         time.sleep(0.1)
                     for outcome in pool.poll():
                         self._record(outcome)

@@ -342,8 +342,8 @@ def test_streams_are_independent_and_stable():
     assert first(0, "a") == first(0, "a")
     keys = [(0,), (1,), (0, "a"), (0, "b"), (0, "a", 1), (0, "a", 2), (0, "a", "1"), (1, "a", 1), (0, 0, "a")]
     assert len({first(*key) for key in keys}) == len(keys)
-    assert 0 <= seeds.derived_seed(0, "blobby", 3) < 2**31
-    assert seeds.derived_seed(0, "blobby", 3) == STREAM
+    assert 0 <= seeds.derive_seed(0, "blobby", 3) < 2**31
+    assert seeds.derive_seed(0, "blobby", 3) == STREAM
 
 
 @dataclass(frozen=True, kw_only=True)
