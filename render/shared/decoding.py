@@ -142,7 +142,7 @@ _kept = -1
 
 
 @contextmanager
-def silenced() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """Keep what C libraries print about damaged files off standard error, in all threads of the process.
 
     Python's own stream writes there as well, so nothing but decoding belongs inside.

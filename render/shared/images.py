@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from render.shared.decoding import check_picture, decoding, silenced
+from render.shared.decoding import check_picture, decoding, silence
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
 
@@ -67,7 +67,7 @@ def _decode(path: str | Path) -> np.ndarray:
         with Image.open(io.BytesIO(data)) as picture:
             check_picture(path, picture, data)
             picture.verify()
-        with silenced():  # libpng and libtiff print about odd profiles and tags
+        with silence():  # libpng and libtiff print about odd profiles and tags
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise InputError(f"{path}: damaged or not a picture; copy it again")

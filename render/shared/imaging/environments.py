@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from render.shared.decoding import check_unpacked, decoding, silenced
+from render.shared.decoding import check_unpacked, decoding, silence
 from render.shared.errors import InputError, unknown
 from render.shared.files import read_bytes
 from render.shared.imaging.exr_colours import read_exr_colours
@@ -181,7 +181,7 @@ def _read(path: Path) -> np.ndarray:
         with decoding(path, "a Radiance picture", "save it as .hdr or .exr again"):
             if size:
                 check_unpacked(path, 12 * int(size[1]) * int(size[2]), "its pixels")
-                with silenced():
+                with silence():
                     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if pixels is None or pixels.ndim != 3:
             raise InputError(f"{path}: damaged or no Radiance picture; save it as .hdr or .exr again")

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from render.shared.decoding import decoding, exr_parts, silenced
+from render.shared.decoding import decoding, exr_parts, silence
 from render.shared.errors import InputError
 
 _PRINTING = threading.Lock()
@@ -68,7 +68,7 @@ def read_exr_colours(path: str | Path, remedy: str = "copy it again") -> ExrColo
     Raises:
         InputError: missing, damaged, of a size that such a file cannot hold, or without light in it.
     """
-    with decoding(path, "an EXR picture", remedy), silenced(), _PRINTING, redirect_stdout(io.StringIO()):
+    with decoding(path, "an EXR picture", remedy), silence(), _PRINTING, redirect_stdout(io.StringIO()):
         parts = exr_parts(path, remedy, grouped=False)
         layers = [layer for part in parts for layer in _layers(part, alone=len(parts) == 1)]
         if not layers:
