@@ -25,7 +25,7 @@ def progress_bar(*args: Any, **options: Any) -> "tqdm[Any]":
 
 
 @contextmanager
-def listening(listener: Listener) -> Iterator[None]:
+def report_to(listener: Listener) -> Iterator[None]:
     """Report to `listener` the stages that `stage` names inside; in one thread at a time."""
     global _listener
     before, _listener = _listener, listener
@@ -80,7 +80,7 @@ def bars(without: Collection[str] = ()) -> Iterator[None]:
         shown[name].update(max(done - shown[name].n, 0.0))
 
     try:
-        with listening(report):
+        with report_to(report):
             yield
     finally:
         _close(shown)
@@ -93,7 +93,7 @@ def _close(shown: "dict[str, tqdm[Any]]") -> None:
 
 
 @contextmanager
-def together(weights: Mapping[str, float]) -> Iterator[None]:
+def share_out(weights: Mapping[str, float]) -> Iterator[None]:
     """Report the share of a whole job: its stages in order, each with its part of the time; no others."""
     outer, total = _listener, sum(weights.values())
     if outer is None:
@@ -105,5 +105,5 @@ def together(weights: Mapping[str, float]) -> Iterator[None]:
         if name in weights:
             outer(name, (starts[name] + weights[name] * share) / total)
 
-    with listening(report):
+    with report_to(report):
         yield

@@ -15,7 +15,7 @@ from typing import Any
 
 from render.backend.orphans import end_with_parent
 from render.shared.errors import InputError
-from render.shared.progress import listening
+from render.shared.progress import report_to
 
 TASKS = {
     "example": "pipelines.app.rooms.photo_tasks:example",
@@ -43,7 +43,7 @@ def serve(pipe: Connection) -> None:
             return
         answer: tuple[Any, ...]
         try:
-            with listening(_teller(pipe)):
+            with report_to(_teller(pipe)):
                 result = task(name)(**arguments)
             _tidy()
             answer = ("done", result, memory())

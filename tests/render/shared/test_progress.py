@@ -3,13 +3,13 @@
 import pytest
 
 from render.shared import progress
-from render.shared.progress import bars, listening, repeat, share, stage, together
+from render.shared.progress import bars, repeat, report_to, share, share_out, stage
 
 
 def test_stages_are_told_to_who_listens_and_to_nobody_else() -> None:
     told: list[tuple[str, float]] = []
     stage("nobody hears", 1, 2)
-    with listening(lambda *values: told.append(values)):
+    with report_to(lambda *values: told.append(values)):
         stage("reading", 1, 4)
         with repeat(1, 2):
             stage("lights", 1, 2)
@@ -19,19 +19,19 @@ def test_stages_are_told_to_who_listens_and_to_nobody_else() -> None:
 
 def test_stages_of_a_job_are_shares_of_it() -> None:
     told: list[tuple[str, float]] = []
-    with listening(lambda *values: told.append(values)), together({"lights": 1.0, "normals": 3.0}):
+    with report_to(lambda *values: told.append(values)), share_out({"lights": 1.0, "normals": 3.0}):
         stage("lights", 1, 2)
         stage("something else")
         stage("normals", 1, 3)
         stage("normals", 3, 3)
     assert told == [("lights", 0.125), ("normals", 0.5), ("normals", 1.0)]
-    with together({"lights": 1.0}):
+    with share_out({"lights": 1.0}):
         stage("lights")
 
 
 def test_parts_of_a_stage_may_be_nested() -> None:
     told: list[tuple[str, float]] = []
-    with listening(lambda *values: told.append(values)), repeat(1, 4):
+    with report_to(lambda *values: told.append(values)), repeat(1, 4):
         with share(0.0, 0.5), repeat(1, 2):
             stage("normals", 1, 2)
         with share(0.5, 1.0):
