@@ -8,7 +8,7 @@ from pathlib import Path
 from pipelines.shared.flags import add_cache_argument
 from render.records.manifest import MANIFEST, SceneSpec, manifest_text, read_manifest
 from render.records.mirror import opened, shard_path, shown, stored_size
-from render.records.packs import PACK, TARS, packed, plan_tars, plan_text
+from render.records.packs import PACK, TARS, pack_tar, plan_tars, plan_text
 from render.records.shards import is_sealed
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
@@ -45,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
                 raise InputError(f"{store.url}/{name}: {about}")
         left = [name for name in plan if name not in there]
         for name in progress_bar(left, desc="pack", unit="tar", disable=None if left else True):
-            store.write(name, packed(_shards(folder, [by_id[id] for id in plan[name]])))
+            store.write(name, pack_tar(_shards(folder, [by_id[id] for id in plan[name]])))
     sys.stdout.write(
         f"{args.out}: {len(scenes)} scenes ({sum(sizes) / 1e9:.3g} GB) in {len(plan)} tars, {len(left)} written now, "
         f"{len(plan) - len(left)} kept; train on it with `sdps train --data {args.out}`\n"

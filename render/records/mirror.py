@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from render.records.manifest import FAILED, MANIFEST, SceneSpec
-from render.records.packs import PACK, Plan, read_plan, unpacked
+from render.records.packs import PACK, Plan, read_plan, unpack_tar
 from render.records.shards import file_hash, is_sealed
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, parse_json, read_bytes, write_text
@@ -73,7 +73,7 @@ class Mirror:
         for _ in range(2):  # damaged on the way: once more
             data = self.store.read(name)
             if name != scene.file:
-                found = unpacked(data, self.plan[name])
+                found = unpack_tar(data, self.plan[name])
                 if found is not None:
                     return found
             elif is_sealed(data):

@@ -75,7 +75,7 @@ def read_plan(folder: Path) -> Plan:
     return tars
 
 
-def packed(samples: Iterable[tuple[SceneSpec, bytes]]) -> bytes:
+def pack_tar(samples: Iterable[tuple[SceneSpec, bytes]]) -> bytes:
     """Return the tar of some scenes and their shards, the same bytes for the same scenes."""
     stream = io.BytesIO()
     with _library().TarWriter(stream, encoder=False, mtime=0) as tar:
@@ -84,7 +84,7 @@ def packed(samples: Iterable[tuple[SceneSpec, bytes]]) -> bytes:
     return stream.getvalue()
 
 
-def unpacked(data: bytes, ids: Iterable[str]) -> dict[str, bytes] | None:
+def unpack_tar(data: bytes, ids: Iterable[str]) -> dict[str, bytes] | None:
     """Return the shards of a tar by scene; None if one of those that should be in it is not, or not whole."""
     from_tar = _library().tariterators.tar_file_iterator
     try:
