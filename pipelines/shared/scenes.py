@@ -23,7 +23,7 @@ def test_scenes(config: TestConfig) -> list[SceneSpec]:
         InputError: an unknown shape, material or light set, or two scenes of one name.
     """
     open_names = material_pool(config.materials)
-    pool = [textured.drawn(name, generator(config.seed, "test", "texture", name)) for name in open_names]
+    pool = [textured.complete(name, generator(config.seed, "test", "texture", name)) for name in open_names]
     for name in pool:
         surfaces.load(name)
     for shape in config.shapes:

@@ -263,7 +263,7 @@ def _plan_view(
         drawn = generator(config.seed, *keys, "unseen").permutation(len(materials.unseen))
         surface[1::2] = [materials.unseen[index] for index in np.resize(drawn, len(surface[1::2]))]
     streams = (generator(config.seed, *keys, "texture", slot) for slot in range(len(surface)))
-    surface = [textured.drawn(name, rng) for name, rng in zip(surface, streams, strict=True)]
+    surface = [textured.complete(name, rng) for name, rng in zip(surface, streams, strict=True)]
     common: dict[str, Any] = {
         "seed": derive_seed(config.seed, *keys, "sampler"),
         "split": "val" if held_out else "train",

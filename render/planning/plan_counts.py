@@ -87,7 +87,7 @@ def count_plan(scenes: Sequence[SceneSpec]) -> PlanCounts:
         entry[0] += 1
         entry[1].add(scene.shape)
         entry[2].add(_view_key(scene))
-    parts = [tuple(map(textured.unseeded, components(scene.material))) for scene in scenes]
+    parts = [tuple(map(textured.without_seed, components(scene.material))) for scene in scenes]
     names = Counter(name for names in parts for name in set(names))
     kinds = {name: category(name) for name in names}
     return PlanCounts(

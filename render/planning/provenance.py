@@ -105,7 +105,7 @@ def material_terms(materials: Sequence[str]) -> list[Terms]:
     """Group materials by source and terms of use, the largest group first; spatially-varying names are taken apart."""
     groups: dict[tuple[str, str], dict[str, None]] = {}
     for name in dict.fromkeys(part for material in materials for part in components(material)):
-        groups.setdefault(_terms_of(name), {})[textured.unseeded(name)] = None
+        groups.setdefault(_terms_of(name), {})[textured.without_seed(name)] = None
     ordered = sorted(groups.items(), key=lambda item: -len(item[1]))
     return [Terms(source, terms, tuple(names)) for (source, terms), names in ordered]
 

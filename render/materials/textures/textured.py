@@ -73,12 +73,12 @@ def is_open(name: str) -> bool:
     return name == PROCEDURAL or (name != kind and kind in KINDS)
 
 
-def drawn(name: str, rng: np.random.Generator) -> str:
+def complete(name: str, rng: np.random.Generator) -> str:
     """Complete an open name by a seed; any other stays as it is."""
     return f"{name}:{int(rng.integers(2**31))}" if is_open(name) else name
 
 
-def unseeded(name: str) -> str:
+def without_seed(name: str) -> str:
     """Leave out the seed of a procedural material without others in it, to count those of a kind together."""
     if not name.startswith(f"{PROCEDURAL}:") or is_open(name):
         return name

@@ -158,9 +158,9 @@ def test_names():
     assert kinds == set(KINDS)  # a seed alone draws the kind
     pattern, names = surfaces.split("procedural:tiles:7:chrome+brass")
     assert pattern.texture == "tiles" and pattern.seed == 7 and names == ("chrome", "brass")
-    assert textured.unseeded("procedural:wood:7") == "procedural:wood"
-    assert textured.unseeded("chrome") == "chrome"
+    assert textured.without_seed("procedural:wood:7") == "procedural:wood"
+    assert textured.without_seed("chrome") == "chrome"
     rng = np.random.default_rng(0)
-    assert textured.drawn("chrome", rng) == "chrome"
-    surfaces.load(textured.drawn("procedural:rust", rng))
-    surfaces.load(textured.drawn("procedural", rng))
+    assert textured.complete("chrome", rng) == "chrome"
+    surfaces.load(textured.complete("procedural:rust", rng))
+    surfaces.load(textured.complete("procedural", rng))
