@@ -94,7 +94,7 @@ def lights(source: LightsLike) -> np.ndarray:  # (L, 3)
     """
     if isinstance(source, str | Path):
         return light_sets.load(str(source))
-    return light_sets.checked(np.atleast_2d(np.asarray(source)).tolist(), "lights")
+    return light_sets.check(np.atleast_2d(np.asarray(source)).tolist(), "lights")
 
 
 _shape, _material, _lights = shape, material, lights  # for functions whose parameters have these names

@@ -20,7 +20,7 @@ import numpy as np
 
 from render.backend.arrays import opaque, upload
 from render.backend.jit import dr, mi
-from render.backend.sampling import scrambled, stream, uniform
+from render.backend.sampling import scramble, stream, uniform
 
 _NORMALS_PER_SAMPLE, _FEWEST, _MOST = 8, 256, 2048
 # s = 1 - cos(theta) around h is drawn with density ~ (1 + s / _CORE)^(-3/2) up to _RIM, which falls with the cube of
@@ -292,7 +292,7 @@ def _draw(
     pair, number = chosen
     prim, light = dr.gather(mi.UInt32, candidates.triangle, pair), dr.gather(mi.UInt32, candidates.light, pair)
     half = halves.of(light, centroid(scene.triangles(prim)))
-    turn = scrambled(prim * mi.UInt32(0x9E3779B1) + light, seed)
+    turn = scramble(prim * mi.UInt32(0x9E3779B1) + light, seed)
     u = (mi.Float(number) + uniform(turn[0])) * opaque(mi.Float(1 / count))
     s = _CORE * (dr.rcp(dr.square(1 - u * _TAIL)) - 1)
     sine = dr.sqrt(dr.maximum(s * (2 - s), 0))

@@ -192,7 +192,7 @@ def evaluate(table: MerlTable, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     return np.where(((wi[:, 2] > 0) & (wo[:, 2] > 0))[:, None], value.T, 0.0)
 
 
-def measured(table: MerlTable, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
+def is_measured(table: MerlTable, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     """Return for (N, 3) `wi` and `wo` whether `evaluate` there rests on measured entries alone; (N,) bool."""
     wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
     holes = knots((~table.valid).astype(np.float32)) > 0
@@ -206,7 +206,7 @@ def as_brdf(table: MerlTable) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Return a function of (N, 3) `wi`, `wo` giving the (N, 3) BRDF, NaN where it was not measured, for fitting."""
 
     def brdf(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
-        return np.where(measured(table, wi, wo)[:, None], evaluate(table, wi, wo), np.nan)
+        return np.where(is_measured(table, wi, wo)[:, None], evaluate(table, wi, wo), np.nan)
 
     return brdf
 

@@ -15,11 +15,11 @@ from render.shapes import grounds
 from render.shapes.blobby import blobby
 from render.shapes.geometry import sdf
 from render.shapes.geometry.contact import free_path
-from render.shapes.geometry.mesh import TriangleMesh, joined
+from render.shapes.geometry.mesh import TriangleMesh, join
 from render.shapes.geometry.noise import scalar_waves
 from render.shapes.geometry.polygonise import polygonise
 from render.shapes.geometry.sdf import Field
-from render.shapes.sculpture.family import RECIPES, weathered
+from render.shapes.sculpture.family import RECIPES, weather
 from render.shared import seeds
 
 TRIANGLES = 30_000  # of an object
@@ -37,7 +37,7 @@ def composition(seed: int) -> TriangleMesh:
     Object 0 is the ground, bowl or niche where there is one.
     """
     rng = seeds.generator(seed, "composition")
-    return joined(KINDS[kind(seed)][0](rng)).normalised()
+    return join(KINDS[kind(seed)][0](rng)).normalised()
 
 
 def kind(seed: int) -> str:
@@ -103,7 +103,7 @@ def links(rng: np.random.Generator) -> list[TriangleMesh]:
 
 def concave(rng: np.random.Generator) -> list[TriangleMesh]:
     """Build a single deeply concave object, in half of the cases on a ground."""
-    body = polygonise(weathered(rng, grounds.hollow(rng)), half_size=1.7, triangles=2 * TRIANGLES).normalised()
+    body = polygonise(weather(rng, grounds.hollow(rng)), half_size=1.7, triangles=2 * TRIANGLES).normalised()
     if rng.random() < 0.5:
         return [body]
     pile = [_mesh(grounds.ground(rng), 1.4)]
@@ -128,7 +128,7 @@ def part(rng: np.random.Generator) -> TriangleMesh:
         return _lay_down(rng, blobby(int(rng.integers(2**31))))
     if choice < 0.65:
         name = str(rng.choice(list(RECIPES)))
-        form, stands = weathered(rng, RECIPES[name][0](rng)), name in _STANDING and rng.random() < 0.8
+        form, stands = weather(rng, RECIPES[name][0](rng)), name in _STANDING and rng.random() < 0.8
     else:
         form, stands = _solid(rng), False
     mesh = polygonise(form, half_size=1.7, triangles=TRIANGLES).normalised()

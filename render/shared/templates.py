@@ -36,7 +36,7 @@ def _environment(folder: Path) -> Environment:
         loader=FileSystemLoader(folder), autoescape=select_autoescape(["html.j2"], default=False),
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    environment.filters |= {"inline": inline, "commas": "{:,}".format, "spelled": spelled, "yaml": to_yaml}
+    environment.filters |= {"inline": inline, "commas": "{:,}".format, "spelled": spell, "yaml": to_yaml}
     environment.globals["table"] = markdown_table
     return environment
 
@@ -53,7 +53,7 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join([*lines, *("| " + " | ".join(map(inline, row)) + " |" for row in rows)])
 
 
-def spelled(counts: Mapping[Any, int]) -> str:
+def spell(counts: Mapping[Any, int]) -> str:
     """Spell counts of scenes: the value alone when there is one, else each with its number."""
     if len(counts) == 1:
         return str(next(iter(counts)))

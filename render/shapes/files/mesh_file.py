@@ -119,7 +119,7 @@ def _read(path: Path, smooth: bool) -> Corners:
     if kind in ("gltf", "glb"):
         gltf_file.check(data, None if packed else path.parent)
     elif kind == "stl":
-        data = stl_file.checked(data)
+        data = stl_file.check(data)
     found = None if smooth or kind not in _READERS else _READERS[kind](data)
     if found is not None:
         return found
@@ -199,7 +199,7 @@ def _mesh(found: Corners, smooth: bool) -> TriangleMesh:
     if smooth:
         return TriangleMesh(vertices=merged, faces=wound, normals=vertex_normals(merged, wound), uv=uv)
     given = None if found.normals is None else np.take_along_axis(found.normals[kept], moved, axis=1)
-    points, split, normals = creases.shaded(merged, wound, given)
+    points, split, normals = creases.shade(merged, wound, given)
     return TriangleMesh(vertices=points, faces=split, normals=normals, uv=uv)
 
 

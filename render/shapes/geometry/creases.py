@@ -31,7 +31,7 @@ class _Fans(NamedTuple):
     apart: np.ndarray  # (2, M) the same at an edge that is sharp
 
 
-def shaded(
+def shade(
     vertices: np.ndarray, faces: np.ndarray, given: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Split vertices at creases and return their normals.

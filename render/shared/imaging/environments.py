@@ -40,7 +40,7 @@ def solid_angles(height: int) -> np.ndarray:  # (H, 1) float64
     return (np.pi / height * (edges[:-1] - edges[1:]))[:, None]
 
 
-def turned(radiance: np.ndarray, degrees: float) -> np.ndarray:
+def turn(radiance: np.ndarray, degrees: float) -> np.ndarray:
     """Return the map turned about the vertical y axis, counter-clockwise as seen from above (+z moves to +x).
 
     The angle is rounded to a whole number of columns.

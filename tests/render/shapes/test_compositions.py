@@ -22,7 +22,7 @@ from render.running.rendered_view import rendered_views
 from render.shapes import compositions
 from render.shapes.files.mesh_file import from_trimesh
 from render.shapes.geometry.contact import CLEARANCE, free_path
-from render.shapes.geometry.mesh import TriangleMesh, joined
+from render.shapes.geometry.mesh import TriangleMesh, join
 from render.shared.errors import InputError
 from render.shared.seeds import generator
 
@@ -204,6 +204,6 @@ def test_the_shard_keeps_the_ids(built, tmp_path):
 
 def test_joined_meshes_keep_their_faces():
     first, second = support.plane(), support.ball(0.5, (0, 0, 1))
-    whole = joined([first, second])
+    whole = join([first, second])
     np.testing.assert_array_equal(np.bincount(whole.objects), [len(first.faces), len(second.faces)])
     np.testing.assert_allclose(whole.vertices[whole.faces[2:]], second.vertices[second.faces])

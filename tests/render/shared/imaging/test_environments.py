@@ -33,7 +33,7 @@ def test_turning_moves_the_camera_side_to_the_right_hand():
     radiance = np.zeros((36, 72, 3), np.float32)
     radiance[10, 36] = 1.0  # near +z
     vectors = environments.directions(36)
-    there = vectors[environments.turned(radiance, 90.0)[..., 0] > 0][0]
+    there = vectors[environments.turn(radiance, 90.0)[..., 0] > 0][0]
     before = vectors[10, 36]
     np.testing.assert_allclose(there, [before[2], before[1], -before[0]], atol=1e-9)
 
