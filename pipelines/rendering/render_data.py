@@ -65,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
     preset, out = presets.from_arguments(args)
     options, cluster = run_options(args), cluster_config.from_arguments(args)
     with (
-        mirror.opened(out / "data", purpose="run") as folder,
+        mirror.open_folder(out / "data", purpose="run") as folder,
         open_pool(cluster, folder, timeout=options.timeout) as pool,
     ):
         scenes = planned_scenes(preset, folder)
@@ -73,7 +73,7 @@ def main(args: argparse.Namespace) -> int:
         summary = render_supervised(scenes, folder, options, pool=pool)
         if summary.lines:
             write_preview(scenes, folder)
-    sys.stdout.write(report(summary, mirror.shown(folder), len(scenes[0].lights)))
+    sys.stdout.write(report(summary, mirror.display_name(folder), len(scenes[0].lights)))
     return 1 if summary.failed or summary.skipped else 0
 
 
@@ -157,7 +157,7 @@ def write_preview(scenes: list[SceneSpec], folder: Path) -> None:
     Raises:
         InputError: none is there any more.
     """
-    finished = mirror.finished(folder, scenes)
+    finished = mirror.select_rendered(folder, scenes)
     if not finished:
         raise InputError(
             f"{folder}: the shards that were rendered are gone; was the folder moved? run the command again"

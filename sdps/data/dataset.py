@@ -16,7 +16,7 @@ from torch.nn import functional
 from torch.utils.data import Dataset
 
 from render.records.manifest import SceneSpec
-from render.records.mirror import packed_as
+from render.records.mirror import describe_packing
 from render.shared.errors import InputError
 from render.shared.imaging.mixing import LightStage, mix, require_enough
 from render.shared.seeds import generator
@@ -103,7 +103,7 @@ class SceneDataset(Dataset[Any]):
         self.split = split
         self.options = options
         self.scenes = finished_scenes(Path(folder), split, skip_missing=skip_missing)
-        self.packed = packed_as(Path(folder), self.scenes)
+        self.packed = describe_packing(Path(folder), self.scenes)
         # Scenes of a set that does not fit would leave the cache before they are used a second time.
         fits = self.packed is None or self.packed.limit > _WITH_DECODED * self.packed.size
         self.store = SceneStore(Path(folder), cache=cache and fits)

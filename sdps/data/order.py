@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.records.mirror import Packed, shown
+from render.records.mirror import Packed, display_name
 from render.records.packs import PACK
 from render.records.shards import file_hash
 from render.shared.errors import InputError
@@ -98,8 +98,8 @@ class PackedOrder:
         in_use = min(2 * window + 2 * self.ahead, len(dataset)) * packed.size / len(dataset)
         if packed.limit < in_use:
             raise InputError(
-                f"{shown(dataset.store.folder)}: shuffling among {window} scenes keeps {in_use / 1e9:.3g} GB on this "
-                f"disk, and --cache-gb is {packed.limit / 1e9:.3g}; raise it, or lower shuffle_window"
+                f"{display_name(dataset.store.folder)}: shuffling among {window} scenes keeps {in_use / 1e9:.3g} GB "
+                f"on this disk, and --cache-gb is {packed.limit / 1e9:.3g}; raise it, or lower shuffle_window"
             )
 
     def identity(self) -> dict[str, Any]:
