@@ -1,4 +1,4 @@
-"""Rendering from Python: images of one's own mesh, material and lights, or a whole plan of scenes.
+"""Rendering from Python: images of your own mesh, material and lights, or a whole plan of scenes.
 
 ```python
 import render
@@ -255,7 +255,7 @@ def render_plan(scenes: Sequence[SceneSpec], folder: str | Path, *, workers: int
 def fit_material(
     file: str | Path, brdf: Callable[[np.ndarray, np.ndarray], np.ndarray], *, source: str = "", terms: str = ""
 ) -> Material:
-    """Fit the built-in reflectance model to a BRDF of one's own, and write it as a material file.
+    """Fit the built-in reflectance model to your own BRDF, and write it as a material file.
 
     The model is isotropic and reciprocal, tabulated over half and difference angle; `fit_error` of the result is the
     relative RMS error of a sphere under 20 lights. Where the BRDF reflects more light than it receives, it is lowered.

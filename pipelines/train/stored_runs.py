@@ -65,7 +65,7 @@ class StoredRuns:
         self._sending: Future[None] | None = None
 
     def fetch(self, names: Sequence[str]) -> None:
-        """Bring runs here as the store has them, on every machine, before one of them is gone on with.
+        """Bring runs here as the store has them, on every machine, before one of them resumes.
 
         Raises:
             InputError: the store cannot be read.

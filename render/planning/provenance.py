@@ -125,6 +125,6 @@ def _terms_of(name: str) -> tuple[str, str]:
 
 
 def mesh_terms(counts: PlanCounts, own: str = "") -> dict[str, str]:
-    """Return {shape family or mesh file: terms of use} of a composition; `own` are those of the family `meshes`."""
+    """Return {shape family or mesh file: terms of use} of a plan; `own` are those of the family `meshes`."""
     known = MESHES | {IMPORTED: ORIGINAL} | ({OWN_MESHES: own} if own else {})
     return {name: known.get(name, UNSTATED) for name in counts.families}

@@ -217,7 +217,7 @@ class _Run:
         if not self.lines and len(self.failed) >= HOPELESS:
             raise InputError(
                 f"{self.folder}: the first {len(self.failed)} scenes all failed, the last one: {failure.reason}; "
-                "mend that, then run it again with --retry-failed"
+                "fix that, then run it again with --retry-failed"
             )
 
     def _update_bar(self, count: int) -> None:

@@ -208,16 +208,16 @@ def _of_the_store(error: Exception) -> bool:
 
 
 def _hopeless(where: str, error: Exception) -> InputError | None:
-    """Return what to say of an error that waiting does not mend."""
+    """Return what to say of an error that waiting does not help."""
     if isinstance(error, FileNotFoundError):
-        return Missing(f"{where}: {_short(error)}; create the bucket, or mend the address")
+        return Missing(f"{where}: {_short(error)}; create the bucket, or correct the address")
     if isinstance(error, PermissionError) or "Credential" in type(error).__name__:
         return InputError(f"{where}: refused ({_short(error)}); check the keys (for s3: `aws sts get-caller-identity`)")
     if isinstance(error, OSError) and error.errno in _HOPELESS:
-        return InputError(f"{where}: {_short(error)}; mend the address")
+        return InputError(f"{where}: {_short(error)}; correct the address")
     status = getattr(error, "status", 0)  # of aiohttp
     if status in (400, 401, 403, 404, 410):
-        return Missing(f"{where}: {_short(error)}; mend the address")
+        return Missing(f"{where}: {_short(error)}; correct the address")
     return None
 
 

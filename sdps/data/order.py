@@ -1,4 +1,4 @@
-"""In which order a trainer takes scenes: a matter of seed, epoch and place alone, so any place can be gone on from.
+"""In which order a trainer takes scenes: a matter of seed, epoch and place alone, so training can resume at any place.
 
 Of a packed set, too large to be shuffled as a whole, the tars come in random order and every scene is moved back at
 random by less than a window. So only the tars of about a window are in use at a time, and what a buffer of a stream

@@ -103,7 +103,7 @@ class StreamedScenes:
         """Yield batches endlessly, from sample `taken` on, a multiple of the batch; end after a mistake."""
         number, rest = divmod(taken, self.batch)
         if rest:
-            raise InputError(f"a stream goes on at a multiple of batch_scenes ({self.batch}) samples, not at {taken}")
+            raise InputError(f"a stream resumes at a multiple of batch_scenes ({self.batch}) samples, not at {taken}")
         self.close()
         self._running = self._run(number)
         return self._running

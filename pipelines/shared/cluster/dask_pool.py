@@ -70,7 +70,7 @@ class DaskPool:
         return bool(self.queue or self.out)
 
     def poll(self) -> list[Outcome]:
-        """Send chunks, fetch one that is done, and mend a connection that broke."""
+        """Send chunks, fetch one that is done, and restore a connection that broke."""
         if self.lost is not None:
             return self._reconnect()
         try:

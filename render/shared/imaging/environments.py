@@ -184,7 +184,7 @@ def _read(path: Path) -> np.ndarray:
                 with silence():
                     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if pixels is None or pixels.ndim != 3:
-            raise InputError(f"{path}: damaged or no Radiance picture; save it as .hdr or .exr again")
+            raise InputError(f"{path}: damaged or not a Radiance picture; save it as .hdr or .exr again")
         return pixels[..., ::-1]
     pixels = read_exr_colours(path, "save it as .hdr or .exr again").pixels
     if pixels.shape[2] != 3:
