@@ -108,7 +108,7 @@ class PackedOrder:
             return {}
         return {"pack": file_hash(self.dataset.store.folder / PACK), "shuffle_window": self.windows.window}
 
-    def fetching(self, batches: Iterable[list[SampleKey]], size: int) -> Iterator[list[SampleKey]]:
+    def prefetch(self, batches: Iterable[list[SampleKey]], size: int) -> Iterator[list[SampleKey]]:
         """Yield batches of keys while a thread fetches what those to come are made of.
 
         Args:

@@ -153,7 +153,7 @@ def test_white_stays_white_up_to_the_horizon():
     np.testing.assert_allclose(merl.evaluate(table, wi, wo), 1 / np.pi, rtol=1e-6)
 
 
-def test_what_was_not_measured_takes_its_neighbours_colour_and_is_told_apart(blank):
+def test_what_was_not_measured_takes_its_neighbours_colour_and_is_marked(blank):
     blank[:] = np.arange(90).reshape(90, 1, 1) + 1
     blank[1, 60:] = -0.5  # one bad channel spoils the entry
     blank[:, :, 50] = -1

@@ -147,7 +147,7 @@ def test_a_mesh_that_cannot_be_framed_is_named(folder):
         plan(config(folder, 1, min_foreground={"meshes": 0.9}))
 
 
-def test_a_changed_or_moved_file_is_told(folder, tmp_path):
+def test_a_changed_or_moved_file_is_refused(folder, tmp_path):
     path = folder / "box0.obj"
     (scene,) = plan(config(path, 1))
     path.write_text(path.read_text() + "# touched\n")

@@ -449,7 +449,7 @@ def test_held_out_materials_are_seen_in_validation_only() -> None:
             assert scene == before[scene.id]
 
 
-def test_procedural_materials_are_drawn_anew_for_every_scene():
+def test_procedural_materials_are_drawn_again_for_every_scene():
     config = DataConfig(families={"blobby": 12}, materials=("procedural",), spatially_varying=0.5, validation=0)
     names = [scene.material for scene in plan(config)]
     assert all(name.startswith("procedural:") for name in names)
@@ -459,7 +459,7 @@ def test_procedural_materials_are_drawn_anew_for_every_scene():
         surfaces.load(name)
 
 
-def test_procedural_materials_beside_others_are_weighed_and_stay_unmixed():
+def test_procedural_materials_among_others_are_weighed_and_stay_unmixed():
     pool = ("metal", "procedural:wood", "lambertian:0.5")
     config = DataConfig(families={"blobby": 40}, materials=pool, material_weights={"procedural": 20}, validation=0,
                         spatially_varying=0.8)  # fmt: skip

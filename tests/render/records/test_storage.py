@@ -132,7 +132,7 @@ def test_readers_see_in_a_store_what_lies_in_a_folder(tmp_path: Path) -> None:
             assert np.array_equal(away.load(scene).images[:], here.load(scene).images[:])
 
 
-def test_the_cache_keeps_to_its_limit_and_forgets_what_was_written_anew(
+def test_the_cache_keeps_to_its_limit_and_forgets_what_was_written_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url, scenes = filled(tmp_path)
@@ -236,7 +236,7 @@ def strict(s3: ObjectStore) -> Iterator[None]:
 
 
 def commands(place: str, out: Path) -> list[list[str]]:
-    """Return every command that takes an address, told to use one."""
+    """Return every command that takes an address, with one to use."""
     train = ["train", "--preset", "smoke", "--out"]
     return [
         *(["data", verb, place] for verb in ("status", "validate", "preview", "card")),

@@ -270,7 +270,7 @@ def test_another_machines_half_written_shards_go_by_the_clock_of_the_file_server
 # ---- The real renderer -----------------------------------------------------------------------------
 
 
-def test_real_processes_write_the_bytes_of_a_plain_run_whatever_fails_beside_them(tmp_path, monkeypatch):
+def test_real_processes_write_the_bytes_of_a_plain_run_whatever_else_fails(tmp_path, monkeypatch):
     """Two processes; one scene's material file is missing, another one blocks its process, which is then killed."""
     from render.running import rendered_view
     from render.running.scene_rendering import render_scenes

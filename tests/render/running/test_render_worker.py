@@ -112,7 +112,7 @@ def test_lights_brighten_the_side_they_stand_on(tmp_path):
     np.testing.assert_allclose(shard.images[..., 1].astype(np.float32)[:, inner], expected[:, inner], atol=0.02)
 
 
-def test_object_outside_the_frame_is_sent(scenes, tmp_path):
+def test_object_outside_the_frame_is_refused(scenes, tmp_path):
     lost = replace(scenes[0], view=View(scale=0.05, offset=(4.0, 0.0)))
     with pytest.raises(InputError, match=r"outside the frame; check view\.scale"):
         scene_rendering.render_scenes([lost], tmp_path)
@@ -187,7 +187,7 @@ def test_bounces_add_light_to_a_varying_surface(tmp_path):
     np.testing.assert_array_equal(bounced.weights, direct.weights)
 
 
-def test_an_unknown_part_of_a_pattern_is_sent(scenes, tmp_path):
+def test_an_unknown_part_of_a_pattern_is_refused(scenes, tmp_path):
     with pytest.raises(InputError, match="did you mean 'chrome'"):
         scene_rendering.render_scenes([replace(scenes[0], material="stripes:1:crome+nylon")], tmp_path)
 

@@ -80,9 +80,9 @@ def test_edges_corners_and_faces_meet_exactly():
     assert free_path(box((1, 1, 1), diagonal, (0, 4, 0)), cube, DOWN) == pytest.approx(
         3.5 - np.sqrt(0.5) - CLEARANCE, abs=1e-6
     )
-    beside = box((1, 1, 1), at=(1.5, 0.2, 0))
-    assert free_path(beside, cube, np.array([-1.0, 0, 0])) == pytest.approx(0.5 - CLEARANCE, abs=1e-6)
-    assert free_path(beside, cube, np.array([1.0, 0, 0])) == np.inf
+    other = box((1, 1, 1), at=(1.5, 0.2, 0))
+    assert free_path(other, cube, np.array([-1.0, 0, 0])) == pytest.approx(0.5 - CLEARANCE, abs=1e-6)
+    assert free_path(other, cube, np.array([1.0, 0, 0])) == np.inf
 
 
 def test_every_kind_is_drawn():

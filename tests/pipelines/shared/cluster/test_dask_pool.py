@@ -1,4 +1,4 @@
-"""Rendering on a Dask cluster: the books are those of a local run, whatever happens to workers and scheduler.
+"""Rendering on a Dask cluster: its records are those of a local run, whatever happens to workers and scheduler.
 
 Most tests run processes that only pretend to render, on two workers of this machine.
 """
@@ -91,7 +91,7 @@ def rendering(address: str) -> int:
         return sum(client.run(lambda: len(multiprocessing.active_children())).values())
 
 
-def test_books_and_bytes_are_those_of_a_local_run(tmp_path, address):
+def test_records_and_bytes_are_those_of_a_local_run(tmp_path, address):
     scenes = planned([["ok", "raise", "ok"], ["ok", "hang"], ["die", "ok"], ["ok", "quit"], ["ok"] * 4])
     here = render_supervised(scenes, tmp_path / "a", RunOptions(workers=2, timeout=HANGS), serve=pretend)
     there = run(scenes, tmp_path / "b", address, timeout=HANGS)

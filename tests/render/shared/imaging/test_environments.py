@@ -82,7 +82,7 @@ def test_what_is_no_map_is_refused_in_one_line(tmp_path):
     write_exr(tmp_path / "grey.exr", [("map", {}, {"Y": good[..., 0]})])
     refused("grey.exr", "needs R, G and B")
     (tmp_path / "text.hdr").write_text("no picture")
-    refused("text.hdr", "no Radiance picture")
+    refused("text.hdr", "not a Radiance picture")
     (tmp_path / "text.exr").write_text("no picture")
     refused("text.exr", "not an EXR picture")
     refused("missing.hdr", "no such environment map")
