@@ -223,7 +223,7 @@ def test_damage_in_the_folder_is_named(tmp_path, capsys):
 
 
 def test_non_finite_shards_are_found_on_disk(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(shards, "_checked", lambda array, name: np.ascontiguousarray(array))
+    monkeypatch.setattr(shards, "_check", lambda array, name: np.ascontiguousarray(array))
     shard = sphere_shard()
     write_folder(tmp_path, [images_of(shard, spoil(shard.images, np.nan))])
     assert main(["data", "validate", str(tmp_path)]) == 1
