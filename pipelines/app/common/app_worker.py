@@ -15,7 +15,7 @@ from typing import Any
 
 from render.backend.orphans import end_with_parent
 from render.shared.errors import InputError
-from render.shared.progress import listening
+from render.shared.progress import report_to
 
 TASKS = {
     "example": "pipelines.app.pages.photo_tasks:render_example",
@@ -43,7 +43,7 @@ def serve(pipe: Connection) -> None:
             return
         answer: tuple[Any, ...]
         try:
-            with listening(_make_reporter(pipe)):
+            with report_to(_make_reporter(pipe)):
                 result = load_task(name)(**arguments)
             _clean_up()
             answer = ("done", result, measure_memory())

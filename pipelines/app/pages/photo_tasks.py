@@ -17,7 +17,7 @@ from pipelines.app.pages import object_view
 from pipelines.shared import pictures
 from render.shared.errors import InputError
 from render.shared.files import write_json
-from render.shared.progress import stage, together
+from render.shared.progress import share_out, stage
 
 PHOTOS, VIEW, PAINTED, TRUTH = "photos", "view", "painted.png", "truth.npy"
 _EXAMPLE = {"shape": "bunny", "material": "red-phenolic", "lights": "near-uniform:48", "size": 256, "spp": 32}
@@ -61,7 +61,7 @@ def check(place: str, **options: Any) -> dict[str, Any]:
     from sdps import photos as photographs
 
     folder = Path(place)
-    with together(_CHECKING), _shorten_paths(folder):
+    with share_out(_CHECKING), _shorten_paths(folder):
         stage("reading")
         photos = _load(folder, anyway=True, **options)
         stage("checks")
@@ -130,7 +130,7 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
     run = folder / "runs" / str(number)
     _remove_failed_runs(run)
     shares = _INFERRING | ({"refinement": 40.0} if refine or method.endswith("+refine") else {})
-    with together(shares), _shorten_paths(folder):
+    with share_out(shares), _shorten_paths(folder):
         stage("reading")
         photos = _load(folder, anyway=anyway, **options)
         result = sdps.infer(

@@ -17,7 +17,7 @@ from sdps_scenes import errors, write_data
 
 from pipelines.cli import main
 from render.records import mirror
-from render.records.mirror import opened
+from render.records.mirror import open_folder
 from render.shared.config import build
 from render.shared.errors import InputError
 from sdps.data.dataset import SampleKey, SceneDataset, collate
@@ -103,7 +103,7 @@ def tars(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_packed_set_gives_the_losses_of_the_folder(folder: Path, tars: Path, uninterrupted: tuple) -> None:
-    with opened(tars) as data:
+    with open_folder(tars) as data:
         train(NormalStage(replace(QUICK, workers=1)), data, tars / "run", loggers=[StopAt(3)])
         train(NormalStage(QUICK), data, tars / "run")
     assert_same_run(uninterrupted[0], tars / "run")
@@ -115,7 +115,7 @@ def test_a_packed_set_larger_than_its_cache_goes_on_as_if_uninterrupted(
 ) -> None:
     monkeypatch.setattr(mirror, "_IN_USE", -1.0 if workers == 0 else 0.5)
     config = replace(QUICK, workers=workers, shuffle_window=1, steps=12)  # five scenes, in pairs
-    with opened(tars, cache_gb=75e-6) as data:
+    with open_folder(tars, cache_gb=75e-6) as data:
         train(NormalStage(config), data, tmp_path / "whole")
         assert not list(data.glob("cache/sphere_00[0-4]*"))  # decoded, they would leave it before they are used again
         assert train(NormalStage(config), data, tmp_path / "parts", loggers=[StopAt(5)]).interrupted
@@ -124,7 +124,7 @@ def test_a_packed_set_larger_than_its_cache_goes_on_as_if_uninterrupted(
         assert_same_run(tmp_path / "whole", tmp_path / "parts")
         with pytest.raises(InputError, match=r"of another run \(shuffle_window was 1, now 2\)"):
             train(NormalStage(replace(config, shuffle_window=2)), data, tmp_path / "parts")
-    with opened(tars, cache_gb=20e-6) as data, pytest.raises(InputError, match="shuffling among 1 scenes keeps"):
+    with open_folder(tars, cache_gb=20e-6) as data, pytest.raises(InputError, match="shuffling among 1 scenes keeps"):
         train(NormalStage(config), data, tmp_path / "none")
 
 

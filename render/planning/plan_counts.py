@@ -17,7 +17,7 @@ IMPORTED = "imported"  # family of shapes, and prefix of materials, that came wi
 
 
 @dataclass(frozen=True)
-class Composition:
+class PlanCounts:
     """Counts over the scenes of a manifest; every mapping is sorted, the most frequent first.
 
     Attributes:
@@ -79,7 +79,7 @@ def category(material: str) -> str:
         return "other"
 
 
-def compose(scenes: Sequence[SceneSpec]) -> Composition:
+def count_plan(scenes: Sequence[SceneSpec]) -> PlanCounts:
     """Count what a manifest holds."""
     per_family: dict[str, list[Any]] = {}
     for scene in scenes:
@@ -87,26 +87,26 @@ def compose(scenes: Sequence[SceneSpec]) -> Composition:
         entry[0] += 1
         entry[1].add(scene.shape)
         entry[2].add(_view_key(scene))
-    parts = [tuple(map(textured.unseeded, components(scene.material))) for scene in scenes]
+    parts = [tuple(map(textured.without_seed, components(scene.material))) for scene in scenes]
     names = Counter(name for names in parts for name in set(names))
     kinds = {name: category(name) for name in names}
-    return Composition(
+    return PlanCounts(
         scenes=len(scenes),
         images=sum(len(scene.lights) for scene in scenes),
         shapes=sum(len(entry[1]) for entry in per_family.values()),
         views=sum(len(entry[2]) for entry in per_family.values()),
-        families=_counted(family(scene.shape) for scene in scenes),
-        splits=_counted(scene.split for scene in scenes),
+        families=_count(family(scene.shape) for scene in scenes),
+        splits=_count(scene.split for scene in scenes),
         materials=dict(names.most_common()),
-        categories=_counted(kind for names in parts for kind in {kinds[name] for name in names}),
+        categories=_count(kind for names in parts for kind in {kinds[name] for name in names}),
         near=sum(bool(scene.light_distances) for scene in scenes),
         perspective=sum(scene.view.camera_distance is not None for scene in scenes),
         varying=sum(len(names) > 1 for names in parts),
         per_family={name: (count, len(shapes), len(views)) for name, (count, shapes, views) in per_family.items()},
-        light_counts=_counted(len(scene.lights) for scene in scenes),
-        sizes=_counted("{1}x{0}".format(*scene.resolution) for scene in scenes),
-        spp=_counted(scene.spp for scene in scenes),
-        bounces=_counted(scene.bounces for scene in scenes),
+        light_counts=_count(len(scene.lights) for scene in scenes),
+        sizes=_count("{1}x{0}".format(*scene.resolution) for scene in scenes),
+        spp=_count(scene.spp for scene in scenes),
+        bounces=_count(scene.bounces for scene in scenes),
     )
 
 
@@ -120,5 +120,5 @@ def _view_key(scene: SceneSpec) -> tuple[Hashable, ...]:
     return scene.shape, scene.view, scene.lights, scene.light_distances
 
 
-def _counted(items: Iterable[Any]) -> dict[Any, int]:
+def _count(items: Iterable[Any]) -> dict[Any, int]:
     return dict(Counter(items).most_common())

@@ -259,7 +259,7 @@ def test_a_sheet_is_wound_as_most_of_it_is(tmp_path):
 
 
 def gltf(tmp_path, **changes):
-    """Write a box as glTF with its buffer beside it; return the path and the tree."""
+    """Write a box as glTF with its buffer next to it; return the path and the tree."""
     box = trimesh.creation.box()
     points, index = box.vertices.astype("<f4").tobytes(), box.faces.astype("<u2").tobytes()
     (tmp_path / "my box.bin").write_bytes(points + index)

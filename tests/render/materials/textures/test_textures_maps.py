@@ -38,7 +38,7 @@ def test_base_colour_is_srgb_and_the_others_are_linear(tmp_path):
      ("A_1K-PNG_Color.png", "A_1K-PNG_Roughness.png", "A_1K-PNG_Metalness.png", "A_1K-PNG_NormalGL.png",
       "A_1K-PNG_NormalDX.png", "A_1K-PNG_Displacement.png")],
 )  # fmt: skip
-def test_maps_are_told_by_the_names_of_both_shops(tmp_path, names):
+def test_maps_are_known_by_the_names_of_both_shops(tmp_path, names):
     for name in (*names, "A.png", "A_preview.usdc", "a_ao_2k.png"):
         (tmp_path / name).write_bytes(b"")
     maps = find(tmp_path)

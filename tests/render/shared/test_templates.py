@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from jinja2 import UndefinedError
 
-from render.shared.templates import fill, inline, markdown_table, spelled
+from render.shared.templates import fill, inline, markdown_table, spell
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_html_escapes_every_value_and_markdown_what_is_inline(tmp_path: Path) -> None:
@@ -32,7 +32,7 @@ def test_cells_break_no_table() -> None:
 
 
 def test_counts_are_spelled() -> None:
-    assert spelled({64: 100}) == "64" and spelled({64: 1000, 32: 2}) == "64 (1,000 scenes), 32 (2 scenes)"
+    assert spell({64: 100}) == "64" and spell({64: 1000, 32: 2}) == "64 (1,000 scenes), 32 (2 scenes)"
 
 
 def test_every_template_is_packaged() -> None:

@@ -7,7 +7,7 @@ from brdf_support import directions, vector
 from render.backend.jit import dr, mi
 from render.materials import library, model
 from render.materials.fit import spheres
-from render.materials.kernels import bsdf, lobes
+from render.materials.kernels import bsdf, lobes, surface_bsdf
 from render.shared.errors import InputError
 
 NAMES = ("chrome", "steel", "pink-fabric", "specular-orange-phenolic", "lambertian:0.8/0.3/0.1")
@@ -74,10 +74,10 @@ def test_symbolic_loop_over_materials_compiles_once_for_any_set(packed):
 def test_sampling_follows_the_density(name, incidence):
     from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
 
-    bsdf.register()
+    surface_bsdf.register()
     angle = float(np.radians(incidence))
     wi = mi.Vector3f(dr.sin(angle), 0, dr.cos(angle))
-    sample, density = BSDFAdapter("ps_material", f'<string name="material" value="{name}"/>', wi=wi)
+    sample, density = BSDFAdapter("ps_surface", f'<string name="material" value="{name}"/>', wi=wi)
     # Fine bins: the test's own quadrature of the density misses sub-degree steps otherwise.
     test = ChiSquareTest(
         domain=SphericalDomain(),
@@ -105,8 +105,8 @@ def test_density_integrates_to_the_share_of_directions_above_the_horizon(packed)
 
 @pytest.mark.parametrize("name", ["chrome", "gold-metallic-paint", "white-marble", "lambertian:0.5"])
 def test_importance_sampling_estimates_the_directional_albedo(name):
-    bsdf.register()
-    plugin = mi.load_dict({"type": "ps_material", "material": name})
+    surface_bsdf.register()
+    plugin = mi.load_dict({"type": "ps_surface", "material": name})
     count = 200_000
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.wi = mi.Vector3f(0.6, 0, 0.8)
@@ -128,12 +128,12 @@ def test_importance_sampling_estimates_the_directional_albedo(name):
 
 @pytest.mark.parametrize("name", ["chrome", "red-plastic"])
 def test_plugin_renders_a_directly_lit_sphere_as_the_reference(name):
-    bsdf.register()
+    surface_bsdf.register()
     light = np.array([0.48, 0.36, 0.8])
     scene = mi.load_dict(
         {
             "type": "scene",
-            "sphere": {"type": "sphere", "bsdf": {"type": "ps_material", "material": name}},
+            "sphere": {"type": "sphere", "bsdf": {"type": "ps_surface", "material": name}},
             "light": {"type": "directional", "direction": list(-light), "irradiance": float(np.pi)},
         }
     )
@@ -150,9 +150,9 @@ def test_plugin_renders_a_directly_lit_sphere_as_the_reference(name):
 
 
 def test_plugin_exposes_its_tables_and_names_itself():
-    bsdf.register()
-    bsdf.register()
-    plugin = mi.load_dict({"type": "ps_material", "material": "brass"})
+    surface_bsdf.register()
+    surface_bsdf.register()
+    plugin = mi.load_dict({"type": "ps_surface", "material": "brass"})
     assert {"tables", "shadowing", "lobes"} <= {key.rsplit(".", 1)[-1] for key in mi.traverse(plugin).keys()}  # noqa: SIM118
     assert "brass" in str(plugin)
 

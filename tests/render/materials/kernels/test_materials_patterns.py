@@ -200,7 +200,7 @@ def test_a_name_gives_components_and_pattern():
         ("parts:7:stripes:1:chrome+nylon", "stripes"),
     ],
 )
-def test_a_wrong_name_is_told_in_one_line(name, message):
+def test_a_wrong_name_is_one_line(name, message):
     with pytest.raises(InputError, match=message) as caught:
         surfaces.load(name)
     assert "\n" not in str(caught.value)

@@ -1,23 +1,22 @@
 """Rendering planned scenes into shards: view by view, resumable, each shard whole or absent.
 
-`render_scenes` does it in this process and stops at the first mistake; `render.running.supervisor` has the same
-pieces run by processes of their own, and goes on after failures.
+`render_scenes` does it in this process and stops at the first mistake; `render.running.worker_process` uses the same
+pieces in a process of its own, and goes on after failures.
 """
 
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from render.backend.jit import dr
 from render.kernel.scene import Scene, build
 from render.materials.kernels.packed import pack
-from render.planning.chunks import view_groups
+from render.planning.chunks import cut
 from render.records.manifest import SceneSpec
 from render.records.shards import Shard, is_whole, write_shard
-from render.running.rendered import rendered_views
+from render.running.rendered_view import rendered_views
 from render.shapes import load as load_shape
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
@@ -95,14 +94,11 @@ def render_scenes(
     folder = Path(folder)
     missing = {scene.id for scene in scenes if not is_whole(folder / scene.file, scene)}
     with progress_bar(total=len(scenes), initial=len(scenes) - len(missing), unit="scene", desc="render") as bar:
-        # Consecutive views of one shape share its mesh and acceleration structure.
-        for shape, run in groupby(view_groups(scenes), key=lambda group: group[0].shape):
-            groups = [group for group in run if any(scene.id in missing for scene in group)]
-            if not groups:
-                continue
-            built, stages = build(load_shape(shape)), Stages()
-            for group in groups:
-                for scene in render_group(built, group, folder, missing, stages):
+        for chunk in cut(scenes, missing):
+            built, stages = build(load_shape(chunk.shape)), Stages()
+            for group in chunk.groups:
+                for scene, shard in group_shards(built, group, missing, stages):
+                    write(folder / scene.file, shard)
                     bar.update()
                     if on_shard:
                         on_shard(scene)
@@ -110,23 +106,8 @@ def render_scenes(
     return len(missing)
 
 
-def render_group(
-    built: Scene, group: list[SceneSpec], folder: Path, missing: set[str], stages: Stages
-) -> Iterator[SceneSpec]:
-    """Render the missing scenes of one view and write their shards; yield each scene when its shard is written.
-
-    Raises:
-        InputError: an unusable material, an object outside the frame, or images that are not finite.
-        Unwritable: a full disk or an unwritable folder.
-    """
-    for scene, shard in group_shards(built, group, missing, stages):
-        with stages.time("write"):
-            _write(folder / scene.file, shard)
-        yield scene
-
-
 def group_shards(
-    built: Scene, group: list[SceneSpec], missing: set[str], stages: Stages
+    built: Scene, group: Sequence[SceneSpec], missing: set[str], stages: Stages
 ) -> Iterator[tuple[SceneSpec, Shard]]:
     """Render the missing scenes of one view, always from the whole group's rays, in the order of the group.
 
@@ -143,8 +124,8 @@ def group_shards(
         yield view.scene, view.shard()
 
 
-def _write(path: Path, shard: Shard) -> None:
-    """Write a shard; tell a disk that refuses it from images that must not be written.
+def write(path: Path, shard: Shard) -> int:
+    """Write a shard and return its bytes; distinguish a disk that refuses it from images that must not be written.
 
     Raises:
         Unwritable: the disk is full or the folder unwritable.
@@ -152,6 +133,7 @@ def _write(path: Path, shard: Shard) -> None:
     """
     try:
         write_shard(path, shard)
+        return path.stat().st_size
     except InputError as error:
         if isinstance(error.__cause__, OSError):
             raise Unwritable(str(error)) from error

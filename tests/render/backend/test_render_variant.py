@@ -71,7 +71,7 @@ def test_other_versions_are_tried_and_aborting_ones_are_not(clean):
 
 
 @pytest.mark.parametrize("versions", [(), (16,), (14, 15)])
-def test_without_a_usable_library_the_remedy_is_told(clean, versions):
+def test_without_a_usable_library_the_remedy_is_named(clean, versions):
     clean.setattr(variant, "find_llvm", lambda: [(n, Path(f"/x/libLLVM.so.{n}")) for n in versions])
     with pytest.raises(InputError, match=r"no working libLLVM.*apt-get install libllvm19") as caught:
         choose()
@@ -219,7 +219,7 @@ def test_a_cache_of_ones_own_does_without_a_library_of_its_own(monkeypatch, tmp_
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-def test_what_an_unpacked_library_needs_is_loaded_from_beside_it(monkeypatch, tmp_path):
+def test_what_an_unpacked_library_needs_is_loaded_from_its_folder(monkeypatch, tmp_path):
     """In a process of its own: of three libraries each needs the next, and the system knows none."""
     place = tmp_path / "llvm/usr/lib/x86_64-linux-gnu"
     place.mkdir(parents=True)

@@ -50,14 +50,14 @@ def test_the_slope_is_the_derivative_of_the_height(kind):
 def test_normals_are_turned_against_the_slope():
     """Of a height a.x over a plane, the normal is that of the tilted plane."""
     slope, normal = np.array([[0.3, -0.2, 5.0]]), np.array([[0.0, 0.0, 1.0]])
-    found = np.array(cover.turned(vectors(normal), vectors(slope), vectors(VIEWER[None])))[:, 0]
+    found = np.array(cover.turn(vectors(normal), vectors(slope), vectors(VIEWER[None])))[:, 0]
     np.testing.assert_allclose(found, np.array([-0.3, 0.2, 1]) / np.linalg.norm([0.3, 0.2, 1]), atol=1e-6)
 
 
 def test_no_facet_that_is_seen_faces_away():
     at = points()
     rng = np.random.default_rng(0)
-    normal = np.array(cover.turned(vectors(at), vectors(rng.normal(size=at.shape) * 3), vectors(VIEWER[None]))).T
+    normal = np.array(cover.turn(vectors(at), vectors(rng.normal(size=at.shape) * 3), vectors(VIEWER[None]))).T
     seen = at[:, 2] > 0
     assert (normal[seen, 2] > 0).all()
     np.testing.assert_allclose(normal[~seen], at[~seen], atol=1e-6)
@@ -158,9 +158,9 @@ def test_names():
     assert kinds == set(KINDS)  # a seed alone draws the kind
     pattern, names = surfaces.split("procedural:tiles:7:chrome+brass")
     assert pattern.texture == "tiles" and pattern.seed == 7 and names == ("chrome", "brass")
-    assert textured.unseeded("procedural:wood:7") == "procedural:wood"
-    assert textured.unseeded("chrome") == "chrome"
+    assert textured.without_seed("procedural:wood:7") == "procedural:wood"
+    assert textured.without_seed("chrome") == "chrome"
     rng = np.random.default_rng(0)
-    assert textured.drawn("chrome", rng) == "chrome"
-    surfaces.load(textured.drawn("procedural:rust", rng))
-    surfaces.load(textured.drawn("procedural", rng))
+    assert textured.complete("chrome", rng) == "chrome"
+    surfaces.load(textured.complete("procedural:rust", rng))
+    surfaces.load(textured.complete("procedural", rng))

@@ -135,7 +135,7 @@ def _describe(scene: SceneSpec) -> dict[str, str | int | float]:
         "frame": "x right, y up, z to the camera",
         "variant": variant.load().variant(),
         **_camera_and_lights(scene),
-        **_software(_stamped),
+        **_software(_commit),
     }
 
 
@@ -156,18 +156,18 @@ def _camera_and_lights(scene: SceneSpec) -> dict[str, str | float]:
     return found
 
 
-_stamped: str | None = None
+_commit: str | None = None
 
 
-def stamp(commit: str | None) -> None:
+def set_commit(commit: str | None) -> None:
     """Let the headers of this process's shards name a commit; None: that of this machine's copy."""
-    global _stamped
-    _stamped = commit
+    global _commit
+    _commit = commit
 
 
 @cache
-def _software(stamped: str | None) -> dict[str, str]:
+def _software(commit: str | None) -> dict[str, str]:
     """Return the versions of this package and of those a shard depends on, and the commit in a checkout."""
     versions = {name: version for name, version in provenance.versions().items() if name in provenance.PACKAGES}
-    commit = provenance.commit() if stamped is None else stamped
+    commit = provenance.commit() if commit is None else commit
     return versions | ({"commit": commit} if commit else {})

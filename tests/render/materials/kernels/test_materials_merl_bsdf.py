@@ -8,7 +8,7 @@ from merl_support import of_library, values
 from render.backend.jit import dr, mi
 from render.materials import library, merl, model
 from render.materials.fit import spheres
-from render.materials.kernels import bsdf, lobes, merl_bsdf
+from render.materials.kernels import bsdf, lobes, merl_bsdf, surface_bsdf
 from render.shared.errors import InputError
 
 NAMES = ("chrome", "glossy", "lambertian:1")
@@ -37,8 +37,8 @@ def packed(tables):
 @pytest.fixture
 def plugin(files):
     """Return a function that loads the plugin with one of the tables."""
-    merl_bsdf.register()
-    return lambda name: mi.load_dict({"type": "merl", "filename": str(files[name])})
+    surface_bsdf.register()
+    return lambda name: mi.load_dict({"type": "ps_surface", "material": str(files[name])})
 
 
 @pytest.mark.parametrize("index", range(len(NAMES)))
@@ -105,10 +105,10 @@ def test_a_symbolic_loop_compiles_once_for_any_tables(packed, tables):
 def test_sampling_follows_the_density(files, name, incidence):
     from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
 
-    merl_bsdf.register()
+    surface_bsdf.register()
     angle = float(np.radians(incidence))
     wi = mi.Vector3f(dr.sin(angle), 0, dr.cos(angle))
-    sample, density = BSDFAdapter("merl", f'<string name="filename" value="{files[name]}"/>', wi=wi)
+    sample, density = BSDFAdapter("ps_surface", f'<string name="material" value="{files[name]}"/>', wi=wi)
     # Fine bins: the test's own quadrature of the density misses sub-degree steps otherwise.
     test = ChiSquareTest(
         domain=SphericalDomain(),
@@ -185,7 +185,7 @@ def test_plugin_renders_a_directly_lit_sphere_as_the_material_it_tabulates(plugi
 
 
 def test_plugin_exposes_its_table_and_names_itself(plugin):
-    merl_bsdf.register()  # a second time does nothing
+    surface_bsdf.register()  # a second time does nothing
     shown = plugin("glossy")
     assert {"tables", "lobes"} <= {key.rsplit(".", 1)[-1] for key in mi.traverse(shown).keys()}  # noqa: SIM118
     assert "glossy.binary" in str(shown)
@@ -198,10 +198,9 @@ def test_the_coarse_form_gives_a_lobe_where_there_is_a_highlight(tables, packed)
     assert probability[0] > 0.5 > probability[1] > 0.05 and probability[2] == 0
 
 
-def test_other_files_and_nothing_to_pack_are_errors(tmp_path):
-    merl_bsdf.register()
+def test_missing_files_and_nothing_to_pack_are_errors(tmp_path):
+    surface_bsdf.register()
     with pytest.raises(InputError, match="MERL tables can be packed"):
         merl_bsdf.PackedMerl([])
-    for name, message in (("chrome", "files ending in .binary"), (tmp_path / "absent.binary", "no such file")):
-        with pytest.raises(Exception, match=message):
-            mi.load_dict({"type": "merl", "filename": str(name)})
+    with pytest.raises(Exception, match="no such file"):
+        mi.load_dict({"type": "ps_surface", "material": str(tmp_path / "absent.binary")})

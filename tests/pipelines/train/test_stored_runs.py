@@ -14,7 +14,7 @@ from sdps_scenes import write_data
 from pipelines.cli import main
 
 pytestmark = pytest.mark.slow
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 VALUES = {
     "size": 32, "crop": 16, "images": 2, "batch_scenes": 4, "schedule": "constant", "log_every": 1,
     "validation_scenes": 2, "precision": "float32", "shuffle_window": 3, "workers": 1, "minutes": "null",

@@ -1,4 +1,4 @@
-"""Rendering on a Dask cluster: the books are those of a local run, whatever happens to workers and scheduler.
+"""Rendering on a Dask cluster: its records are those of a local run, whatever happens to workers and scheduler.
 
 Most tests run processes that only pretend to render, on two workers of this machine.
 """
@@ -22,7 +22,7 @@ from pretend_renderer import pretend, stillborn
 from pipelines import cli
 from pipelines.shared.cluster import link
 from pipelines.shared.cluster.cluster_config import ClusterChoice, ClusterConfig
-from pipelines.shared.cluster.dask_crew import crew_on
+from pipelines.shared.cluster.dask_pool import open_pool
 from render.backend import variant
 from render.planning import chunks
 from render.planning.chunks import Chunk
@@ -30,9 +30,11 @@ from render.records import ledger
 from render.records.ledger import Ledger
 from render.records.manifest import SceneSpec, View
 from render.records.shards import file_hash, read_shard
-from render.running import station
-from render.running.crew import LocalCrew
+from render.running import cluster_worker
+from render.running.cluster_worker import ClusterWorker, make_task
+from render.running.protocol import Failure
 from render.running.supervisor import RunOptions, RunSummary, render_supervised
+from render.running.worker_pool import LocalPool
 from render.shared.errors import InputError
 
 distributed = pytest.importorskip("distributed")
@@ -71,8 +73,8 @@ def run(
     scenes: list[SceneSpec], folder: Path, address: str, serve=pretend, timeout=60.0, patience=300.0, **options
 ) -> RunSummary:
     choice = ClusterChoice(name=address, config=ClusterConfig(patience=patience))
-    with crew_on(choice, folder, timeout=timeout, serve=serve) as crew:
-        return render_supervised(scenes, folder, RunOptions(**options), crew=crew)
+    with open_pool(choice, folder, timeout=timeout, serve=serve) as pool:
+        return render_supervised(scenes, folder, RunOptions(**options), pool=pool)
 
 
 def files(folder: Path) -> dict[str, str]:
@@ -89,7 +91,7 @@ def rendering(address: str) -> int:
         return sum(client.run(lambda: len(multiprocessing.active_children())).values())
 
 
-def test_books_and_bytes_are_those_of_a_local_run(tmp_path, address):
+def test_records_and_bytes_are_those_of_a_local_run(tmp_path, address):
     scenes = planned([["ok", "raise", "ok"], ["ok", "hang"], ["die", "ok"], ["ok", "quit"], ["ok"] * 4])
     here = render_supervised(scenes, tmp_path / "a", RunOptions(workers=2, timeout=HANGS), serve=pretend)
     there = run(scenes, tmp_path / "b", address, timeout=HANGS)
@@ -105,17 +107,11 @@ def test_books_and_bytes_are_those_of_a_local_run(tmp_path, address):
 
 @pytest.mark.parametrize("name", ["sdps", "fitted materials", "code of the renderer"])
 def test_what_differs_is_refused(tmp_path, address, monkeypatch, name):
-    there = dict(station.installed()) | {name: "other"}
-    monkeypatch.setattr(station, "installed", lambda: there)
+    there = dict(cluster_worker.installed()) | {name: "other"}
+    monkeypatch.setattr(cluster_worker, "installed", lambda: there)
     with pytest.raises(InputError, match=rf"a worker has {name} .*, the run other; install the same sdps on both"):
         run(planned([["ok"]]), tmp_path, address)
     assert not files(tmp_path)
-
-
-def test_a_plan_that_is_read_otherwise_is_refused(tmp_path, address, monkeypatch):
-    monkeypatch.setattr(station, "lines_digest", lambda scenes: "other")
-    with pytest.raises(InputError, match="reads the plan otherwise"):
-        run(planned([["ok"]]), tmp_path, address)
 
 
 @pytest.mark.parametrize(
@@ -137,23 +133,23 @@ def test_own_files_are_tied_to_their_content(tmp_path, shape, material, file):
     (scene,) = planned([["ok"]])
     scene = replace(scene, shape=shape.format(tmp_path), material=material.format(tmp_path))
     (chunk,) = chunks.cut([scene], {scene.id})
-    task = station.task_of("run", chunk, 1.0)
-    station.check(task)
+    task = make_task("run", chunk, 1.0)
+    cluster_worker.check(task)
     path.write_text("other")
-    with pytest.raises(station.Mismatch, match=rf"has file {tmp_path}.*put it under the same path there"):
-        station.check(task)
+    with pytest.raises(cluster_worker.Mismatch, match=rf"has file {tmp_path}.*put it under the same path there"):
+        cluster_worker.check(task)
     path.unlink()
-    with pytest.raises(station.Mismatch, match=rf"has file {tmp_path}.* missing, the run"):
-        station.check(task)
+    with pytest.raises(cluster_worker.Mismatch, match=rf"has file {tmp_path}.* missing, the run"):
+        cluster_worker.check(task)
 
 
 def test_shards_name_the_commit_of_the_run(tmp_path, monkeypatch):
-    monkeypatch.setattr(station, "_commit", lambda: "the run's")
+    monkeypatch.setattr(cluster_worker, "_commit", lambda: "the run's")
     (scene,) = (replace(scene, shape="sphere", material="chrome", size=8) for scene in planned([["ok"]]))
     (chunk,) = chunks.cut([scene], {scene.id})
-    crew = station.Station(tmp_path / "station")
-    rendered = crew.render(station.task_of("run", chunk, 60.0))
-    crew.dismiss()
+    worker = ClusterWorker(tmp_path / "worker")
+    rendered = worker.render(make_task("run", chunk, 60.0))
+    worker.dismiss()
     (tmp_path / "shards").mkdir()
     (tmp_path / scene.file).write_bytes(rendered.shards[scene.id])
     assert read_shard(tmp_path / scene.file).provenance["commit"] == "the run's"
@@ -269,66 +265,62 @@ def test_chunks_that_kill_their_workers_are_taken_apart(tmp_path, address):
     views = [replace(scene, shape="sphere") for scene in planned([["ok", "ok"], ["ok"]])]
     chunk = Chunk("sphere", (tuple(views[:2]), tuple(views[2:])), frozenset(scene.id for scene in views))
     error = type("KilledWorker", (Exception,), {})()
-    with crew_on(ClusterChoice(name=address), tmp_path) as crew:
-        assert crew._refused(chunk, error) == []
-        assert [part.scenes() for part in crew.queue] == [views[:2], views[2:]]
-        (failed,) = crew._refused(crew.queue[0], error)
+    with open_pool(ClusterChoice(name=address), tmp_path) as pool:
+        assert pool._handle_error(chunk, error) == []
+        assert [part.scenes() for part in pool.queue] == [views[:2], views[2:]]
+        (failed,) = pool._handle_error(pool.queue[0], error)
     assert failed.ids == ("s0-m0", "s0-m1") and failed.reason == "every worker that tried it died"
 
 
 def test_a_process_that_takes_too_much_memory_costs_its_scene(tmp_path):
-    crew = station.Station(tmp_path, memory=300 * 2**20)
+    worker = ClusterWorker(tmp_path, memory=300 * 2**20)
     (chunk,) = chunks.cut(planned([["ok", "hoard", "ok"]]), {"s0-m0", "s0-m1", "s0-m2"})
-    rendered = crew.render(station.task_of("run", chunk, 60.0, pretend))
-    crew.dismiss()
+    rendered = worker.render(make_task("run", chunk, 60.0, pretend))
+    worker.dismiss()
     assert set(rendered.shards) == {"s0-m0", "s0-m2"}
-    assert [news.reason for news in rendered.news if not hasattr(news, "line")] == ["took more than 315 MB of memory"]
+    (failure,) = [outcome for outcome in rendered.outcomes if isinstance(outcome, Failure)]
+    assert failure.reason == "took more than 315 MB of memory"
 
 
 def test_a_worker_with_a_gpu_renders_on_it_one_chunk_at_a_time(tmp_path, monkeypatch):
     monkeypatch.setattr(variant, "choose", lambda: variant.Choice("cuda_ad_rgb", None, "a GPU"))
-    crew, together = station.Station(tmp_path), []
-    step = LocalCrew.step
-    monkeypatch.setattr(LocalCrew, "step", lambda local: (together.append(crew.gpu.locked()), step(local))[1])
+    worker, together = ClusterWorker(tmp_path), []
+    poll = LocalPool.poll
+    monkeypatch.setattr(LocalPool, "poll", lambda local: (together.append(worker.gpu.locked()), poll(local))[1])
     parts = [chunks.cut(planned([["variant"], ["variant"]]), {id})[0] for id in ("s0-m0", "s1-m0")]
     with ThreadPoolExecutor(2) as pool:
-        rendered = list(pool.map(lambda part: crew.render(station.task_of("run", part, 60.0, pretend)), parts))
-    assert len(crew.idle) == 1 and all(together)  # one process did both
-    crew.dismiss()
+        rendered = list(pool.map(lambda part: worker.render(make_task("run", part, 60.0, pretend)), parts))
+    assert len(worker.idle) == 1 and all(together)  # one process did both
+    worker.dismiss()
     assert [list(each.shards.values()) for each in rendered] == [[b"cuda_ad_rgb"]] * 2
 
 
-class Idler:
-    """Stands for a process that a station keeps."""
+class Idle:
+    """Stands for a process that a worker keeps."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.closed, self.serve, self.commit = folder, threading.Event(), pretend, station._commit()
+    serve, commit, timeout = staticmethod(pretend), cluster_worker._commit(), 60.0
+
+    def __init__(self, errors: Path) -> None:
+        self.errors, self.closed = errors, threading.Event()
 
     def close(self) -> None:
         self.closed.set()
 
 
-def test_every_idle_process_ends_when_its_own_time_is_over(tmp_path, monkeypatch):
-    """Neither earlier, by the timer of another one or of its own last rest, nor never."""
-    monkeypatch.setattr(station, "IDLE", 0.4)
-    here, (chunk,) = station.Station(tmp_path), chunks.cut(planned([["ok"]]), {"s0-m0"})
-    task = station.task_of("run", chunk, 60.0, pretend)
-    first, second = Idler(tmp_path / "1"), Idler(tmp_path / "2")
-    here._give_back(first)
-    time.sleep(0.25)
-    here._give_back(second)
-    assert here._borrow(task) is first  # its timer, and only its, stops
-    time.sleep(0.25)
-    assert not first.closed.is_set() and not second.closed.is_set()
-    assert second.closed.wait(5)  # although the first one never came back
-    here._give_back(first)
-    before = here.idle[first]
-    assert here._borrow(task) is first
-    here._give_back(first)
-    before.function(*before.args)  # a timer that ran out at the moment of the borrowing
-    assert not first.closed.is_set() and list(here.idle) == [first]
-    here.dismiss()
-    assert first.closed.is_set() and not here.idle
+def test_processes_end_when_they_were_idle_for_a_while_and_only_those(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster_worker, "IDLE", 0.2)
+    worker, (chunk,) = ClusterWorker(tmp_path), chunks.cut(planned([["ok"]]), {"s0-m0"})
+    task = make_task("run", chunk, 60.0, pretend)
+    first, second = Idle(tmp_path / "1"), Idle(tmp_path / "2")
+    worker._keep(first)
+    worker._keep(second)
+    assert worker._borrow(task) is first
+    assert second.closed.wait(20) and not first.closed.is_set()
+    worker._keep(first)
+    assert first.closed.wait(20) and not worker.idle
+    worker._keep(second)
+    worker.dismiss()
+    assert not worker.idle
 
 
 def test_chunks_of_a_cluster_are_bounded_in_bytes():

@@ -8,7 +8,7 @@ import render_support as support
 from render import shapes
 from render.backend.jit import dr, mi
 from render.materials import merl
-from render.materials.kernels import merl_bsdf, surface_bsdf
+from render.materials.kernels import surface_bsdf
 from render.materials.kernels.bsdf import PackedMaterials
 from render.materials.kernels.merl_bsdf import PackedMerl
 from render.materials.kernels.packed import Part, pack
@@ -139,7 +139,6 @@ def test_nothing_to_pack_and_unknown_names_are_errors():
 @pytest.mark.parametrize("name", ["chrome", "gradient:0:chrome+pink-felt", "patches:3:chrome+table+lambertian:1"])
 def test_the_plugin_is_the_surface(name, table, directions, points):
     surface_bsdf.register()
-    merl_bsdf.register()
     surface = name.replace("table", table)
     plugin, surfaces = mi.load_dict({"type": "ps_surface", "material": surface}), pack([surface])
     si = dr.zeros(mi.SurfaceInteraction3f, COUNT)
