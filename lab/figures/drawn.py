@@ -5,7 +5,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from pipelines.report.sections import Table
+from pipelines.evaluate.report.sections import Table
 from render.shared.errors import InputError
 from sdps.methods import rows
 from sdps.methods.method import Method

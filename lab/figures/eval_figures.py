@@ -11,9 +11,9 @@ from PIL import Image
 
 from lab.figures import light_distributions, number_of_classes, number_of_images, per_material, pf14
 from lab.figures.drawn import Drawn, LeftOut
+from pipelines.evaluate.report.sections import Section, SectionWriter, save_picture
 from pipelines.evaluate.results import tables_text
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Section, SectionWriter, save_picture
 from pipelines.shared import presets
 from pipelines.shared.flags import picked, split_list
 from render.shared.config import to_plain

@@ -5,8 +5,8 @@ from matplotlib.figure import Figure
 
 from lab.figures.drawn import Drawn, LeftOut, finds
 from pipelines.evaluate.evaluation import Result, TestObject
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.pictures import spread
 from pipelines.shared.text_tables import number
@@ -34,7 +34,7 @@ def make(bench: Workbench) -> Drawn:
         chosen = spread([scene for scene in wanted if scene.shape == shape], min(SCENES, bench.config.pictures))
         panels: Panels = {}
         objects = (((scene, item), item) for scene, item in bench.objects(chosen, folder, bench.config))
-        for (scene, item), runner, result in bench.evaluated(objects, runners, len(chosen), f"lights, {shape}"):
+        for (scene, item), runner, result in bench.evaluation.run(objects, runners, len(chosen), f"lights, {shape}"):
             name = runner.method.name
             panels.setdefault(scene.material, (item, []))[1].append((name, result))
             angle, gain = (result.scores.get(metric) for metric in ("direction_mae", "intensity_error"))

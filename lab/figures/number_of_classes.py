@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from lab.figures.drawn import Drawn, LeftOut, paper_row
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.results import Mean, mean
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
 from render.planning import light_sets
@@ -84,7 +84,7 @@ def make(bench: Workbench) -> Drawn:
         for place, variant in enumerate(_variants(item, count))
     )
     total = len(wanted) * (4 * len(BINS) + 1)
-    for (shape, count, place), runner, result in bench.evaluated(objects, runners, total, "bins"):
+    for (shape, count, place), runner, result in bench.evaluation.run(objects, runners, total, "bins"):
         corners = found.setdefault((runner.method.name, shape, count), [[] for _ in CORNERS])
         corners[place].append(result.scores)
     errors = {key: _worst([mean(part, "normal_mae") for part in parts if part]) for key, parts in found.items()}

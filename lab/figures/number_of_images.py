@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from lab.figures.drawn import METRICS, Drawn, finds, paper_row
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.results import Mean, mean
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
 from render.shared.seeds import generator
@@ -62,7 +62,7 @@ def make(bench: Workbench) -> Drawn:
         for count, draw, places in chosen
     )
     found: dict[tuple[str, str, int, int], list[dict[str, float]]] = {}
-    for key, runner, result in bench.evaluated(objects, bench.runners, len(wanted) * len(chosen), "images"):
+    for key, runner, result in bench.evaluation.run(objects, bench.runners, len(wanted) * len(chosen), "images"):
         found.setdefault((runner.method.name, *key), []).append(result.scores)
     points: Points = {}
     for (method, shape, count, _), scores in found.items():

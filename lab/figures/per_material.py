@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
 from lab.figures.drawn import Drawn, LeftOut, paper_row
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench, lit_object
-from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
 from render.shared.errors import InputError
@@ -82,7 +82,7 @@ def make(bench: Workbench) -> Drawn:
     found: dict[str, dict[str, list[float]]] = {runner.method.name: {} for runner in runners}
     repeats = range(bench.config.repeats)
     objects = ((s.material, lit_object(s, folder, bench.config, repeat)) for s in wanted for repeat in repeats)
-    for material, runner, result in bench.evaluated(objects, runners, len(wanted) * len(repeats), "materials"):
+    for material, runner, result in bench.evaluation.run(objects, runners, len(wanted) * len(repeats), "materials"):
         found[runner.method.name].setdefault(material, []).append(result.scores.get("normal_mae", np.nan))
     curves = []
     for method in (runner.method for runner in runners):  # without what it failed on in any of the repeats

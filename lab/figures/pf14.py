@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 
 from lab.figures.drawn import METRICS, Drawn, LeftOut, finds, paper_row
 from pipelines.evaluate.published import POSTER
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.results import Mean, mean
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Table
 from pipelines.shared import charts, scenes
 from pipelines.shared.pictures import spread
 from render.materials import library
@@ -112,7 +112,7 @@ def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[s
         (scene.material, replace(item, name=f"{item.name}, {lights}"))
         for scene, item in bench.objects(wanted, folder, config)
     )
-    for material, runner, result in bench.evaluated(objects, runners, len(wanted), lights):
+    for material, runner, result in bench.evaluation.run(objects, runners, len(wanted), lights):
         found.setdefault((runner.method.name, group_of[material]), []).append(result.scores)
     return {(m, lights, group, metric): mean(s, metric) for (m, group), s in found.items() for metric in METRICS}
 

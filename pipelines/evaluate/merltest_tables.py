@@ -9,9 +9,9 @@ import numpy as np
 
 from pipelines.evaluate import published
 from pipelines.evaluate.object_pictures import ERROR_LIMIT, tiles
+from pipelines.evaluate.report.sections import Section, SectionWriter, Table
 from pipelines.evaluate.results import mean
 from pipelines.evaluate.workbench import Workbench, lit_object
-from pipelines.report.sections import Section, SectionWriter, Table
 from pipelines.shared.pictures import spread
 from pipelines.shared.presets import TestConfig
 from pipelines.shared.text_tables import number
@@ -126,7 +126,7 @@ def write(
     )
     names = [runner.method.name for runner in runners]
     section = Section(name="merltest", title="MERL-Test scenes", text=text, order=10, tables=tuple(tables),
-                      command=f"sdps eval-merltest --preset {bench.preset.name} --out {bench.out}")  # fmt: skip
+                      command=f"sdps evaluate merltest --preset {bench.preset.name} --out {bench.out}")  # fmt: skip
     writer = SectionWriter(section)
     for result in choose(results, names[0], config.pictures):
         item = lit_object(result.scene, folder, config)

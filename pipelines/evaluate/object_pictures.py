@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipelines.evaluate.evaluation import Result, TestObject
-from pipelines.report.sections import Tile
+from pipelines.evaluate.report.sections import Tile
 from pipelines.shared import pictures
 from sdps.core.metrics import normal_error_map
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.report.sections import SectionWriter, Table
+from pipelines.evaluate.report.sections import SectionWriter, Table
 from pipelines.shared.text_tables import number, render_text
 from render.shared.config import to_plain
 from render.shared.files import write_json

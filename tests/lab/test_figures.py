@@ -20,9 +20,9 @@ from lab.figures import (
     pf14,
 )
 from pipelines.evaluate import evaluation, published
+from pipelines.evaluate.report.sections import read_sections
 from pipelines.evaluate.results import mean
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import read_sections
 from pipelines.shared import charts, presets, scenes
 from render.planning import light_sets
 from render.records.shards import Shard, to_half, write_shard

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.benchmarks import suite
-from pipelines.benchmarks.eval_diligent import OBJECTS, DiligentConfig, diligent_objects
-from pipelines.benchmarks.object_tables import object_table, published_rows
+from pipelines.evaluate.benchmarks import suite
+from pipelines.evaluate.benchmarks.diligent import OBJECTS, DiligentConfig, diligent_objects
+from pipelines.evaluate.benchmarks.object_tables import object_table, published_rows
 from pipelines.evaluate.evaluation import Result
-from pipelines.report.sections import read_sections
+from pipelines.evaluate.report.sections import read_sections
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.images import read_image, write_png

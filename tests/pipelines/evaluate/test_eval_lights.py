@@ -8,9 +8,9 @@ import benchmark_folders as folders
 import numpy as np
 import pytest
 
-from pipelines.benchmarks import stacks
-from pipelines.benchmarks.lit_photographs import front, gourd_apple_objects, light_stage_objects
-from pipelines.benchmarks.object_tables import published_rows
+from pipelines.evaluate.benchmarks import stacks
+from pipelines.evaluate.benchmarks.lit_photographs import front, gourd_apple_objects, light_stage_objects
+from pipelines.evaluate.benchmarks.object_tables import published_rows
 from render.shared.errors import InputError
 from render.shared.images import write_png
 from sdps.classical import registry

@@ -12,8 +12,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from pipelines.cli import main
-from pipelines.report.page import render
-from pipelines.report.sections import Picture, Section, SectionWriter, Strip, Table, read_sections
+from pipelines.evaluate.report.page import render
+from pipelines.evaluate.report.sections import Picture, Section, SectionWriter, Strip, Table, read_sections
 from render.shared.errors import InputError
 
 CHROMIUM = next(

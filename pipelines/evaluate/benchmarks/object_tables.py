@@ -8,7 +8,7 @@ from importlib import resources
 import numpy as np
 
 from pipelines.evaluate.evaluation import Result
-from pipelines.report.sections import Table
+from pipelines.evaluate.report.sections import Table
 from render.shared.config import read_yaml
 
 OURS, REFUSED = "ours", "refused"

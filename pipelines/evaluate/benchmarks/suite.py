@@ -7,18 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipelines.benchmarks.object_tables import object_table, published_rows
-from pipelines.evaluate.elsewhere import evaluate_elsewhere
+from pipelines.evaluate.benchmarks.object_tables import object_table, published_rows
 from pipelines.evaluate.evaluation import Evaluation, TestObject
 from pipelines.evaluate.object_pictures import Found, tiles
+from pipelines.evaluate.report.sections import Section, SectionWriter, Table
 from pipelines.evaluate.results import publish, weights_of
-from pipelines.report.sections import Section, SectionWriter, Table
 from pipelines.shared import using
-from pipelines.shared.cluster import cluster_config
-from pipelines.shared.cluster.cluster_config import ClusterChoice
 from pipelines.shared.flags import add_out, picked, split_list
 from render.shared.config import to_plain
-from render.shared.progress import progress_bar
 from sdps.inference.inference_config import InferenceConfig, inference_config
 from sdps.methods import select
 from sdps.methods.method import Method
@@ -39,7 +35,6 @@ def run(
     folder: Path,
     config: InferenceConfig,
     shown: Sequence[str],
-    cluster: ClusterChoice | None = None,
 ) -> tuple[Found, list[Runner]]:
     """Run methods on objects, or take their results from the cache in `folder`.
 
@@ -50,17 +45,13 @@ def run(
         folder: Where results are kept.
         config: How networks are used.
         shown: Methods whose normal maps are kept for pictures.
-        cluster: Whose workers run the methods; this process when omitted.
     """
     runners = [Runner(method, finder(models), config) for method in chosen]
     evaluation = Evaluation(folder)
     found: Found = {runner.method.name: {} for runner in runners}
-    opened = [replace(item, load=partial(_opened, item)) for item in items]
-    if cluster is not None:
-        evaluate_elsewhere(cluster, evaluation, ((item, shown) for item in opened), len(opened), runners, config)
-    for item in progress_bar(opened, desc="evaluate", unit="object", disable=cluster is not None):
-        for runner, result in zip(runners, evaluation.results(item, runners, shown), strict=True):
-            found[runner.method.name][item.name] = result
+    objects = ((item.name, replace(item, load=partial(_opened, item))) for item in items)
+    for name, runner, result in evaluation.run(objects, runners, len(items), "evaluate", shown):
+        found[runner.method.name][name] = result
     return found, runners
 
 
@@ -112,8 +103,7 @@ def evaluate(
         command: The command that does it again, without `--out`.
     """
     config, shown, file = inference_config(args), pictured(chosen), args.out / bench.name / "results.json"
-    cluster = cluster_config.from_arguments(args)
-    found, runners = run(items, chosen, select.runs_folder(args.models), file.parent / "cache", config, shown, cluster)
+    found, runners = run(items, chosen, select.runs_folder(args.models), file.parent / "cache", config, shown)
     section = Section(
         name=bench.name, title=bench.title, text=text + using.describe(runners, config), order=bench.order,
         tables=build_tables(bench, items, found, chosen), command=f"{command} --out {args.out}",
@@ -173,8 +163,8 @@ def lighting_only(found: Found, chosen: Sequence[Method]) -> Found:
     return {name: found[name] for name in kept}
 
 
-def _lights_of(method: Method) -> tuple[str, str, str | None, int | None]:
-    return method.lights, method.second, method.read_out, method.light_views
+def _lights_of(method: Method) -> tuple[str, str | None, int | None]:
+    return method.lights, method.read_out, method.light_views
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -186,7 +176,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="--out of `sdps train`, whose models are evaluated (default: shipped ones)")  # fmt: skip
     parser.add_argument("--objects", action="append", help="commas or repeat (default: all in the folder)")
     using.add_arguments(parser)
-    cluster_config.add_arguments(parser)
     add_out(parser, Path("out/real"))
 
 

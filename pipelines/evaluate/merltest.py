@@ -1,4 +1,4 @@
-"""`sdps eval-merltest`: render MERL-Test scenes and score every method on them in the layout of the paper's tables.
+"""`sdps evaluate merltest`: render MERL-Test scenes and score every method on them in the layout of the paper's tables.
 
 Table A is lighting estimation, table B normal estimation (SDPS-Net, sec. 5.1); each number is the mean over the
 materials, with the paper's beside it. Every scene gets random light intensities. Every model that is trained in the
@@ -8,17 +8,16 @@ a constant predictor, which shows what knowing nothing scores, stand below.
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.evaluate.elsewhere import evaluate_elsewhere
 from pipelines.evaluate.merltest_tables import SceneScores, definition, lighting_table, normal_table, write
+from pipelines.evaluate.report import page as report
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.results import tables_text, weights_of
 from pipelines.evaluate.workbench import Workbench, lit_object
-from pipelines.report import page as report
-from pipelines.report.sections import Table
 from pipelines.shared import presets, using
 from pipelines.shared.cluster import cluster_config
 from pipelines.shared.presets import Preset
@@ -26,7 +25,6 @@ from render.records.manifest import SceneSpec
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import write_json
-from render.shared.progress import progress_bar
 from sdps.inference.inference_config import inference_config
 from sdps.methods import rows
 from sdps.methods.method import CONSTANT, Method
@@ -36,14 +34,14 @@ from sdps.models.registry import MODELS, TRUE_LIGHTS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of `sdps eval-merltest`."""
+    """Declare the flags of `sdps evaluate merltest`."""
     presets.add_common_arguments(parser)
     cluster_config.add_arguments(parser)
-    parser.add_argument("--lights", default=None, metavar="NAME|FILE|true",
+    parser.add_argument("--lighting", default=None, metavar="NAME|FILE|true",
                         help="lighting model of a combination (default: every trained model, a row each)")  # fmt: skip
+    parser.add_argument("--lights", dest="lighting", default=None, help=argparse.SUPPRESS)  # its earlier name
     parser.add_argument("--normals", default=None, metavar="NAME|FILE",
                         help="normal model, combination such as sdps-plus, or classical method")  # fmt: skip
-    parser.add_argument("--second", default=None, metavar="NAME|FILE", help="second lighting pass")
     parser.add_argument("--intensities", default=None, choices=("true",), help="give the true intensities only")
 
 
@@ -56,7 +54,7 @@ def main(args: argparse.Namespace) -> int:
     bench = Workbench(preset, out, runners, cluster=cluster_config.from_arguments(args))
     pictured = shown(normals)
     wanted, folder = bench.merltest()
-    results = list(evaluate(bench, wanted, folder, pictured))
+    results = evaluate(bench, wanted, folder, pictured)
     tables, networks = build_tables(results, lighting, normals), using.describe(runners, config)
     presets.save_resolved(preset, out / "eval")
     write_json(out / "eval" / "results.json", {
@@ -84,8 +82,8 @@ def table_rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[lis
         InputError: nothing is trained, or flags name what is not there.
     """
     constant = Method(name="constant predictor", normals=CONSTANT)
-    if any((args.lights, args.normals, args.second, args.intensities)):
-        method = rows.chosen(out, args.lights, args.normals, args.second, args.intensities)
+    if any((args.lighting, args.normals, args.intensities)):
+        method = rows.chosen(out, args.lighting, args.normals, None, args.intensities)
         reference = Method(name="least-squares, true lights", lights="true", normals="least-squares")
         return [], [method, *([reference] if method.name != reference.name else []), constant]
     normals = rows.normal_methods(out, preset.test.shipped, preset.test)
@@ -117,31 +115,23 @@ def shown(normals: Sequence[Method]) -> list[str]:
     return list(dict.fromkeys([*(method.name for method in chosen), "least-squares, true lights"]))
 
 
-def evaluate(
-    bench: Workbench, wanted: Sequence[SceneSpec], folder: Path, pictured: Sequence[str]
-) -> Iterator[SceneScores]:
+def evaluate(bench: Workbench, wanted: Sequence[SceneSpec], folder: Path, pictured: Sequence[str]) -> list[SceneScores]:
     """Score every scene, averaged over the draws of random intensities; normal maps of the first draw are kept."""
     repeats = range(bench.config.repeats)
-    if bench.cluster is not None:
-        items = (
-            (lit_object(scene, folder, bench.config, repeat), () if repeat else pictured)
-            for scene in wanted
-            for repeat in repeats
-        )
-        total, config = len(wanted) * len(repeats), inference_config(bench.config)
-        evaluate_elsewhere(bench.cluster, bench.evaluation, items, total, bench.runners, config)
-    for scene in progress_bar(wanted, desc="evaluate", unit="scene", disable=bench.cluster is not None):
-        draws: dict[str, list[dict[str, float]]] = {}
-        for repeat in repeats:
-            item = lit_object(scene, folder, bench.config, repeat)
-            scored: dict[str, dict[str, float]] = {}
-            results = bench.evaluation.results(item, bench.runners, () if repeat else pictured)
-            for runner, result in zip(bench.runners, results, strict=True):
-                name = runner.method.name  # the constant predictor has a row in both tables
-                scored[name] = scored.get(name, {}) | result.scores
-            for name, scores in scored.items():
-                draws.setdefault(name, []).append(scores)
-        yield SceneScores(scene, {name: _mean_scores(values) for name, values in draws.items()})
+    objects = (
+        ((number, repeat), lit_object(scene, folder, bench.config, repeat))
+        for number, scene in enumerate(wanted)
+        for repeat in repeats
+    )
+    found: list[dict[str, list[dict[str, float]]]] = [{} for _ in wanted]  # [scene][method][draw]
+    total = len(wanted) * len(repeats)
+    for (number, repeat), runner, result in bench.evaluation.run(objects, bench.runners, total, "evaluate", pictured):
+        draws = found[number].setdefault(runner.method.name, [{} for _ in repeats])
+        draws[repeat] |= result.scores  # the constant predictor has a row in both tables
+    return [
+        SceneScores(scene, {name: _mean_scores(values) for name, values in draws.items()})
+        for scene, draws in zip(wanted, found, strict=True)
+    ]
 
 
 def _mean_scores(draws: list[dict[str, float]]) -> dict[str, float]:
@@ -153,6 +143,5 @@ def _mean_scores(draws: list[dict[str, float]]) -> dict[str, float]:
 
 def build_tables(results: list[SceneScores], lighting: list[Method], normals: list[Method]) -> list[Table]:
     """Return table A where every model has its row, and table B."""
-    second = [method for method in normals if method.second]  # rows of both tables
-    first = [lighting_table(results, [*lighting, *second], all_rows=True)] if lighting else []
+    first = [lighting_table(results, lighting, all_rows=True)] if lighting else []
     return [*first, normal_table(results, normals, all_rows=bool(lighting))]

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.benchmarks.stacks import Images, photographed
+from pipelines.evaluate.benchmarks.stacks import Images, photographed
 from pipelines.evaluate.evaluation import TestObject
 from render.shared.decoding import decoding
 from render.shared.errors import InputError

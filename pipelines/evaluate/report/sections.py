@@ -1,7 +1,7 @@
 """Sections of a report: what one evaluation shows, as data on disk, so that a page can be made of all of them.
 
-An evaluation writes its section into `<out>/report/<name>/`: `section.json` and its pictures. `sdps report` collects
-the sections under a folder into one self-contained page.
+An evaluation writes its section into `<out>/report/<name>/`: `section.json` and its pictures. `sdps evaluate
+report` collects the sections under a folder into one self-contained page.
 """
 
 from collections.abc import Sequence

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from pipelines import cli
-from pipelines.benchmarks import psm_photos
+from pipelines.evaluate.benchmarks import uw_photos
 from render.shared.errors import InputError
 from sdps.core.metrics import angle_degrees
 
@@ -43,8 +43,8 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_reads_an_object_cropped_and_linear(photos: Path) -> None:
-    assert psm_photos.list_objects(photos) == ["hill"]
-    read = psm_photos.read_photos(photos, "hill", LIGHTS)
+    assert uw_photos.list_objects(photos) == ["hill"]
+    read = uw_photos.read_photos(photos, "hill", LIGHTS)
     images = read.load().opened()
     normals, mask = scenes.hills(80)
     assert read.mask.sum() == mask.sum()
@@ -52,13 +52,13 @@ def test_reads_an_object_cropped_and_linear(photos: Path) -> None:
     truth = scenes.lambertian(normals, mask, LIGHTS, albedo=0.9).images[:, mask]
     np.testing.assert_allclose(images[:, read.mask], np.clip(truth, 0, 1), atol=0.6 / 255)
     with pytest.raises(InputError, match="8 images but 7 lights"):
-        psm_photos.read_photos(photos, "hill", LIGHTS[1:])
+        uw_photos.read_photos(photos, "hill", LIGHTS[1:])
 
 
 def test_lights_come_from_the_sphere_or_the_file(photos: Path) -> None:
-    assert angle_degrees(psm_photos.read_lights(photos, "chrome"), LIGHTS).max() < 1.0
-    assert angle_degrees(psm_photos.read_lights(photos, "file"), LIGHTS).max() < 1e-3
-    np.testing.assert_array_equal(psm_photos.read_lights(photos), psm_photos.read_lights(photos, "chrome"))
+    assert angle_degrees(uw_photos.read_lights(photos, "chrome"), LIGHTS).max() < 1.0
+    assert angle_degrees(uw_photos.read_lights(photos, "file"), LIGHTS).max() < 1e-3
+    np.testing.assert_array_equal(uw_photos.read_lights(photos), uw_photos.read_lights(photos, "chrome"))
 
 
 def test_the_command_compares_and_leaves_files(
@@ -116,24 +116,24 @@ def test_bad_names_are_one_line(
 
 def test_bad_folders_are_one_line(photos: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
-        psm_photos.list_objects(tmp_path / "nowhere")
+        uw_photos.list_objects(tmp_path / "nowhere")
     with pytest.raises(InputError, match="no photographs"):
-        psm_photos.list_objects(tmp_path)
+        uw_photos.list_objects(tmp_path)
     copy = tmp_path / "copy"
     shutil.copytree(photos, copy)
     (copy / "hill" / "hill.3.tga").write_bytes(b"no picture")
     with pytest.raises(InputError, match=r"hill\.3\.tga: damaged or not a picture"):
-        psm_photos.read_photos(copy, "hill", LIGHTS).load().opened()
+        uw_photos.read_photos(copy, "hill", LIGHTS).load().opened()
     (copy / "hill" / "hill.3.tga").unlink()
     with pytest.raises(InputError, match="without gaps"):
-        psm_photos.read_photos(copy, "hill", LIGHTS)
+        uw_photos.read_photos(copy, "hill", LIGHTS)
     (copy / "lights.txt").write_text("8\n0 0 1\n")
     with pytest.raises(InputError, match="want a count"):
-        psm_photos.read_lights(copy, "file")
+        uw_photos.read_lights(copy, "file")
     (copy / "lights.txt").write_text("one\n")
     with pytest.raises(InputError, match="no number"):
-        psm_photos.read_lights(copy, "file")
+        uw_photos.read_lights(copy, "file")
     shutil.rmtree(copy / "chrome")
     (copy / "lights.txt").unlink()
     with pytest.raises(InputError, match="neither a chrome sphere"):
-        psm_photos.read_lights(copy)
+        uw_photos.read_lights(copy)

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from pipelines.benchmarks.stacks import Images, Stack, photographed
+from pipelines.evaluate.benchmarks.stacks import Images, Stack, photographed
 from pipelines.evaluate.evaluation import TestObject
 from render.exchange.ingest import crop_box
 from render.shared.decoding import check_picture, decoding
