@@ -22,7 +22,8 @@ from render.shared.progress import progress_bar
 
 if TYPE_CHECKING:
     from sdps.inference.image_source import ImageSource
-    from sdps.methods.runner import Found, Runner
+    from sdps.methods.runner import Found as FoundLights
+    from sdps.methods.runner import Runner
 
 K = TypeVar("K")
 _log = logging.getLogger(__name__)
@@ -94,6 +95,10 @@ class Result:
             return stored["normals"].astype(np.float32)
 
 
+Found = dict[str, dict[str, Result]]
+"""Results by method, then object."""
+
+
 class ScoreCache:
     """Results by key in a file of JSON lines, appended to one by one.
 
@@ -155,7 +160,7 @@ class Evaluation:
             keep: Names of methods whose normal maps are kept (float16).
         """
         images, found = None, []
-        lights: Found = {}
+        lights: FoundLights = {}
         for runner in runners:
             key, kept = _key(item, runner), item.pictured and runner.method.name in keep
             known = self._known(key, kept)
@@ -201,7 +206,7 @@ class Evaluation:
         return None if known and kept and known["normals"] and not self._maps(key).is_file() else known
 
     def _run(
-        self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: "Found"
+        self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: "FoundLights"
     ) -> dict[str, Any]:
         """Run a method and return what is kept of it, JSON ready."""
         try:

@@ -7,11 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipelines.evaluate.benchmarks.object_tables import object_table, published_rows
-from pipelines.evaluate.evaluation import Evaluation, TestObject
-from pipelines.evaluate.object_pictures import Found, tiles
+from pipelines.evaluate.evaluation import Evaluation, Found, TestObject
+from pipelines.evaluate.object_pictures import tiles
+from pipelines.evaluate.published import published_rows
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
-from pipelines.evaluate.results import publish, weights_of
+from pipelines.evaluate.results import object_table, publish, weights_of
 from pipelines.shared import using
 from pipelines.shared.flags import add_out, picked, split_list
 from render.shared.config import to_plain

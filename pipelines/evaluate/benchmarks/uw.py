@@ -14,8 +14,8 @@ import numpy as np
 
 from pipelines.evaluate.benchmarks import suite
 from pipelines.evaluate.benchmarks.uw_photos import list_objects, read_lights, read_photos, resolve_source
-from pipelines.evaluate.evaluation import Result, TestObject
-from pipelines.evaluate.object_pictures import ERROR_LIMIT, Found, tiles
+from pipelines.evaluate.evaluation import Found, Result, TestObject
+from pipelines.evaluate.object_pictures import ERROR_LIMIT, tiles
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
 from pipelines.evaluate.results import publish
 from pipelines.shared.flags import add_models, add_out, picked, split_list

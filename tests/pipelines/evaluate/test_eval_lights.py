@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.evaluate.benchmarks import stacks
 from pipelines.evaluate.benchmarks.lit_photographs import front, gourd_apple_objects, light_stage_objects
-from pipelines.evaluate.benchmarks.object_tables import published_rows
+from pipelines.evaluate.published import published_rows
 from render.shared.errors import InputError
 from render.shared.images import write_png
 from sdps.classical import registry
