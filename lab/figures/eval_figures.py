@@ -10,7 +10,7 @@ from typing import Any
 from PIL import Image
 
 from lab.figures import light_distributions, number_of_classes, number_of_images, per_material, pf14
-from lab.figures.drawn import Drawn, LeftOut
+from lab.figures.sweep import LeftOut, Panel
 from pipelines.evaluate.report.sections import Section, SectionWriter, save_picture
 from pipelines.evaluate.results import tables_text
 from pipelines.evaluate.workbench import Workbench
@@ -103,7 +103,7 @@ def _placed(name: str, out: Path) -> str:
     return pretrained.SHIPPED + name if set(members) <= set(pretrained.shipped()) else NONE
 
 
-def write(name: str, drawn: Drawn, bench: Workbench) -> None:
+def write(name: str, drawn: Panel, bench: Workbench) -> None:
     """Write a figure: its section of the report, its charts, and its numbers beside those of earlier figures.
 
     Raises:
@@ -126,7 +126,7 @@ def write(name: str, drawn: Drawn, bench: Workbench) -> None:
     write_json(path, _earlier(path) | {name: _plain(drawn, bench)})
 
 
-def _plain(drawn: Drawn, bench: Workbench) -> dict[str, Any]:
+def _plain(drawn: Panel, bench: Workbench) -> dict[str, Any]:
     return {
         "title": drawn.title, "definition": drawn.text, "config": to_plain(bench.config), "draws": bench.draws,
         "methods": {r.method.name: {key: str(file) for key, file in r.files.items()} for r in bench.runners},
@@ -142,6 +142,6 @@ def _earlier(path: Path) -> dict[str, Any]:
     try:
         found = read_json(path, "delete it")
     except InputError:
-        _log.warning("%s: damaged; it is written anew", path)
+        _log.warning("%s: damaged; it is written again", path)
         return {}
     return {name: found[name] for name in FIGURES if name in found} if isinstance(found, dict) else {}

@@ -5,13 +5,14 @@ and all objects and methods see the same ones.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.drawn import METRICS, Drawn, finds, paper_row
+from lab.figures.sweep import METRICS, Panel, finds, paper_row, shapes_of, sweep
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
@@ -19,6 +20,7 @@ from pipelines.evaluate.results import Mean, mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
+from render.records.manifest import SceneSpec
 from render.shared.seeds import generator
 from sdps.methods.method import Method
 
@@ -48,7 +50,7 @@ def part_of(item: TestObject, count: int, draw: int, places: np.ndarray) -> Test
     )  # fmt: skip
 
 
-def make(bench: Workbench) -> Drawn:
+def make(bench: Workbench) -> Panel:
     """Evaluate and draw.
 
     Raises:
@@ -56,21 +58,19 @@ def make(bench: Workbench) -> Drawn:
     """
     wanted, folder = bench.merltest()
     chosen = subsets(len(wanted[0].lights), bench.draws, bench.config.seed)
-    objects = (
-        ((scene.shape, count, draw), part_of(item, count, draw, places))
-        for scene, item in bench.objects(wanted, folder, bench.config)
-        for count, draw, places in chosen
-    )
-    found: dict[tuple[str, str, int, int], list[dict[str, float]]] = {}
-    for key, runner, result in bench.evaluation.run(objects, bench.runners, len(wanted) * len(chosen), "images"):
-        found.setdefault((runner.method.name, *key), []).append(result.scores)
+
+    def variants(scene: SceneSpec, item: TestObject) -> Iterator[tuple[tuple[Any, ...], TestObject]]:
+        for count, draw, places in chosen:
+            yield (scene.shape, count, draw), part_of(item, count, draw, places)
+
     points: Points = {}
-    for (method, shape, count, _), scores in found.items():
+    found = sweep(bench, bench.runners, (wanted, folder), variants, len(chosen), "images")
+    for (method, shape, count, _), results in found.items():
         kept = points.setdefault((method, shape, count), {metric: [] for metric in METRICS})
         for metric in METRICS:
-            kept[metric].append(mean(scores, metric))
+            kept[metric].append(mean((one.scores for one in results), metric))
     methods = [runner.method for runner in bench.runners]
-    shapes = tuple(dict.fromkeys(scene.shape for scene in wanted))
+    shapes = shapes_of(wanted)
     counts = tuple(dict.fromkeys(count for count, _, _ in sorted(chosen, key=lambda part: part[0])))
     text = (
         f"{len(wanted)} MERL-Test scenes ({bench.config.lights}); {bench.draws} random subsets of each number of "
@@ -84,7 +84,7 @@ def make(bench: Workbench) -> Drawn:
         for shape in shapes
     )  # fmt: skip
     tables = tuple(_table(methods, shape, counts, points, metric) for shape in shapes for metric in METRICS)
-    return Drawn(
+    return Panel(
         title="Error against the number of images",
         text=text,
         charts=drawings,

@@ -1,6 +1,7 @@
 """Error per material on BUNNY beside the published curves (the paper's supplement)."""
 
 import csv
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
 
@@ -8,11 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
-from lab.figures.drawn import Drawn, LeftOut, paper_row
+from lab.figures.sweep import LeftOut, Panel, paper_row, sweep
+from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench, lit_object
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
+from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from render.shared.files import read_text
 
@@ -64,7 +67,7 @@ class Curve:
         return float(found.statistic), float(found.pvalue), len(shared)
 
 
-def make(bench: Workbench) -> Drawn:
+def make(bench: Workbench) -> Panel:
     """Evaluate and draw; errors are averaged over `test.repeats` draws of the intensities.
 
     Raises:
@@ -79,14 +82,17 @@ def make(bench: Workbench) -> Drawn:
     published = read_published()
     wanted, folder = bench.merltest()
     wanted = [scene for scene in wanted if scene.shape == SHAPE]
-    found: dict[str, dict[str, list[float]]] = {runner.method.name: {} for runner in runners}
-    repeats = range(bench.config.repeats)
-    objects = ((s.material, lit_object(s, folder, bench.config, repeat)) for s in wanted for repeat in repeats)
-    for material, runner, result in bench.evaluation.run(objects, runners, len(wanted) * len(repeats), "materials"):
-        found[runner.method.name].setdefault(material, []).append(result.scores.get("normal_mae", np.nan))
+
+    def variants(scene: SceneSpec, _: TestObject) -> Iterator[tuple[tuple[str], TestObject]]:
+        for repeat in range(bench.config.repeats):
+            yield (scene.material,), lit_object(scene, folder, bench.config, repeat)
+
+    found = sweep(bench, runners, (wanted, folder), variants, bench.config.repeats, "materials")
+    errors = {key: [one.scores.get("normal_mae", np.nan) for one in results] for key, results in found.items()}
     curves = []
     for method in (runner.method for runner in runners):  # without what it failed on in any of the repeats
-        kept = {name: float(np.mean(e)) for name, e in found[method.name].items() if np.isfinite(e).all()}
+        own = {material: values for (name, material), values in errors.items() if name == method.name}
+        kept = {material: float(np.mean(values)) for material, values in own.items() if np.isfinite(values).all()}
         curves.append(Curve(method.name, kept, COLUMNS.get(paper_row(method), "SDPS_Net")))
     names = [scene.material for scene in wanted]
     reference = published["SDPS_Net"]
@@ -96,7 +102,7 @@ def make(bench: Workbench) -> Drawn:
         f"{bench.config.repeats} draw(s) of random intensities. Materials are in the order of the published SDPS-Net "
         "curve. Grey: the paper's curves, of its own rendering, digitised from the vector figure of its poster."
     )
-    return Drawn(
+    return Panel(
         title="Error per material",
         text=text,
         charts=(("materials", "Mean angular error of normals per material.", _chart(curves, order, published)),),
