@@ -1,4 +1,4 @@
-"""`lab eval-figures`: the paper's figures on MERL-Test, for any methods, with the published curves beside ours."""
+"""`lab eval-figures`: the paper's figures on MERL-Test, for any methods, with the published curves."""
 
 import argparse
 import logging
@@ -89,13 +89,13 @@ def wanted_methods(names: Sequence[str], out: Path) -> list[Method]:
     find = finder(out)
     if names:
         return list({method.name: method for method in (parse(name, find) for name in names)}.values())
-    found = [parse(name, find) for name in (_placed(item, out) for item in ("sdps", "psfcn")) if name]
+    found = [parse(name, find) for name in (_find_default(item, out) for item in ("sdps", "psfcn")) if name]
     if not found:
         _log.warning("%s: neither sdps nor psfcn has weights here or in the package; classical methods only", out)
     return [*found, parse("pf14", find), parse("least-squares", find)]
 
 
-def _placed(name: str, out: Path) -> str:
+def _find_default(name: str, out: Path) -> str:
     """Return a default model's or combination's name, that of its shipped weights, or nothing."""
     members = COMBINATIONS[name].members() if name in COMBINATIONS else (name,)
     if all(pretrained.trained_file(out, member).is_file() for member in members):
@@ -104,7 +104,7 @@ def _placed(name: str, out: Path) -> str:
 
 
 def write(name: str, drawn: Panel, bench: Workbench) -> None:
-    """Write a figure: its section of the report, its charts, and its numbers beside those of earlier figures.
+    """Write a figure: its section of the report, its charts, and its numbers next to those of earlier figures.
 
     Raises:
         InputError: a file cannot be written.

@@ -92,7 +92,7 @@ def make(bench: Workbench) -> Panel:
     shapes = shapes_of(wanted)
     directions = light_sets.load(bench.config.lights)
     text = (
-        f"Normals of methods that are told the lights, on {len(wanted)} MERL-Test scenes of {len(directions)} lights "
+        f"Normals of methods that are given the lights, on {len(wanted)} MERL-Test scenes of {len(directions)} lights "
         f"({bench.config.lights}). Every true light is replaced by each of the four directions half a class away in "
         "azimuth and in elevation, delta = 180/(2 K_d) degrees; shown is the worst of the four means over materials. "
         "Angles stay within the range of class centres, +-(90 - delta) degrees. Intensities are the true ones."

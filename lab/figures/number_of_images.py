@@ -75,7 +75,7 @@ def make(bench: Workbench) -> Panel:
     text = (
         f"{len(wanted)} MERL-Test scenes ({bench.config.lights}); {bench.draws} random subsets of each number of "
         "images, the same for all scenes and methods, and all images once. Lines: mean over materials and draws. "
-        "Bands: from the lowest to the highest draw. Grey diamonds: the paper's figures for all images. A method told "
+        "Bands: from the lowest to the highest draw. Grey diamonds: the paper's figures for all images. A method given "
         "the true lights is scored on normals only."
     )
     drawings = tuple(
@@ -124,8 +124,8 @@ def _table(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
             text = number(middle) if np.isfinite(middle) else "-"
             text += f" [{number(low)}, {number(high)}]" if high > low else ""
             cells.append(text + (f" {failed} failed" if failed and np.isfinite(middle) else ""))
-        beside = _published(method, shape, metric)
-        rows.append((method.name, *cells, number(beside) if beside is not None else "-"))
+        known = _published(method, shape, metric)
+        rows.append((method.name, *cells, number(known) if known is not None else "-"))
     title, unit = METRICS[metric]
     header = ("method", *map(str, counts), f"published, {counts[-1]}" if counts[-1] == 100 else "published, 100")
     note = f"{unit.capitalize()}, mean over materials and draws; in brackets the lowest and the highest draw."

@@ -1,4 +1,4 @@
-"""Error per material on BUNNY beside the published curves (the paper's supplement)."""
+"""Error per material on BUNNY and the published curves (the paper's supplement)."""
 
 import csv
 from collections.abc import Iterator
@@ -44,23 +44,23 @@ def read_published() -> dict[str, dict[str, float]]:
 
 @dataclass(frozen=True)
 class Curve:
-    """A method's errors beside the published curve it is compared with.
+    """A method's errors and the published curve it is compared with.
 
     Attributes:
         method: Its name.
         errors: MAE in degrees by material; without those it failed on.
-        beside: Column of the published curve.
+        column: Column of the published curve.
     """
 
     method: str
     errors: dict[str, float]
-    beside: str
+    column: str
 
     def rank_correlation(self, curves: dict[str, dict[str, float]]) -> tuple[float, float, int]:
         """Return Spearman's rho with the published curve, its p-value and the number of materials; NaN where
         fewer than 3 errors differ."""
-        shared = [name for name in self.errors if name in curves[self.beside]]
-        ours, theirs = ([column[name] for name in shared] for column in (self.errors, curves[self.beside]))
+        shared = [name for name in self.errors if name in curves[self.column]]
+        ours, theirs = ([column[name] for name in shared] for column in (self.errors, curves[self.column]))
         if len(set(ours)) < 3:
             return float("nan"), float("nan"), len(shared)
         found = spearmanr(ours, theirs)
@@ -108,7 +108,7 @@ def make(bench: Workbench) -> Panel:
         charts=(("materials", "Mean angular error of normals per material.", _chart(curves, order, published)),),
         tables=(_summary(curves, published), _hardest(curves, published)),
         values={
-            curve.method: {"rank_correlation": rho if np.isfinite(rho) else None, "beside": curve.beside,
+            curve.method: {"rank_correlation": rho if np.isfinite(rho) else None, "beside": curve.column,
                            "normal_mae": curve.errors}
             for curve in curves
             for rho in curve.rank_correlation(published)[:1]
@@ -120,10 +120,10 @@ def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Tab
     rows = []
     for curve in curves:
         rho, p, count = curve.rank_correlation(published)
-        beside = [published[curve.beside][name] for name in curve.errors if name in published[curve.beside]]
+        theirs = [published[curve.column][name] for name in curve.errors if name in published[curve.column]]
         rows.append((
             curve.method, number(float(np.mean(list(curve.errors.values())))) if curve.errors else "-",
-            LABELS[curve.beside], number(float(np.mean(beside))) if beside else "-",
+            LABELS[curve.column], number(float(np.mean(theirs))) if theirs else "-",
             f"{rho:.2f}" if np.isfinite(rho) else "-", f"{p:.1g}" if np.isfinite(p) else "-", str(count),
         ))  # fmt: skip
     note = "Mean angular error in degrees over mask pixels. Spearman's rank correlation over the materials."

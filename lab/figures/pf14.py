@@ -81,10 +81,10 @@ def make(bench: Workbench) -> Panel:
         means |= _evaluate(bench, runners, shape, kinds, lights)
     methods = [runner.method for runner in runners]
     counted = ", ".join(f"{len(names)} {group}" for group, names in kinds.items())
-    beside = "Grey diamonds and brackets: read off the paper's poster. " if shape == SHAPE else ""
+    note = "Grey diamonds and brackets: read off the paper's poster. " if shape == SHAPE else ""
     text = (
         f"{shape.capitalize()} with {counted} materials under {' and '.join(LIGHT_SETS)} lights (uniform on the unit "
-        f"disc of x and y; biased: its part y > {light_sets.BIASED_MIN_Y}), with random intensities. {beside}"
+        f"disc of x and y; biased: its part y > {light_sets.BIASED_MIN_Y}), with random intensities. {note}"
         "The Lambertian materials and the lights are ours; the paper's are not known."
     )
     tables = tuple(_table(methods, tuple(kinds), means, metric, shape) for metric in METRICS)
@@ -108,7 +108,7 @@ def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[s
     """Return the means under one light set."""
     materials = tuple(name for names in kinds.values() for name in names)
     config = replace(bench.config, shapes=(shape,), materials=materials, lights=lights)
-    wanted, folder = bench.rendered(config, bench.out / "figures" / scenes.slug(lights))
+    wanted, folder = bench.render(config, bench.out / "figures" / scenes.slug(lights))
     group_of = {name: group for group, names in kinds.items() for name in names}
 
     def variants(scene: SceneSpec, item: TestObject) -> Iterator[tuple[tuple[str], TestObject]]:

@@ -57,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
 def evaluate(bench: Workbench, lights: str) -> list[dict[str, Any]]:
     """Run the methods on the scenes under a light set; results by names that are kept in results.json."""
     test = replace(bench.config, lights=lights)
-    wanted, folder = bench.rendered(test, bench.out / scenes.slug(lights))
+    wanted, folder = bench.render(test, bench.out / scenes.slug(lights))
     results = bench.evaluation.run(bench.objects(wanted, folder, test), bench.runners, len(wanted), lights)
     return [
         {"method": runner.method.normals, "lights": lights, "shape": scene.shape, "category": category(scene),

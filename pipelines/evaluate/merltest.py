@@ -1,7 +1,7 @@
 """`sdps evaluate merltest`: render MERL-Test scenes and score every method on them in the layout of the paper's tables.
 
 Table A is lighting estimation, table B normal estimation (SDPS-Net, sec. 5.1); each number is the mean over the
-materials, with the paper's beside it. Every scene gets random light intensities. Every model that is trained in the
+materials, with the paper's in brackets. Every scene gets random light intensities. Every model that is trained in the
 output folder, and every shipped one, has its row, and the paper's rows without a model are marked so; least squares and
 a constant predictor, which shows what knowing nothing scores, stand below.
 """
@@ -118,7 +118,7 @@ def table_rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[lis
 
 
 def _own_lighting(preset: Preset) -> list[str]:
-    """Return the runs of a preset that give lights, without those that others start from: they are no result."""
+    """Return the runs of a preset that give lights, without those that others start from, which are not results."""
     starts = {settings.get("start") for settings in preset.runs.values()}
     models = {name: preset.run(name).model for name in preset.runs if name not in starts}
     return [name for name, model in models.items() if model in MODELS and MODELS[model].role == "lighting"]

@@ -108,9 +108,9 @@ class Workbench:
         Raises:
             InputError: the folder holds other scenes, or one cannot be rendered.
         """
-        return self.rendered(self.config, self.out / "merltest")
+        return self.render(self.config, self.out / "merltest")
 
-    def rendered(self, config: TestConfig, folder: Path) -> tuple[list[SceneSpec], Path]:
+    def render(self, config: TestConfig, folder: Path) -> tuple[list[SceneSpec], Path]:
         """Return the scenes of a test configuration and their folder, rendered where they are not yet."""
         wanted = scenes.test_scenes(config)
         render_planned(wanted, folder, replace(self.preset, test=config), self.cluster)

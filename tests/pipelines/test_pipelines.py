@@ -335,18 +335,18 @@ def evaluate_combinations(capsys, flags, out):
     assert "psfcn: 2 steps" in (text := capsys.readouterr().out) and "cnnps: 1 steps" in text
     flags = [*flags, "--set", "test.rotations=1"]
     combinations = {
-        "lcnet + psfcn": ["--lights", "lcnet", "--normals", "psfcn"],
-        "lcnet + cnnps": ["--lights", "lcnet", "--normals", "cnnps"],
+        "lcnet + psfcn": ["--lighting", "lcnet", "--normals", "psfcn"],
+        "lcnet + cnnps": ["--lighting", "lcnet", "--normals", "cnnps"],
         "cnnps, true lights": ["--normals", "cnnps"],
         "lcnet + nenet, true intensities": ["--normals", "sdps", "--intensities", "true"],
-        "lcnet + least-squares": ["--lights", "lcnet", "--normals", "least-squares"],
+        "lcnet + least-squares": ["--lighting", "lcnet", "--normals", "least-squares"],
     }
     for name, words in combinations.items():
-        assert main(["eval-merltest", *flags, *words]) == 0
+        assert main(["evaluate", "merltest", *flags, *words]) == 0
         assert name in capsys.readouterr().out
     scores = json.loads((out / "eval" / "results.json").read_text())["scenes"][0]["scores"]
     assert "direction_mae" not in scores["least-squares, true lights"]  # what was given is not scored
-    assert "did you mean 'psfcn'" in fails(capsys, "eval-merltest", *flags, "--lights", "lcnet", "--normals", "psfnc")
+    assert "did you mean 'psfcn'" in fails(capsys, "eval-merltest", *flags, "--lighting", "lcnet", "--normals", "psfnc")
     line = fails(capsys, "eval-merltest", *flags, "--normals", "sdps-second")
     assert "no such weights; train them with `sdps train --models" in line
 

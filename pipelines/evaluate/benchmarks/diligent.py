@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.evaluate.benchmarks import suite
-from pipelines.evaluate.benchmarks.stacks import MARGIN, Images, photographed
+from pipelines.evaluate.benchmarks.stacks import MARGIN, Images, build_object
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.shared.flags import from_flags
 from render.exchange.foreign_samples import Source
@@ -131,7 +131,7 @@ def _object(source: Source, config: DiligentConfig) -> TestObject:
     if drop >= len(source.images):
         raise InputError(f"{source.folder}: {len(source.images)} images, --bear 76 drops the first {drop}")
     files = [source.folder / name for name in source.images[drop:]]
-    return photographed(
+    return build_object(
         source.name, Images.of_files(files, lambda path: _read(path, config.bits)), truth.mask,
         source.directions[drop:], source.intensities[drop:], normals=truth.normals, margin=config.margin,
         files=[source.folder / "mask.png", truth.origin], settings=(config.bits,),

@@ -22,10 +22,10 @@ from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
 
 
-def _opened(item: TestObject) -> Any:
+def _open(item: TestObject) -> Any:
     """Return an object's images, read whole, so that no method is blamed for a damaged file."""
     images: Any = item.load()
-    return images.opened()
+    return images.open()
 
 
 def run(
@@ -49,7 +49,7 @@ def run(
     runners = [Runner(method, finder(models), config) for method in chosen]
     evaluation = Evaluation(folder)
     found: Found = {runner.method.name: {} for runner in runners}
-    objects = ((item.name, replace(item, load=partial(_opened, item))) for item in items)
+    objects = ((item.name, replace(item, load=partial(_open, item))) for item in items)
     for name, runner, result in evaluation.run(objects, runners, len(items), "evaluate", shown):
         found[runner.method.name][name] = result
     return found, runners
@@ -102,7 +102,7 @@ def evaluate(
         protocol: The same for results.json.
         command: The command that does it again, without `--out`.
     """
-    config, shown, file = inference_config(args), pictured(chosen), args.out / bench.name / "results.json"
+    config, shown, file = inference_config(args), pick_pictured(chosen), args.out / bench.name / "results.json"
     found, runners = run(items, chosen, select.runs_folder(args.models), file.parent / "cache", config, shown)
     section = Section(
         name=bench.name, title=bench.title, text=text + using.describe(runners, config), order=bench.order,
@@ -189,7 +189,7 @@ def pick(items: Sequence[TestObject], names: list[str] | None) -> list[TestObjec
     return [known[name] for name in picked("object", names, known)]
 
 
-def pictured(chosen: Sequence[Method]) -> list[str]:
+def pick_pictured(chosen: Sequence[Method]) -> list[str]:
     """Return the names of the methods to show, and of the first lighting model."""
     names = select.shown(list(chosen))
     lights = [method.name for method in chosen if method.lights and not method.normals][:1]

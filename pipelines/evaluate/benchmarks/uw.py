@@ -1,7 +1,7 @@
 """`sdps evaluate uw`: uncalibrated methods on real photographs, against least squares under the measured lights.
 
 There is no ground truth: the error is the mean angle between the normals of a method that finds the lights itself and
-those of one that is told them. The published figures of PF14 stand beside ours.
+those of one that is given them. The published figures of PF14 are in brackets.
 """
 
 import argparse

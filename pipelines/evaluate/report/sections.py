@@ -72,7 +72,7 @@ class Picture:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise InputError(f"kind: {self.kind!r} is none of {', '.join(filter(None, KINDS))}")
+            raise InputError(f"kind: {self.kind!r} is not one of {', '.join(filter(None, KINDS))}")
         if not is_plain_name(self.file):
             raise InputError(f"file: {self.file!r} is not the name of a picture in the section's folder")
 
