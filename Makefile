@@ -87,8 +87,11 @@ app: $(APP_READY)
 doctor: $(READY)
 	$(SDPS) doctor
 
-render-data eval-merltest: $(ASSETS_READY)
-	$(SDPS) $@ --preset $(PRESET) --out $(OUT) $(SETTINGS)
+eval-merltest: $(ASSETS_READY)
+	$(SDPS) evaluate merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
+
+render-data: $(ASSETS_READY)
+	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
 
 train: $(ASSETS_READY)
 	$(SDPS) train --preset $(PRESET) --out $(OUT) $(if $(MODELS),--models '$(MODELS)') $(if $(STREAM),--stream) $(SETTINGS)
@@ -102,23 +105,23 @@ study: OUT = out/study
 study: $(ASSETS_READY)
 	$(SDPS) render-data --preset $(PRESET) --out $(OUT) $(SETTINGS)
 	$(SDPS) train --preset $(PRESET) --out $(OUT) --models '$(or $(MODELS),all)' $(SETTINGS)
-	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
+	$(SDPS) evaluate merltest --preset $(PRESET) --out $(OUT) $(SETTINGS)
 
 eval-classical: OUT = out/classical
 eval-classical: $(ASSETS_READY)
-	$(SDPS) eval-classical --out $(OUT) $(SETTINGS)
+	$(SDPS) evaluate classical --out $(OUT) $(SETTINGS)
 
 eval-photos: OUT = out/photos
 eval-photos: $(READY)
-	$(SDPS) eval-photos '$(DATA)' --out $(OUT)
+	$(SDPS) evaluate uw '$(DATA)' --out $(OUT)
 
 eval-diligent eval-lights: OUT = out/real
 eval-diligent: $(READY)
-	$(SDPS) eval-diligent '$(DATA)' --out $(OUT) $(if $(RUNS),--models $(RUNS)) $(if $(BITS),--bits $(BITS)) \
+	$(SDPS) evaluate diligent '$(DATA)' --out $(OUT) $(if $(RUNS),--models $(RUNS)) $(if $(BITS),--bits $(BITS)) \
 		$(if $(BEAR),--bear $(BEAR))
 
 eval-lights: $(READY)
-	$(SDPS) eval-lights '$(DATA)' --dataset $(DATASET) --out $(OUT) $(if $(RUNS),--models $(RUNS))
+	$(SDPS) evaluate $(DATASET) '$(DATA)' --out $(OUT) $(if $(RUNS),--models $(RUNS))
 
 eval-figures: $(ASSETS_READY)
 	$(LAB) eval-figures --preset $(PRESET) --out $(OUT) $(if $(FIGURES),--figures '$(FIGURES)') \
@@ -136,12 +139,12 @@ ship: $(READY)
 shipped-results: OUT = out/shipped
 shipped-results: PRESET = ship
 shipped-results: $(ASSETS_READY)
-	$(SDPS) eval-merltest --preset $(PRESET) --out $(OUT) --set 'test.shipped=[all]' $(SETTINGS)
-	$(if $(DATA),$(SDPS) eval-diligent '$(DATA)' --out $(OUT) --methods '$(or $(METHODS),learned)')
+	$(SDPS) evaluate merltest --preset $(PRESET) --out $(OUT) --set 'test.shipped=[all]' $(SETTINGS)
+	$(if $(DATA),$(SDPS) evaluate diligent '$(DATA)' --out $(OUT) --methods '$(or $(METHODS),learned)')
 	$(LAB) shipped-results --out $(OUT) --page docs/results.md
 
 report: $(READY)
-	$(SDPS) report $(OUT)
+	$(SDPS) evaluate report $(OUT)
 
 data-plan: $(ASSETS_READY)
 	$(SDPS) data plan --preset $(PRESET) --out $(OUT) $(SETTINGS)

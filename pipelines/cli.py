@@ -53,6 +53,19 @@ DATA = Group("plan, check, preview, describe, export, relight and import data fo
     "pack": Command("pipelines.data.data_pack", "pack scenes into WebDataset tars for streaming", stores=True),
 })  # fmt: skip
 
+EVALUATE = Group("score methods on rendered scenes and real photographs, and write the report", {
+    "merltest": Command("pipelines.evaluate.merltest", "render and score MERL-Test scenes"),
+    "diligent": Command("pipelines.evaluate.benchmarks.diligent", "score methods on DiLiGenT's objects, by folder"),
+    "gourd-apple": Command("pipelines.evaluate.benchmarks.measured_lights", "score lights on Gourd&Apple",
+                           "add_gourd_apple_arguments"),
+    "light-stage": Command("pipelines.evaluate.benchmarks.measured_lights",
+                           "score lights on the Light Stage Data Gallery", "add_light_stage_arguments"),
+    "uw": Command("pipelines.evaluate.benchmarks.uw",
+                  "score uncalibrated methods on photographs of the University of Washington"),
+    "classical": Command("pipelines.evaluate.classical", "compare the classical methods on rendered scenes"),
+    "report": Command("pipelines.evaluate.report.page", "collect everything evaluated into one page"),
+})  # fmt: skip
+
 COMMANDS: dict[str, Command | Group] = {
     "infer": Command("pipelines.infer", "find normals, lights and a surface in a folder of photographs"),
     "app": Command("pipelines.app.app", "serve a local page for photographs, scenes and data"),
@@ -62,19 +75,21 @@ COMMANDS: dict[str, Command | Group] = {
     "data": DATA,
     "models": Command("pipelines.train.list_models", "list the learned models"),
     "train": Command("pipelines.train.train", "train models, by default LCNet, then NENet", stores=True),
-    "eval-merltest": Command("pipelines.evaluate.eval_merltest", "render and score MERL-Test scenes"),
-    "eval-diligent": Command("pipelines.benchmarks.eval_diligent", "score methods on DiLiGenT's objects, by folder"),
-    "eval-lights": Command("pipelines.benchmarks.eval_lights", "score lights on Gourd&Apple or Light Stage"),
-    "eval-classical": Command("pipelines.evaluate.eval_classical", "compare the classical methods on rendered scenes"),
-    "eval-photos": Command("pipelines.benchmarks.eval_photos", "score uncalibrated methods on real photographs"),
-    "report": Command("pipelines.report.page", "collect everything evaluated into one page"),
+    "evaluate": EVALUATE,
     "regenerate": Command("pipelines.rendering.regenerate", "render test scenes of chosen shapes and materials"),
     "fit-material": Command("pipelines.rendering.fit_material", "fit the built-in model to a MERL .binary table"),
     "materials": Command(
         "pipelines.rendering.catalogue", "list the built-in materials", "add_material_arguments", "materials_main"
     ),
     "shapes": Command("pipelines.rendering.catalogue", "list the shape families", "add_shape_arguments", "shapes_main"),
-}
+    "eval-merltest": EVALUATE.commands["merltest"]._replace(hidden=True),
+    "eval-diligent": EVALUATE.commands["diligent"]._replace(hidden=True),
+    "eval-lights": Command("pipelines.evaluate.benchmarks.measured_lights",
+                           "score lights on Gourd&Apple or Light Stage", hidden=True),
+    "eval-classical": EVALUATE.commands["classical"]._replace(hidden=True),
+    "eval-photos": EVALUATE.commands["uw"]._replace(hidden=True),
+    "report": EVALUATE.commands["report"]._replace(hidden=True),
+}  # fmt: skip
 
 IN_LAB = ("bench", "bench-checks", "bench-classical", "bench-infer", "bench-surface", "bench-train",
           "eval-figures", "noise", "ship", "shipped-results")  # fmt: skip

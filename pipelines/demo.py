@@ -132,7 +132,7 @@ def main(args: argparse.Namespace) -> int:
     commands = (
         ["render-data", *common, str(out)],
         ["train", *common, str(out)],
-        ["eval-merltest", *common, str(out)],
+        ["evaluate", "merltest", *common, str(out)],
         ["regenerate", *common, str(out / "regenerated"), "--shapes", "bunny", "--materials", args.materials,
          "--lights", args.lights],
     )  # fmt: skip

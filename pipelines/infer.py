@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.report import page as report
-from pipelines.report.sections import Section, SectionWriter, Table, Tile
+from pipelines.evaluate.report import page as report
+from pipelines.evaluate.report.sections import Section, SectionWriter, Table, Tile
 from pipelines.shared import pictures, using
 from render.shared.errors import InputError
 from render.shared.progress import bars, stage

@@ -29,8 +29,8 @@ FOLDERS = [
     )),
     "sdps",
     *(f"pipelines.{name}" for name in (
-        "shared", "shared.cluster", "rendering", "data.preview", "data", "train", "report", "evaluate",
-        "benchmarks",
+        "shared", "shared.cluster", "rendering", "data.preview", "data", "train", "evaluate.report", "evaluate",
+        "evaluate.benchmarks",
     )),
     "pipelines", "pipelines.app.common", "pipelines.app.pages", "pipelines.app",
     "lab.shared", "lab.bench", "lab.figures", "lab.studies", "lab.releases", "lab",

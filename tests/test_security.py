@@ -14,7 +14,7 @@ import torch
 from data_folders import scene_of, sphere_shard, write_folder
 
 from pipelines.cli import main
-from pipelines.report.sections import Picture, Section, SectionWriter
+from pipelines.evaluate.report.sections import Picture, Section, SectionWriter
 from render.exchange.names import legal_name, object_places, view_places
 from render.records.ledger import read_runs
 from render.records.manifest import read_failed, read_manifest
@@ -202,7 +202,7 @@ def test_no_page_or_card_takes_names_for_markup(tmp_path: Path, capsys: pytest.C
 
 def without_ours(page: str) -> str:
     """Return a page without the one script it may have, which is a file of ours, and the data of that script."""
-    for script in ("pipelines/data/preview/preview.js", "pipelines/report/page.js"):
+    for script in ("pipelines/data/preview/preview.js", "pipelines/evaluate/report/page.js"):
         page = page.replace(f"<script>\n{(ROOT / script).read_text()}</script>", "")
     return re.sub(r'<script type="application/json" id="stages">[^<>]*</script>', "", page)
 

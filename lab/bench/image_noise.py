@@ -8,20 +8,16 @@ the mean of the reference; the bias is the same without the bars. The reference 
 import argparse
 import sys
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from pipelines.shared.cluster import cluster_config
-from pipelines.shared.cluster.cluster_config import ClusterChoice
-from pipelines.shared.cluster.mapped import mapped
 from pipelines.shared.flags import add_fields, split_list
 from render.planning import light_sets
 from render.planning.chunks import GROUP_SIZE
 from render.records.manifest import View
-from render.running.cluster_worker import requirements
 from render.shared.config import build
 from render.shared.errors import InputError
 from render.shared.files import write_json, write_text
@@ -75,19 +71,11 @@ class Row:
     bias: dict[int, float]
 
 
-class Part(NamedTuple):
-    """Materials of one shape that share rays, which is what one process measures at a time."""
-
-    config: NoiseConfig
-    shape: str
-    materials: tuple[str, ...]
-
-
-def measure(config: NoiseConfig, cluster: ClusterChoice | None = None) -> list[Row]:
+def measure(config: NoiseConfig) -> list[Row]:
     """Return a row per shape and material.
 
     Raises:
-        InputError: unknown shape or material, or the cluster fails.
+        InputError: unknown shape or material.
     """
     from render import shapes
     from render.planning.plan import material_pool
@@ -95,38 +83,33 @@ def measure(config: NoiseConfig, cluster: ClusterChoice | None = None) -> list[R
     names = material_pool(config.materials)
     for shape in config.shapes:
         shapes.load(shape)
-    parts = [
-        Part(config, shape, tuple(names[first : first + GROUP_SIZE]))
-        for shape in config.shapes
-        for first in range(0, len(names), GROUP_SIZE)
-    ]
+    rows = []
     with progress_bar(total=len(names) * len(config.shapes), unit="material", desc="noise") as bar:
-        found: dict[Part, list[Row]] = {}
-        needs = partial(requirements, config.shapes, tuple(names))
-        for part, rows in mapped(cluster, measure_part, parts, needs) if cluster else map(measure_part, parts):
-            found[part] = rows
-            bar.update(len(rows))
-    return [row for part in parts for row in found[part]]
+        for shape in config.shapes:
+            for first in range(0, len(names), GROUP_SIZE):
+                part = _measure_group(config, shape, names[first : first + GROUP_SIZE])
+                rows += part
+                bar.update(len(part))
+    return rows
 
 
 @lru_cache(maxsize=1)
 def _built(shape: str) -> Any:
-    """Return the scene of a shape, kept for its next part."""
+    """Return the scene of a shape, kept for its next materials."""
     from render import shapes
     from render.kernel import scene
 
     return scene.build(shapes.load(shape))
 
 
-def measure_part(part: Part) -> tuple[Part, list[Row]]:
-    """Render the materials of a part, and compare; they come back in any order from a cluster."""
+def _measure_group(config: NoiseConfig, shape: str, materials: list[str]) -> list[Row]:
+    """Render materials of one shape, which share rays, and compare."""
     from render.kernel import many_lights
     from render.materials.kernels.packed import pack
 
-    config = part.config
     directions = light_sets.draw("azimuth-elevation", config.lights, generator(config.seed, "noise", "lights"))
-    built = _built(part.shape)
-    packed = pack(list(part.materials), built.mesh)
+    built = _built(shape)
+    packed = pack(materials, built.mesh)
 
     def images(spp: int, seed: int, probe: bool) -> tuple[Any, list[np.ndarray]]:
         truth, stacks = many_lights.render(
@@ -139,12 +122,12 @@ def measure_part(part: Part) -> tuple[Part, list[Row]]:
     seen = truth.coverage > 0
     tried = {spp: images(spp, config.seed, True)[1] for spp in config.spp}
     rows = []
-    for number, name in enumerate(part.materials):
+    for number, name in enumerate(materials):
         level = converged[number][:, seen].mean()
         gaps = {spp: (stacks[number] - converged[number])[:, seen] for spp, stacks in tried.items()}
         error = {spp: float(100 * np.abs(gap).mean() / level) for spp, gap in gaps.items()}
-        rows.append(Row(part.shape, name, error, {spp: float(100 * gap.mean() / level) for spp, gap in gaps.items()}))
-    return part, rows
+        rows.append(Row(shape, name, error, {spp: float(100 * gap.mean() / level) for spp, gap in gaps.items()}))
+    return rows
 
 
 def table(rows: list[Row], config: NoiseConfig) -> str:
@@ -183,7 +166,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--materials", action="append", help="names, categories, files (default: all)")
     parser.add_argument("--spp", action="append", help="sample counts to judge (default: 64,128)")
     add_fields(parser, NoiseConfig, _NUMBERS)
-    cluster_config.add_arguments(parser)
     parser.add_argument("--out", type=Path, help="also write noise.md and noise.json into this folder")
 
 
@@ -192,7 +174,7 @@ def main(args: argparse.Namespace) -> int:
     given = {name: split_list(getattr(args, name)) for name in ("shapes", "materials", "spp")}
     numbers = {name: getattr(args, name) for name in _NUMBERS}
     config = build(NoiseConfig, {name: value for name, value in given.items() if value} | numbers)
-    rows = measure(config, cluster_config.from_arguments(args))
+    rows = measure(config)
     text = summary(rows, config) + "\n" + table(rows, config)
     sys.stdout.write(text)
     if args.out:

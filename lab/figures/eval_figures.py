@@ -1,4 +1,4 @@
-"""`lab eval-figures`: the paper's figures on MERL-Test, for any methods, with the published curves beside ours."""
+"""`lab eval-figures`: the paper's figures on MERL-Test, for any methods, with the published curves."""
 
 import argparse
 import logging
@@ -10,10 +10,10 @@ from typing import Any
 from PIL import Image
 
 from lab.figures import light_distributions, number_of_classes, number_of_images, per_material, pf14
-from lab.figures.drawn import Drawn, LeftOut
+from lab.figures.sweep import LeftOut, Panel
+from pipelines.evaluate.report.sections import Section, SectionWriter, save_picture
 from pipelines.evaluate.results import tables_text
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Section, SectionWriter, save_picture
 from pipelines.shared import presets
 from pipelines.shared.flags import picked, split_list
 from render.shared.config import to_plain
@@ -89,13 +89,13 @@ def wanted_methods(names: Sequence[str], out: Path) -> list[Method]:
     find = finder(out)
     if names:
         return list({method.name: method for method in (parse(name, find) for name in names)}.values())
-    found = [parse(name, find) for name in (_placed(item, out) for item in ("sdps", "psfcn")) if name]
+    found = [parse(name, find) for name in (_find_default(item, out) for item in ("sdps", "psfcn")) if name]
     if not found:
         _log.warning("%s: neither sdps nor psfcn has weights here or in the package; classical methods only", out)
     return [*found, parse("pf14", find), parse("least-squares", find)]
 
 
-def _placed(name: str, out: Path) -> str:
+def _find_default(name: str, out: Path) -> str:
     """Return a default model's or combination's name, that of its shipped weights, or nothing."""
     members = COMBINATIONS[name].members() if name in COMBINATIONS else (name,)
     if all(pretrained.trained_file(out, member).is_file() for member in members):
@@ -103,8 +103,8 @@ def _placed(name: str, out: Path) -> str:
     return pretrained.SHIPPED + name if set(members) <= set(pretrained.shipped()) else NONE
 
 
-def write(name: str, drawn: Drawn, bench: Workbench) -> None:
-    """Write a figure: its section of the report, its charts, and its numbers beside those of earlier figures.
+def write(name: str, drawn: Panel, bench: Workbench) -> None:
+    """Write a figure: its section of the report, its charts, and its numbers next to those of earlier figures.
 
     Raises:
         InputError: a file cannot be written.
@@ -126,7 +126,7 @@ def write(name: str, drawn: Drawn, bench: Workbench) -> None:
     write_json(path, _earlier(path) | {name: _plain(drawn, bench)})
 
 
-def _plain(drawn: Drawn, bench: Workbench) -> dict[str, Any]:
+def _plain(drawn: Panel, bench: Workbench) -> dict[str, Any]:
     return {
         "title": drawn.title, "definition": drawn.text, "config": to_plain(bench.config), "draws": bench.draws,
         "methods": {r.method.name: {key: str(file) for key, file in r.files.items()} for r in bench.runners},
@@ -142,6 +142,6 @@ def _earlier(path: Path) -> dict[str, Any]:
     try:
         found = read_json(path, "delete it")
     except InputError:
-        _log.warning("%s: damaged; it is written anew", path)
+        _log.warning("%s: damaged; it is written again", path)
         return {}
     return {name: found[name] for name in FIGURES if name in found} if isinstance(found, dict) else {}

@@ -3,21 +3,21 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.drawn import Drawn, LeftOut, finds
+from lab.figures.sweep import LeftOut, Panel, finds, shapes_of
 from pipelines.evaluate.evaluation import Result, TestObject
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.pictures import spread
 from pipelines.shared.text_tables import number
 
 SCENES = 3  # per shape
 COLUMNS = 3  # methods shown; all are in the table
-Panels = dict[str, tuple[TestObject, list[tuple[str, Result]]]]
+Shown = dict[str, tuple[TestObject, list[tuple[str, Result]]]]
 """By scene: its object, and the results of the methods by their names."""
 
 
-def make(bench: Workbench) -> Drawn:
+def make(bench: Workbench) -> Panel:
     """Evaluate and draw.
 
     Raises:
@@ -29,12 +29,11 @@ def make(bench: Workbench) -> Drawn:
         raise LeftOut("lights needs a method that finds the lights; add sdps or pf14 to --methods")
     wanted, folder = bench.merltest()
     drawings, rows, values = [], [], {}
-    shapes = tuple(dict.fromkeys(scene.shape for scene in wanted))
-    for shape in shapes:
+    for shape in shapes_of(wanted):
         chosen = spread([scene for scene in wanted if scene.shape == shape], min(SCENES, bench.config.pictures))
-        panels: Panels = {}
+        panels: Shown = {}
         objects = (((scene, item), item) for scene, item in bench.objects(chosen, folder, bench.config))
-        for (scene, item), runner, result in bench.evaluated(objects, runners, len(chosen), f"lights, {shape}"):
+        for (scene, item), runner, result in bench.evaluation.run(objects, runners, len(chosen), f"lights, {shape}"):
             name = runner.method.name
             panels.setdefault(scene.material, (item, []))[1].append((name, result))
             angle, gain = (result.scores.get(metric) for metric in ("direction_mae", "intensity_error"))
@@ -50,7 +49,7 @@ def make(bench: Workbench) -> Drawn:
     note = "Directions: mean angular error in degrees. Intensities: mean relative error after one least-squares scale."
     header = ("shape", "material", "method", "directions", "intensities")
     table = Table(title="Errors of the lights shown", header=header, rows=tuple(rows), note=note)
-    return Drawn(
+    return Panel(
         title="Light distributions, true and estimated",
         text=text,
         charts=tuple(drawings),
@@ -59,7 +58,7 @@ def make(bench: Workbench) -> Drawn:
     )
 
 
-def _chart(panels: Panels) -> Figure:
+def _chart(panels: Shown) -> Figure:
     """Draw a row per material: the true lights, then those of each method."""
     columns = 1 + min(COLUMNS, *(len(found) for _, found in panels.values()))
     figure = charts.new_figure(2.5 * columns + 0.6, 2.75 * len(panels))
@@ -76,7 +75,7 @@ def _chart(panels: Panels) -> Figure:
                 gains = result.intensities if len(result.intensities) else np.ones(len(result.light_directions))
                 charts.light_disc(axes, result.light_directions, gains, item.light_directions)
             angle = result.scores.get("direction_mae")
-            told = "refused" if angle is None else f"{angle:.1f}° off"
-            axes.set_title(f"{charts.short(name)}\n{told}", fontsize=8)
+            about = "refused" if angle is None else f"{angle:.1f}° off"
+            axes.set_title(f"{charts.short(name)}\n{about}", fontsize=8)
     figure.colorbar(points, ax=grid, shrink=0.6, label="intensity / highest", aspect=30)
     return figure

@@ -6,20 +6,23 @@ the worst of the four means, an upper bound of what discretisation costs.
 """
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.drawn import Drawn, LeftOut, paper_row
+from lab.figures.sweep import LeftOut, Panel, paper_row, shapes_of, sweep
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.results import Mean, mean
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
 from render.planning import light_sets
+from render.records.manifest import SceneSpec
 from sdps.core.lighting import LightClasses, azimuth_elevation, unit_direction
 from sdps.core.metrics import angle_degrees
 from sdps.methods.runner import Runner
@@ -36,7 +39,7 @@ def half_bin(count: int) -> float:
     return 180.0 / (2 * count)
 
 
-def deviated(directions: np.ndarray, count: int, corner: tuple[int, int]) -> np.ndarray:  # (L, 3) float32
+def deviate(directions: np.ndarray, count: int, corner: tuple[int, int]) -> np.ndarray:  # (L, 3) float32
     """Move lights by half a class in azimuth and in elevation.
 
     Angles are kept within +-(90 - delta) degrees, the range of class centres: no class lies nearer to the horizon or
@@ -65,33 +68,31 @@ def centre_floor(directions: np.ndarray, count: int) -> float:
     return float(angle_degrees(classes.decode(azimuth, elevation, intensity)[0], directions).mean())
 
 
-def make(bench: Workbench) -> Drawn:
+def make(bench: Workbench) -> Panel:
     """Evaluate and draw.
 
     Raises:
-        LeftOut: no method that is told the lights.
+        LeftOut: no method that is given the lights.
         InputError: scenes that cannot be rendered or read.
     """
     runners = [runner for runner in bench.runners if runner.method.lights == TRUE_LIGHTS]
     if not runners:
-        raise LeftOut("bins needs a method that is told the lights; add psfcn or least-squares to --methods")
+        raise LeftOut("bins needs a method that is given the lights; add psfcn or least-squares to --methods")
     wanted, folder = bench.merltest()
-    found: dict[tuple[str, str, int], list[list[dict[str, float]]]] = {}  # (method, shape, bins): scores per corner
-    objects = (
-        ((scene.shape, count, place), variant)
-        for scene, item in bench.objects(wanted, folder, bench.config)
-        for count in (_EXACT, *BINS)
-        for place, variant in enumerate(_variants(item, count))
-    )
-    total = len(wanted) * (4 * len(BINS) + 1)
-    for (shape, count, place), runner, result in bench.evaluated(objects, runners, total, "bins"):
-        corners = found.setdefault((runner.method.name, shape, count), [[] for _ in CORNERS])
-        corners[place].append(result.scores)
-    errors = {key: _worst([mean(part, "normal_mae") for part in parts if part]) for key, parts in found.items()}
-    shapes = tuple(dict.fromkeys(scene.shape for scene in wanted))
+
+    def variants(scene: SceneSpec, item: TestObject) -> Iterator[tuple[tuple[Any, ...], TestObject]]:
+        for count in (_EXACT, *BINS):
+            for place, variant in enumerate(_deviations(item, count)):
+                yield (scene.shape, count, place), variant
+
+    corners: dict[tuple[str, str, int], list[Mean]] = {}  # by method, shape, bins
+    for (*key, _), results in sweep(bench, runners, (wanted, folder), variants, 4 * len(BINS) + 1, "bins").items():
+        corners.setdefault(tuple(key), []).append(mean((one.scores for one in results), "normal_mae"))
+    errors = {key: _worst(means) for key, means in corners.items()}
+    shapes = shapes_of(wanted)
     directions = light_sets.load(bench.config.lights)
     text = (
-        f"Normals of methods that are told the lights, on {len(wanted)} MERL-Test scenes of {len(directions)} lights "
+        f"Normals of methods that are given the lights, on {len(wanted)} MERL-Test scenes of {len(directions)} lights "
         f"({bench.config.lights}). Every true light is replaced by each of the four directions half a class away in "
         "azimuth and in elevation, delta = 180/(2 K_d) degrees; shown is the worst of the four means over materials. "
         "Angles stay within the range of class centres, +-(90 - delta) degrees. Intensities are the true ones."
@@ -101,7 +102,7 @@ def make(bench: Workbench) -> Drawn:
         f"{method} | {shape}": {"exact" if not k else str(k): errors[method, shape, k].plain() for k in (*BINS, _EXACT)}
         for method, shape in dict.fromkeys((m, s) for m, s, _ in errors)
     }
-    return Drawn(
+    return Panel(
         title="Error against the number of light classes",
         text=text,
         charts=(("bins", "Upper bound of the normals' error by the number of bins K_d.", chart),),
@@ -110,14 +111,14 @@ def make(bench: Workbench) -> Drawn:
     )
 
 
-def _variants(item: TestObject, count: int) -> list[TestObject]:
+def _deviations(item: TestObject, count: int) -> list[TestObject]:
     """Return the object with its true lights, or with each of the four sets of deviated ones."""
     if count == _EXACT:
         return [item]
     found = []
     for corner in CORNERS:
         name = f"{item.name}, K_d {count} {corner[0]:+d}{corner[1]:+d}"
-        lights = deviated(item.true_directions, count, corner)
+        lights = deviate(item.true_directions, count, corner)
         digest = hashlib.sha256(item.digest.encode() + lights.tobytes()).hexdigest()[:24]
         found.append(replace(item, name=name, digest=digest, light_directions=lights))
     return found
@@ -144,7 +145,7 @@ def _table(
         ]
         angles = ["0", "0", "0"]
         if count:
-            moved = max(angle_degrees(deviated(directions, count, c), directions).mean() for c in CORNERS)
+            moved = max(angle_degrees(deviate(directions, count, c), directions).mean() for c in CORNERS)
             angles = [f"{half_bin(count):g}", number(float(moved)), number(centre_floor(directions, count))]
         rows.append((str(count) if count else "infinite", *angles, *cells))
     header = ("K_d", "delta", "moved by", "class centres", *(f"{r.method.name}, {s}" for r, s in columns))

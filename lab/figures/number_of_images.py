@@ -5,20 +5,22 @@ and all objects and methods see the same ones.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.drawn import METRICS, Drawn, finds, paper_row
+from lab.figures.sweep import METRICS, Panel, finds, paper_row, shapes_of, sweep
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.results import Mean, mean
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
+from render.records.manifest import SceneSpec
 from render.shared.seeds import generator
 from sdps.methods.method import Method
 
@@ -48,7 +50,7 @@ def part_of(item: TestObject, count: int, draw: int, places: np.ndarray) -> Test
     )  # fmt: skip
 
 
-def make(bench: Workbench) -> Drawn:
+def make(bench: Workbench) -> Panel:
     """Evaluate and draw.
 
     Raises:
@@ -56,26 +58,24 @@ def make(bench: Workbench) -> Drawn:
     """
     wanted, folder = bench.merltest()
     chosen = subsets(len(wanted[0].lights), bench.draws, bench.config.seed)
-    objects = (
-        ((scene.shape, count, draw), part_of(item, count, draw, places))
-        for scene, item in bench.objects(wanted, folder, bench.config)
-        for count, draw, places in chosen
-    )
-    found: dict[tuple[str, str, int, int], list[dict[str, float]]] = {}
-    for key, runner, result in bench.evaluated(objects, bench.runners, len(wanted) * len(chosen), "images"):
-        found.setdefault((runner.method.name, *key), []).append(result.scores)
+
+    def variants(scene: SceneSpec, item: TestObject) -> Iterator[tuple[tuple[Any, ...], TestObject]]:
+        for count, draw, places in chosen:
+            yield (scene.shape, count, draw), part_of(item, count, draw, places)
+
     points: Points = {}
-    for (method, shape, count, _), scores in found.items():
+    found = sweep(bench, bench.runners, (wanted, folder), variants, len(chosen), "images")
+    for (method, shape, count, _), results in found.items():
         kept = points.setdefault((method, shape, count), {metric: [] for metric in METRICS})
         for metric in METRICS:
-            kept[metric].append(mean(scores, metric))
+            kept[metric].append(mean((one.scores for one in results), metric))
     methods = [runner.method for runner in bench.runners]
-    shapes = tuple(dict.fromkeys(scene.shape for scene in wanted))
+    shapes = shapes_of(wanted)
     counts = tuple(dict.fromkeys(count for count, _, _ in sorted(chosen, key=lambda part: part[0])))
     text = (
         f"{len(wanted)} MERL-Test scenes ({bench.config.lights}); {bench.draws} random subsets of each number of "
         "images, the same for all scenes and methods, and all images once. Lines: mean over materials and draws. "
-        "Bands: from the lowest to the highest draw. Grey diamonds: the paper's figures for all images. A method told "
+        "Bands: from the lowest to the highest draw. Grey diamonds: the paper's figures for all images. A method given "
         "the true lights is scored on normals only."
     )
     drawings = tuple(
@@ -84,7 +84,7 @@ def make(bench: Workbench) -> Drawn:
         for shape in shapes
     )  # fmt: skip
     tables = tuple(_table(methods, shape, counts, points, metric) for shape in shapes for metric in METRICS)
-    return Drawn(
+    return Panel(
         title="Error against the number of images",
         text=text,
         charts=drawings,
@@ -124,8 +124,8 @@ def _table(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
             text = number(middle) if np.isfinite(middle) else "-"
             text += f" [{number(low)}, {number(high)}]" if high > low else ""
             cells.append(text + (f" {failed} failed" if failed and np.isfinite(middle) else ""))
-        beside = _published(method, shape, metric)
-        rows.append((method.name, *cells, number(beside) if beside is not None else "-"))
+        known = _published(method, shape, metric)
+        rows.append((method.name, *cells, number(known) if known is not None else "-"))
     title, unit = METRICS[metric]
     header = ("method", *map(str, counts), f"published, {counts[-1]}" if counts[-1] == 100 else "published, 100")
     note = f"{unit.capitalize()}, mean over materials and draws; in brackets the lowest and the highest draw."

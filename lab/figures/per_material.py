@@ -1,6 +1,7 @@
-"""Error per material on BUNNY beside the published curves (the paper's supplement)."""
+"""Error per material on BUNNY and the published curves (the paper's supplement)."""
 
 import csv
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
 
@@ -8,11 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
-from lab.figures.drawn import Drawn, LeftOut, paper_row
+from lab.figures.sweep import LeftOut, Panel, paper_row, sweep
+from pipelines.evaluate.evaluation import TestObject
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench, lit_object
-from pipelines.report.sections import Table
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
+from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from render.shared.files import read_text
 
@@ -41,30 +44,30 @@ def read_published() -> dict[str, dict[str, float]]:
 
 @dataclass(frozen=True)
 class Curve:
-    """A method's errors beside the published curve it is compared with.
+    """A method's errors and the published curve it is compared with.
 
     Attributes:
         method: Its name.
         errors: MAE in degrees by material; without those it failed on.
-        beside: Column of the published curve.
+        column: Column of the published curve.
     """
 
     method: str
     errors: dict[str, float]
-    beside: str
+    column: str
 
     def rank_correlation(self, curves: dict[str, dict[str, float]]) -> tuple[float, float, int]:
         """Return Spearman's rho with the published curve, its p-value and the number of materials; NaN where
         fewer than 3 errors differ."""
-        shared = [name for name in self.errors if name in curves[self.beside]]
-        ours, theirs = ([column[name] for name in shared] for column in (self.errors, curves[self.beside]))
+        shared = [name for name in self.errors if name in curves[self.column]]
+        ours, theirs = ([column[name] for name in shared] for column in (self.errors, curves[self.column]))
         if len(set(ours)) < 3:
             return float("nan"), float("nan"), len(shared)
         found = spearmanr(ours, theirs)
         return float(found.statistic), float(found.pvalue), len(shared)
 
 
-def make(bench: Workbench) -> Drawn:
+def make(bench: Workbench) -> Panel:
     """Evaluate and draw; errors are averaged over `test.repeats` draws of the intensities.
 
     Raises:
@@ -79,14 +82,17 @@ def make(bench: Workbench) -> Drawn:
     published = read_published()
     wanted, folder = bench.merltest()
     wanted = [scene for scene in wanted if scene.shape == SHAPE]
-    found: dict[str, dict[str, list[float]]] = {runner.method.name: {} for runner in runners}
-    repeats = range(bench.config.repeats)
-    objects = ((s.material, lit_object(s, folder, bench.config, repeat)) for s in wanted for repeat in repeats)
-    for material, runner, result in bench.evaluated(objects, runners, len(wanted) * len(repeats), "materials"):
-        found[runner.method.name].setdefault(material, []).append(result.scores.get("normal_mae", np.nan))
+
+    def variants(scene: SceneSpec, _: TestObject) -> Iterator[tuple[tuple[str], TestObject]]:
+        for repeat in range(bench.config.repeats):
+            yield (scene.material,), lit_object(scene, folder, bench.config, repeat)
+
+    found = sweep(bench, runners, (wanted, folder), variants, bench.config.repeats, "materials")
+    errors = {key: [one.scores.get("normal_mae", np.nan) for one in results] for key, results in found.items()}
     curves = []
     for method in (runner.method for runner in runners):  # without what it failed on in any of the repeats
-        kept = {name: float(np.mean(e)) for name, e in found[method.name].items() if np.isfinite(e).all()}
+        own = {material: values for (name, material), values in errors.items() if name == method.name}
+        kept = {material: float(np.mean(values)) for material, values in own.items() if np.isfinite(values).all()}
         curves.append(Curve(method.name, kept, COLUMNS.get(paper_row(method), "SDPS_Net")))
     names = [scene.material for scene in wanted]
     reference = published["SDPS_Net"]
@@ -96,13 +102,13 @@ def make(bench: Workbench) -> Drawn:
         f"{bench.config.repeats} draw(s) of random intensities. Materials are in the order of the published SDPS-Net "
         "curve. Grey: the paper's curves, of its own rendering, digitised from the vector figure of its poster."
     )
-    return Drawn(
+    return Panel(
         title="Error per material",
         text=text,
         charts=(("materials", "Mean angular error of normals per material.", _chart(curves, order, published)),),
         tables=(_summary(curves, published), _hardest(curves, published)),
         values={
-            curve.method: {"rank_correlation": rho if np.isfinite(rho) else None, "beside": curve.beside,
+            curve.method: {"rank_correlation": rho if np.isfinite(rho) else None, "beside": curve.column,
                            "normal_mae": curve.errors}
             for curve in curves
             for rho in curve.rank_correlation(published)[:1]
@@ -114,10 +120,10 @@ def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Tab
     rows = []
     for curve in curves:
         rho, p, count = curve.rank_correlation(published)
-        beside = [published[curve.beside][name] for name in curve.errors if name in published[curve.beside]]
+        theirs = [published[curve.column][name] for name in curve.errors if name in published[curve.column]]
         rows.append((
             curve.method, number(float(np.mean(list(curve.errors.values())))) if curve.errors else "-",
-            LABELS[curve.beside], number(float(np.mean(beside))) if beside else "-",
+            LABELS[curve.column], number(float(np.mean(theirs))) if theirs else "-",
             f"{rho:.2f}" if np.isfinite(rho) else "-", f"{p:.1g}" if np.isfinite(p) else "-", str(count),
         ))  # fmt: skip
     note = "Mean angular error in degrees over mask pixels. Spearman's rank correlation over the materials."

@@ -1,21 +1,24 @@
 """Classical PF14 against SDPS-Net by kind of reflectance and of lights (paper sec. 5.1 and its figure on PF14)."""
 
 import colorsys
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.drawn import METRICS, Drawn, LeftOut, finds, paper_row
+from lab.figures.sweep import METRICS, LeftOut, Panel, finds, paper_row, sweep
+from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.published import POSTER
+from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.results import Mean, mean
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Table
 from pipelines.shared import charts, scenes
 from pipelines.shared.pictures import spread
 from render.materials import library
 from render.planning import light_sets
 from render.planning.plan import material_pool
+from render.records.manifest import SceneSpec
 from sdps.methods.method import Method
 from sdps.methods.runner import Runner
 
@@ -61,7 +64,7 @@ def groups(chosen: tuple[str, ...]) -> dict[str, list[str]]:
     return {"lambertian": named or some} | {group: names for group, names in found.items() if names}
 
 
-def make(bench: Workbench) -> Drawn:
+def make(bench: Workbench) -> Panel:
     """Render the two light sets, evaluate and draw.
 
     Raises:
@@ -78,15 +81,15 @@ def make(bench: Workbench) -> Drawn:
         means |= _evaluate(bench, runners, shape, kinds, lights)
     methods = [runner.method for runner in runners]
     counted = ", ".join(f"{len(names)} {group}" for group, names in kinds.items())
-    beside = "Grey diamonds and brackets: read off the paper's poster. " if shape == SHAPE else ""
+    note = "Grey diamonds and brackets: read off the paper's poster. " if shape == SHAPE else ""
     text = (
         f"{shape.capitalize()} with {counted} materials under {' and '.join(LIGHT_SETS)} lights (uniform on the unit "
-        f"disc of x and y; biased: its part y > {light_sets.BIASED_MIN_Y}), with random intensities. {beside}"
+        f"disc of x and y; biased: its part y > {light_sets.BIASED_MIN_Y}), with random intensities. {note}"
         "The Lambertian materials and the lights are ours; the paper's are not known."
     )
     tables = tuple(_table(methods, tuple(kinds), means, metric, shape) for metric in METRICS)
     caption = "Errors by kind of reflectance; plain bars: near-uniform lights, hatched: biased lights."
-    return Drawn(
+    return Panel(
         title="Classical PF14 against SDPS-Net",
         text=text,
         charts=(
@@ -105,16 +108,18 @@ def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[s
     """Return the means under one light set."""
     materials = tuple(name for names in kinds.values() for name in names)
     config = replace(bench.config, shapes=(shape,), materials=materials, lights=lights)
-    wanted, folder = bench.rendered(config, bench.out / "figures" / scenes.slug(lights))
+    wanted, folder = bench.render(config, bench.out / "figures" / scenes.slug(lights))
     group_of = {name: group for group, names in kinds.items() for name in names}
-    found: dict[tuple[str, str], list[dict[str, float]]] = {}
-    objects = (
-        (scene.material, replace(item, name=f"{item.name}, {lights}"))
-        for scene, item in bench.objects(wanted, folder, config)
-    )
-    for material, runner, result in bench.evaluated(objects, runners, len(wanted), lights):
-        found.setdefault((runner.method.name, group_of[material]), []).append(result.scores)
-    return {(m, lights, group, metric): mean(s, metric) for (m, group), s in found.items() for metric in METRICS}
+
+    def variants(scene: SceneSpec, item: TestObject) -> Iterator[tuple[tuple[str], TestObject]]:
+        yield (group_of[scene.material],), replace(item, name=f"{item.name}, {lights}")
+
+    found = sweep(bench, runners, (wanted, folder), variants, 1, lights)
+    return {
+        (method, lights, group, metric): mean((one.scores for one in results), metric)
+        for (method, group), results in found.items()
+        for metric in METRICS
+    }
 
 
 def published(method: Method, metric: str, group: str, lights: str, shape: str) -> float | None:

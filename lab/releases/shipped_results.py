@@ -1,4 +1,4 @@
-"""`lab shipped-results`: what the shipped weights were measured to do, as Markdown beside them and in the docs.
+"""`lab shipped-results`: what the shipped weights were measured to do, as Markdown in their folder and in the docs.
 
 Reads the `results.json` of `sdps eval-merltest` and, where there is one, of `sdps eval-diligent` in one folder that
 holds no models of its own, so that every learned row is a shipped one. `make shipped-results` runs all three.
@@ -20,7 +20,7 @@ BEGIN, END = "<!-- shipped results: begin -->", "<!-- shipped results: end -->"
 RESULTS = "RESULTS.md"
 NOT_TRAINED, ABSENT, OURS = "not trained", "-", "ours"
 _COMPARED = ("SDPS-Net", "LCNet_reg + NENet", "UPS-FCN deep+mask", "LCNet", "LCNet_reg")
-"""Published rows of DiLiGenT that stand beside ours."""
+"""Published rows of DiLiGenT that are shown with ours."""
 
 _PAPERS_OWN = ("A0", "B1")
 _TEMPLATE = Path(__file__).with_name("shipped_results.md.j2")
@@ -42,7 +42,8 @@ def main(args: argparse.Namespace) -> int:
     """Write <into>/RESULTS.md, and the same tables into the page."""
     text = results_text(args.out)
     file = (args.into or pretrained.shipped_folder()) / RESULTS
-    page = replaced(args.page, text) if args.page else None  # a page without marks is refused before anything
+    # A page without marks is refused before anything is written.
+    page = replace_between_marks(args.page, text) if args.page else None
     write_text(file, f"# What the shipped weights do\n\n{text}")
     if page is not None:
         write_text(args.page, page)
@@ -64,9 +65,9 @@ def results_text(out: Path) -> str:
         config=merltest["config"],
         scenes=merltest["scenes"],
         networks=merltest["networks"],
-        merltest={title: _measured(table) for title, table in merltest["tables"].items()},
+        merltest={title: _keep_measured(table) for title, table in merltest["tables"].items()},
         real=diligent,
-        diligent={title: _compared(table) for title, table in diligent.get("tables", {}).items()},
+        diligent={title: _keep_compared(table) for title, table in diligent.get("tables", {}).items()},
         weights=_digests({**merltest["weights"], **diligent.get("weights", {})}.values()),
     )
 
@@ -77,7 +78,7 @@ def _read(path: Path, remedy: str) -> dict[str, Any]:
     return read_json(path, f"delete it and {remedy}")
 
 
-def _measured(table: Table) -> Table:
+def _keep_measured(table: Table) -> Table:
     """Leave out the paper's rows that no shipped model belongs to, but for its own networks."""
     rows = []
     for row in table["rows"]:
@@ -88,7 +89,7 @@ def _measured(table: Table) -> Table:
     return {"header": table["header"], "rows": rows}
 
 
-def _compared(table: Table) -> Table:
+def _keep_compared(table: Table) -> Table:
     """Keep our rows and those of the paper's own method, and the objects that were there."""
     rows = [row for row in table["rows"] if row[1] == OURS or row[0] in _COMPARED]
     ours = [row for row in rows if row[1] == OURS]
@@ -110,12 +111,12 @@ def _digests(files: Iterable[str]) -> dict[str, str]:
     digests = {}
     for file in sorted(map(Path, files)):
         if file.resolve().parent != folder:
-            raise InputError(f"{file}: evaluated beside the shipped weights; use an --out without trained models")
+            raise InputError(f"{file}: evaluated with the shipped weights; use an --out without trained models")
         digests[file.name] = file_hash(file)[:12]
     return digests
 
 
-def replaced(page: Path, text: str) -> str:
+def replace_between_marks(page: Path, text: str) -> str:
     """Return a page's text with what stands between the marks replaced.
 
     Raises:

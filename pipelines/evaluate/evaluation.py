@@ -12,17 +12,20 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, read_whole_lines, source_digest
+from render.shared.progress import progress_bar
 
 if TYPE_CHECKING:
     from sdps.inference.image_source import ImageSource
-    from sdps.methods.runner import Found, Runner
+    from sdps.methods.runner import Found as FoundLights
+    from sdps.methods.runner import Runner
 
+K = TypeVar("K")
 _log = logging.getLogger(__name__)
 _FORMAT = "evaluation-3"
 _NOTES = ("gbr", "candidates", "intersections")
@@ -41,6 +44,7 @@ class TestObject:
         normals: (H, W, 3) true normals, or None.
         light_directions: (L, 3) true directions, or None.
         intensities: (L,) or (L, 3) true intensities, or None.
+        pictured: Whether normal maps may be kept of it.
     """
 
     __test__ = False  # nothing for pytest to collect
@@ -52,6 +56,7 @@ class TestObject:
     normals: np.ndarray | None = None
     light_directions: np.ndarray | None = None
     intensities: np.ndarray | None = None
+    pictured: bool = True
 
     @property
     def true_directions(self) -> np.ndarray:
@@ -90,6 +95,10 @@ class Result:
             return stored["normals"].astype(np.float32)
 
 
+Found = dict[str, dict[str, Result]]
+"""Results by method, then object."""
+
+
 class ScoreCache:
     """Results by key in a file of JSON lines, appended to one by one.
 
@@ -113,10 +122,6 @@ class ScoreCache:
     def get(self, key: tuple[str, ...]) -> Any:
         """Return the result of a key, or None."""
         return self._found.get(key)
-
-    def items(self) -> Iterable[tuple[tuple[str, ...], Any]]:
-        """Return all keys with their results."""
-        return self._found.items()
 
     def add(self, key: tuple[str, ...], value: Any) -> None:
         """Keep a result, in memory and at the end of the file."""
@@ -155,9 +160,9 @@ class Evaluation:
             keep: Names of methods whose normal maps are kept (float16).
         """
         images, found = None, []
-        lights: Found = {}
+        lights: FoundLights = {}
         for runner in runners:
-            key, kept = _key(item, runner), runner.method.name in keep
+            key, kept = _key(item, runner), item.pictured and runner.method.name in keep
             known = self._known(key, kept)
             if known is None:
                 images = item.load() if images is None else images
@@ -166,22 +171,31 @@ class Evaluation:
             found.append(_result(known, self._maps(key)))
         return found
 
-    def lacks(self, item: TestObject, runners: "Sequence[Runner]", keep: Collection[str] = ()) -> bool:
-        """Tell whether `results` would have to run a method."""
-        return any(self._known(_key(item, runner), runner.method.name in keep) is None for runner in runners)
+    def run(
+        self,
+        objects: Iterable[tuple[K, TestObject]],
+        runners: "Sequence[Runner]",
+        total: int,
+        about: str,
+        keep: Collection[str] = (),
+    ) -> "Iterator[tuple[K, Runner, Result]]":
+        """Run methods on objects with a progress bar, or take their results from the cache.
 
-    def entries(self) -> Iterator["Entry"]:
-        """Yield all that is known, for another evaluation to `adopt`."""
-        for key, known in self._cache.items():
-            maps = self._maps(key)
-            yield Entry(key, known, maps.read_bytes() if maps.is_file() else b"")
+        Args:
+            objects: Keys of the caller, each with an object.
+            runners: The methods.
+            total: Number of objects.
+            about: What the progress bar says.
+            keep: Names of methods whose normal maps are kept, of the objects that are `pictured`.
 
-    def adopt(self, entry: "Entry") -> None:
-        """Keep what another evaluation found."""
-        if entry.maps:
-            with atomic_path(self._maps(entry.key)) as temporary:
-                temporary.write_bytes(entry.maps)
-        self._cache.add(entry.key, entry.known)
+        Yields:
+            The key, the method and its result, object by object.
+        """
+        with progress_bar(total=total * len(runners), desc=about, unit="map") as bar:
+            for key, item in objects:
+                for runner, result in zip(runners, self.results(item, runners, keep), strict=True):
+                    yield key, runner, result
+                    bar.update()
 
     def _maps(self, key: tuple[str, ...]) -> Path:
         return self.folder / "maps" / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.npz"
@@ -192,7 +206,7 @@ class Evaluation:
         return None if known and kept and known["normals"] and not self._maps(key).is_file() else known
 
     def _run(
-        self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: "Found"
+        self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: "FoundLights"
     ) -> dict[str, Any]:
         """Run a method and return what is kept of it, JSON ready."""
         try:
@@ -214,14 +228,6 @@ class Evaluation:
             "gains": np.round(np.asarray(estimate.intensities, np.float64), 6).tolist(),
             "notes": {name: estimate.diagnostics[name] for name in _NOTES if name in estimate.diagnostics},
         }
-
-
-class Entry(NamedTuple):
-    """A result as it is kept: under which key, its line, and the file of the normal map, empty where there is none."""
-
-    key: tuple[str, ...]
-    known: dict[str, Any]
-    maps: bytes
 
 
 def _key(item: TestObject, runner: "Runner") -> tuple[str, ...]:

@@ -4,17 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.evaluate.evaluation import Result, TestObject
-from pipelines.report.sections import Tile
+from pipelines.evaluate.evaluation import Found, TestObject
+from pipelines.evaluate.report.sections import Tile
 from pipelines.shared import pictures
 from sdps.core.metrics import normal_error_map
 
 ERROR_LIMIT = 45.0
 _SHOWN_HEIGHT = 240
 _LIT_CANDIDATES = 12
-
-Found = dict[str, dict[str, Result]]
-"""Results by method, then object."""
 
 
 def tiles(item: TestObject, found: Found, shown: Sequence[str], truth: str = "true normals") -> list[Tile]:

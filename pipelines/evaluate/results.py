@@ -1,4 +1,4 @@
-"""What evaluations do with scores: means over objects, tables as text, results.json and a section of the report."""
+"""What evaluations do with scores: means over objects, tables, results.json and a section of the report."""
 
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -8,11 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.report.sections import SectionWriter, Table
+from pipelines.evaluate.evaluation import Found
+from pipelines.evaluate.published import PublishedRow
+from pipelines.evaluate.report.sections import SectionWriter, Table
 from pipelines.shared.text_tables import number, render_text
 from render.shared.config import to_plain
 from render.shared.files import write_json
 from sdps.methods.runner import Runner
+
+OURS, REFUSED = "ours", "refused"
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,63 @@ def mean(scores: Iterable[Mapping[str, float]], metric: str) -> Mean:
 def tables_text(tables: Sequence[Table], left: Collection[int] = (0,)) -> str:
     """Lay out tables for the terminal; columns in `left` are set flush left."""
     return "".join(render_text(f"\n{table.title}", table.header, table.rows, left) for table in tables)
+
+
+def object_table(
+    title: str,
+    results: Found,
+    metric: str,
+    *,
+    present: Sequence[str],
+    known: Sequence[str],
+    published: Sequence[PublishedRow],
+    digits: int,
+    note: str = "",
+) -> Table:
+    """Return a table of one metric.
+
+    The last columns are the mean over the objects that are present, so that rows can be compared, and the mean over all
+    objects of the benchmark. Without any of the benchmark's own objects there are no published rows.
+
+    Args:
+        title: Caption.
+        results: Ours; methods that never have the metric get no row unless they refused an object.
+        metric: Name of the score.
+        present: Objects of this evaluation.
+        known: Objects of the benchmark, in its order.
+        published: Published rows.
+        digits: Decimals.
+        note: A sentence below the table.
+    """
+    official = any(name in known for name in present)
+    columns = [*(known if official else ()), *(name for name in present if name not in known)]
+    entries: list[tuple[str, str, dict[str, float], float | None, Sequence[str]]] = [
+        (name, OURS, {key: one.scores[metric] for key, one in found.items() if metric in one.scores}, None,
+         [key for key, one in found.items() if one.reason])
+        for name, found in results.items()
+        if any(metric in result.scores or result.reason for result in found.values())
+    ]  # fmt: skip
+    ours = len(entries)
+    entries += [(one.method, one.source, one.figures, one.average, ()) for one in published] if official else []
+    rows = []
+    for name, source, figures, printed, refused in entries:
+        cells = [REFUSED if column in refused else _figure(figures.get(column), digits) for column in columns]
+        means = [_mean(figures, present)]
+        means += [_mean(figures, known) if printed is None else printed] if official else []
+        rows.append((name, source, *cells, *(_figure(mean, digits) for mean in means)))
+    last = [f"mean of {len(present)}" if len(present) > 1 else "this object"]
+    last += [f"all {len(known)}"] if official else []
+    header, theirs = ("method", "source", *columns, *last), tuple(range(ours, len(rows)))
+    return Table(title=title, header=header, rows=tuple(rows), published=theirs, note=note)
+
+
+def _mean(figures: Mapping[str, float], names: Sequence[str]) -> float | None:
+    """Return the mean over objects, None where one has no figure."""
+    return float(np.mean([figures[name] for name in names])) if all(name in figures for name in names) else None
+
+
+def _figure(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def weights_of(runners: Iterable[Runner]) -> dict[str, str]:

@@ -1,15 +1,14 @@
 """Methods on rendered test scenes, seen as photographs under lights of unknown strength."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from pipelines.evaluate.evaluation import Evaluation, Result, TestObject
+from pipelines.evaluate.evaluation import Evaluation, TestObject
 from pipelines.rendering.render_data import render_planned
 from pipelines.shared import scenes
 from pipelines.shared.cluster.cluster_config import ClusterChoice
@@ -18,7 +17,6 @@ from render.records.manifest import SceneSpec
 from render.records.shards import Shard, file_hash, read_shard
 from render.shared.errors import InputError
 from render.shared.images import quantise, write_png
-from render.shared.progress import progress_bar
 from render.shared.seeds import generator
 from sdps.methods.runner import Runner
 
@@ -77,6 +75,7 @@ def lit_object(scene: SceneSpec, folder: Path, config: TestConfig, repeat: int =
         name=scene.id if repeat == 0 else f"{scene.id}, draw {repeat}",
         digest=hashlib.sha256(repr(parts).encode()).hexdigest()[:24], load=lambda: photographs(shard, gains),
         mask=shard.mask, normals=shard.normals, light_directions=scene.light_directions(), intensities=gains,
+        pictured=repeat == 0,
     )  # fmt: skip
 
 
@@ -86,10 +85,10 @@ class Workbench:
 
     Attributes:
         preset: Its `test` section names shapes, materials, lights and how they are rendered.
-        out: The run's folder; MERL-Test scenes are shared with `eval-merltest`.
+        out: The run's folder; MERL-Test scenes are shared with `sdps evaluate merltest`.
         runners: The methods.
         draws: Random choices per point, where a figure makes any.
-        cluster: Where scenes are rendered and, by `eval-merltest`, scored; this process when omitted.
+        cluster: Where scenes are rendered; this process when omitted.
     """
 
     preset: Preset
@@ -109,9 +108,9 @@ class Workbench:
         Raises:
             InputError: the folder holds other scenes, or one cannot be rendered.
         """
-        return self.rendered(self.config, self.out / "merltest")
+        return self.render(self.config, self.out / "merltest")
 
-    def rendered(self, config: TestConfig, folder: Path) -> tuple[list[SceneSpec], Path]:
+    def render(self, config: TestConfig, folder: Path) -> tuple[list[SceneSpec], Path]:
         """Return the scenes of a test configuration and their folder, rendered where they are not yet."""
         wanted = scenes.test_scenes(config)
         render_planned(wanted, folder, replace(self.preset, test=config), self.cluster)
@@ -129,20 +128,3 @@ class Workbench:
         for scene in wanted:
             item = lit_object(scene, folder, config)
             yield scene, replace(item, load=cache(item.load))
-
-    def evaluated(
-        self, objects: Iterable[tuple[Any, TestObject]], runners: Sequence[Runner], total: int, about: str
-    ) -> Iterator[tuple[Any, Runner, Result]]:
-        """Yield what stands for an object, a method and what it makes of the object, from the cache or by running it.
-
-        Args:
-            objects: What stands for it, the object.
-            runners: The methods.
-            total: Number of objects.
-            about: What the progress bar says.
-        """
-        with progress_bar(total=total * len(runners), desc=about, unit="map") as bar:
-            for key, item in objects:
-                for runner, result in zip(runners, self.evaluation.results(item, runners), strict=True):
-                    yield key, runner, result
-                    bar.update()

@@ -13,10 +13,10 @@ import pytest
 from data_folders import good_folder, scene_of, sphere_shard
 from fault_run import FAULTS, ROOT, digests, disturbed, finished, left_over
 
-from pipelines.benchmarks.lit_photographs import object_folders
 from pipelines.cli import main
+from pipelines.evaluate.benchmarks.lit_photographs import object_folders
+from pipelines.evaluate.report.sections import FOLDER, Section, SectionWriter, read_sections
 from pipelines.rendering.render_data import write_preview
-from pipelines.report.sections import FOLDER, Section, SectionWriter, read_sections
 from render.exchange.folders import claim
 from render.records.shards import read_shard, write_shard
 from render.shared import files

@@ -342,7 +342,7 @@ def _read_picture(folder: Path, path: Path) -> None:
 
 
 def _read_foreign_picture(folder: Path, path: Path) -> None:
-    from pipelines.benchmarks.psm_photos import _read
+    from pipelines.evaluate.benchmarks.uw_photos import _read
     from render.shared.images import read_image
 
     (_read if path.suffix in (".jpg", ".tga") else read_image)(path)
@@ -386,7 +386,7 @@ def _read_tree(folder: Path, path: Path) -> None:
 
 
 def _read_records(folder: Path, path: Path) -> None:
-    from pipelines.report.sections import read_sections
+    from pipelines.evaluate.report.sections import read_sections
     from render.exchange.folders import read_record
 
     if path.name == "section.json":

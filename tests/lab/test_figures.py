@@ -12,17 +12,17 @@ from PIL import Image
 from sdps_scenes import hemisphere_lights, shade, sphere_normals
 
 from lab.figures import (
-    drawn,
     eval_figures,
     number_of_classes,
     number_of_images,
     per_material,
     pf14,
+    sweep,
 )
 from pipelines.evaluate import evaluation, published
+from pipelines.evaluate.report.sections import read_sections
 from pipelines.evaluate.results import mean
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import read_sections
 from pipelines.shared import charts, presets, scenes
 from render.planning import light_sets
 from render.records.shards import Shard, to_half, write_shard
@@ -100,7 +100,7 @@ def test_deviated_lights_are_half_a_class_away_and_in_front(count):
     azimuth, elevation = azimuth_elevation(directions)
     inner = (np.abs(azimuth) <= 90 - 2 * delta) & (np.abs(elevation) <= 90 - 2 * delta)
     for corner in number_of_classes.CORNERS:
-        moved = number_of_classes.deviated(directions, count, corner)
+        moved = number_of_classes.deviate(directions, count, corner)
         found = azimuth_elevation(moved.astype(np.float64))
         assert (moved[:, 2] > 0).all()
         np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 1.0, atol=1e-6)
@@ -114,7 +114,7 @@ def test_deviated_lights_are_half_a_class_away_and_in_front(count):
 def test_four_deviations_at_36_bins_are_two_and_a_half_degrees_in_each_angle():
     front = np.array([[0.0, 0.0, 1.0]])
     angles = [
-        angle_degrees(number_of_classes.deviated(front, 36, corner), front)[0] for corner in number_of_classes.CORNERS
+        angle_degrees(number_of_classes.deviate(front, 36, corner), front)[0] for corner in number_of_classes.CORNERS
     ]
     np.testing.assert_allclose(angles, 3.535, atol=0.005)  # the largest quantisation error there is
 
@@ -148,7 +148,7 @@ def test_the_groups_of_the_pf14_figure_have_the_published_sizes():
     few = pf14.groups(("red-phenolic", "blue-fabric", "pink-plastic", "chrome"))
     assert [len(names) for names in few.values()] == [1, 1, 1, 1]
     assert pf14.groups(("red-phenolic", "lambertian:0.5"))["lambertian"] == ["lambertian:0.5"]
-    with pytest.raises(drawn.LeftOut, match=r"test\.materials"):
+    with pytest.raises(sweep.LeftOut, match=r"test\.materials"):
         pf14.groups(("chrome",))
 
 
@@ -172,14 +172,14 @@ def test_methods_are_read_and_told_apart(tmp_path):
     found = {m.name: m for m in eval_figures.wanted_methods(["least-squares", "pf14", "pf14"], tmp_path)}
     assert set(found) == {"least-squares, true lights", "pf14"}
     least, maxima = found["least-squares, true lights"], found["pf14"]
-    assert least.lights == "true" and not drawn.finds(least, "direction_mae")
-    assert drawn.finds(maxima, "intensity_error") and drawn.paper_row(maxima) == "PF14"
+    assert least.lights == "true" and not sweep.finds(least, "direction_mae")
+    assert sweep.finds(maxima, "intensity_error") and sweep.paper_row(maxima) == "PF14"
     pair = Method(name="x", lights="shipped:lcnet", normals="shipped:nenet")
-    assert drawn.paper_row(pair) == "B1" and drawn.finds(pair, "direction_mae")
-    assert drawn.paper_row(replace(pair, intensities="true")) == ""
-    assert not drawn.finds(replace(pair, intensities="true"), "intensity_error")
+    assert sweep.paper_row(pair) == "B1" and sweep.finds(pair, "direction_mae")
+    assert sweep.paper_row(replace(pair, intensities="true")) == ""
+    assert not sweep.finds(replace(pair, intensities="true"), "intensity_error")
     blind = Method(name="x", normals="upsfcn")
-    assert drawn.paper_row(blind) == "B9" and not drawn.finds(blind, "direction_mae")
+    assert sweep.paper_row(blind) == "B9" and not sweep.finds(blind, "direction_mae")
     assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "bunny") == 6.9
     assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "sphere") is None
     with pytest.raises(InputError, match="want METHOD, LIGHTS"):
@@ -262,7 +262,7 @@ def test_materials_need_the_bunny(tmp_path):
     preset = presets.load("smoke", ["test.shapes=[sphere]"])
     runner = Runner(Method(name="constant", normals="constant"), finder(None), InferenceConfig())
     bench = Workbench(preset, tmp_path, (runner,))
-    with pytest.raises(drawn.LeftOut, match="bunny"):
+    with pytest.raises(sweep.LeftOut, match="bunny"):
         per_material.make(bench)
-    with pytest.raises(drawn.LeftOut, match="told the lights"):
+    with pytest.raises(sweep.LeftOut, match="given the lights"):
         number_of_classes.make(bench)

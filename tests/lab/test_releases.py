@@ -112,7 +112,7 @@ def test_results_of_other_weights_and_pages_without_marks_are_refused(
     own = finished_run(tmp_path / "run")
     evaluation(tmp_path / "out", own)
     assert main(["shipped-results", "--out", str(tmp_path / "out")]) == 2
-    assert "evaluated beside the shipped weights" in capsys.readouterr().err
+    assert "evaluated with the shipped weights" in capsys.readouterr().err
     save_weights(kept / "lcnet.safetensors", load_weights(own), half=True)
     evaluation(tmp_path / "again", kept / "lcnet.safetensors")
     page = tmp_path / "page.md"

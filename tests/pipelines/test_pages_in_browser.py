@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from sdps_scenes import sphere_normals
 
 from pipelines.data.data_preview import preview
-from pipelines.report.page import render
-from pipelines.report.sections import Section, SectionWriter, Tile
+from pipelines.evaluate.report.page import render
+from pipelines.evaluate.report.sections import Section, SectionWriter, Tile
 from pipelines.shared.pictures import error_map, normal_map
 
 pytestmark = [pytest.mark.slow, needs_browser]

@@ -118,14 +118,23 @@ def test_unknown_command_and_flag(capsys):
 def test_help_lists_every_command(capsys):
     assert main([]) == 0
     text = capsys.readouterr().out
-    for command in ("doctor", "render-data", "models", "train", "eval-merltest", "regenerate", "materials", "shapes"):
+    for command in ("doctor", "render-data", "models", "train", "evaluate", "regenerate", "materials", "shapes"):
         assert command in text
 
 
 def test_train_and_evaluate_without_data_or_weights_say_what_to_run(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(pretrained, "shipped", list)  # as if none travelled with the package
     assert "sdps render-data" in fails(capsys, "train", "--preset", "smoke", "--out", str(tmp_path / "none"))
-    asked = ("eval-merltest", "--preset", "smoke", "--out", str(tmp_path / "none"), "--set", "test.shipped=[all]")
+    asked = (
+        "evaluate",
+        "merltest",
+        "--preset",
+        "smoke",
+        "--out",
+        str(tmp_path / "none"),
+        "--set",
+        "test.shipped=[all]",
+    )
     assert "sdps train" in fails(capsys, *asked)
     assert not (tmp_path / "none" / "merltest").exists()
 
@@ -335,19 +344,21 @@ def evaluate_combinations(capsys, flags, out):
     assert "psfcn: 2 steps" in (text := capsys.readouterr().out) and "cnnps: 1 steps" in text
     flags = [*flags, "--set", "test.rotations=1"]
     combinations = {
-        "lcnet + psfcn": ["--lights", "lcnet", "--normals", "psfcn"],
-        "lcnet + cnnps": ["--lights", "lcnet", "--normals", "cnnps"],
+        "lcnet + psfcn": ["--lighting", "lcnet", "--normals", "psfcn"],
+        "lcnet + cnnps": ["--lighting", "lcnet", "--normals", "cnnps"],
         "cnnps, true lights": ["--normals", "cnnps"],
         "lcnet + nenet, true intensities": ["--normals", "sdps", "--intensities", "true"],
-        "lcnet + least-squares": ["--lights", "lcnet", "--normals", "least-squares"],
+        "lcnet + least-squares": ["--lighting", "lcnet", "--normals", "least-squares"],
     }
     for name, words in combinations.items():
-        assert main(["eval-merltest", *flags, *words]) == 0
+        assert main(["evaluate", "merltest", *flags, *words]) == 0
         assert name in capsys.readouterr().out
     scores = json.loads((out / "eval" / "results.json").read_text())["scenes"][0]["scores"]
     assert "direction_mae" not in scores["least-squares, true lights"]  # what was given is not scored
-    assert "did you mean 'psfcn'" in fails(capsys, "eval-merltest", *flags, "--lights", "lcnet", "--normals", "psfnc")
-    line = fails(capsys, "eval-merltest", *flags, "--normals", "sdps-reg")
+    assert "did you mean 'psfcn'" in fails(
+        capsys, "evaluate", "merltest", *flags, "--lighting", "lcnet", "--normals", "psfnc"
+    )
+    line = fails(capsys, "evaluate", "merltest", *flags, "--normals", "sdps-reg")
     assert "no such weights; train them with `sdps train --models" in line
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from data_folders import scene_of, sphere_shard, write_folder
 
-from pipelines.report.sections import Section, SectionWriter, Table
+from pipelines.evaluate.report.sections import Section, SectionWriter, Table
 from render.records.manifest import FAILED
 
 

@@ -128,6 +128,6 @@ def whole(images) -> np.ndarray:  # (L, H, W, 3)
 
 def run(command: str, *arguments: object) -> int:
     """Run a command as the command line does, but let its complaints out."""
-    words = [command, *map(str, arguments)]
-    args = cli.build_parser([command]).parse_args(words)
+    words = [*command.split(), *map(str, arguments)]
+    args = cli.build_parser(command.split()).parse_args(words)
     return args.run(args)

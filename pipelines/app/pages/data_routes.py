@@ -16,8 +16,8 @@ from starlette.routing import Route
 
 from pipelines.app.common.jobs import replace_nonfinite
 from pipelines.app.pages.handling import find_file, find_tab_folder, make_tab_folder, queue_task
-from pipelines.report.sections import FOLDER as REPORT
-from pipelines.report.sections import read_sections
+from pipelines.evaluate.report.sections import FOLDER as REPORT
+from pipelines.evaluate.report.sections import read_sections
 from pipelines.shared import pictures
 from render.records.ledger import survey
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest

@@ -9,7 +9,7 @@ import pytest
 from sdps_scenes import hemisphere_lights
 
 import sdps
-from pipelines.evaluate import eval_merltest, evaluation
+from pipelines.evaluate import evaluation, merltest
 from pipelines.evaluate.evaluation import Evaluation, TestObject
 from pipelines.shared import presets
 from render.shared.config import to_plain
@@ -216,8 +216,8 @@ def test_rendered_scenes_are_seen_whole_and_photographs_cut(
     assert seen == [None, 4, None, 15, 4, None]
     with pytest.raises(InputError, match="margin must be at least 0 pixels, auto, or null"):
         replace(preset.test, margin=-1)
-    assert "whole frame" in eval_merltest.definition(preset.test)
-    assert "box with 15 pixels" in eval_merltest.definition(replace(preset.test, margin=15))
+    assert "whole frame" in merltest.definition(preset.test)
+    assert "box with 15 pixels" in merltest.definition(replace(preset.test, margin=15))
 
 
 def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -232,7 +232,7 @@ def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCap
 
 def lighting_rows(out: Path, preset: presets.Preset) -> list[Method]:
     ways = rows.normal_methods(out, preset.test.shipped)
-    return rows.lighting_methods(out, eval_merltest._own_lighting(preset), preset.test, ways, preset.test.shipped)
+    return rows.lighting_methods(out, merltest._own_lighting(preset), preset.test, ways, preset.test.shipped)
 
 
 def test_a_preset_says_which_shipped_ways_stand_beside_what_is_trained(kept: Path, tmp_path: Path) -> None:
@@ -259,17 +259,17 @@ def test_a_preset_says_which_shipped_ways_stand_beside_what_is_trained(kept: Pat
 
 def test_the_page_shows_the_pair_trained_here_and_the_best_shipped_way(runs: Path, kept: Path, tmp_path: Path) -> None:
     least_squares = "least-squares, true lights"
-    assert eval_merltest.shown(rows.normal_methods(runs)) == ["lcnet + nenet", least_squares]
+    assert merltest.shown(rows.normal_methods(runs)) == ["lcnet + nenet", least_squares]
     for name in ("psfcn", "nenet"):
         write_weights(kept.with_name(f"{name}.safetensors"), name)
     # Rows further down the table build on better networks; least squares on LCNet's lights comes last.
-    assert eval_merltest.shown(rows.normal_methods(tmp_path)) == ["lcnet + psfcn (shipped)", least_squares]
-    both = eval_merltest.shown(rows.normal_methods(runs))
+    assert merltest.shown(rows.normal_methods(tmp_path)) == ["lcnet + psfcn (shipped)", least_squares]
+    both = merltest.shown(rows.normal_methods(runs))
     assert both == ["lcnet + nenet", "lcnet + psfcn (shipped)", least_squares]
     write_weights(kept.with_name("lcnet-soft.safetensors"), "lcnet-soft")
-    assert eval_merltest.shown(rows.normal_methods(runs))[1] == "lcnet-soft + psfcn (shipped)"
+    assert merltest.shown(rows.normal_methods(runs))[1] == "lcnet-soft + psfcn (shipped)"
     given = [Method(name="psfcn, true lights", lights="true", normals="psfcn")]
-    assert eval_merltest.shown(given) == ["psfcn, true lights", least_squares]
+    assert merltest.shown(given) == ["psfcn, true lights", least_squares]
 
 
 def test_python_uses_networks_as_every_command_does(runs: Path) -> None:

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.benchmarks import suite
-from pipelines.benchmarks.eval_diligent import OBJECTS, DiligentConfig, diligent_objects
-from pipelines.benchmarks.object_tables import object_table, published_rows
+from pipelines.evaluate.benchmarks import suite
+from pipelines.evaluate.benchmarks.diligent import OBJECTS, DiligentConfig, diligent_objects
 from pipelines.evaluate.evaluation import Result
-from pipelines.report.sections import read_sections
+from pipelines.evaluate.published import published_rows
+from pipelines.evaluate.report.sections import read_sections
+from pipelines.evaluate.results import object_table
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.images import read_image, write_png
@@ -68,7 +69,7 @@ def test_known_cells_of_the_paper():
 
 
 def test_exact_answers_tables_and_resuming(tree, models, tmp_path, capsys, monkeypatch):
-    command = ("eval-diligent", tree, "--out", tmp_path, "--models", models, "--bits", "16",
+    command = ("evaluate diligent", tree, "--out", tmp_path, "--models", models, "--bits", "16",
                "--methods", "least-squares,lcnet,lcnet+least-squares,constant")  # fmt: skip
     assert folders.run(*command) == 0
     text = capsys.readouterr().out
@@ -167,7 +168,7 @@ def test_a_refusal_is_told():
 def test_bad_flags_are_one_line(tree, models, tmp_path, arguments, message):
     given = [] if "--models" in arguments else ["--models", models]
     with pytest.raises(InputError, match=message) as error:
-        folders.run("eval-diligent", tree, "--out", tmp_path / "out", *given, *arguments)
+        folders.run("evaluate diligent", tree, "--out", tmp_path / "out", *given, *arguments)
     assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
 
 
@@ -202,7 +203,7 @@ def test_bad_folders_are_one_line(tree, tmp_path, harm, message):
     shutil.copytree(tree / "pmsData" / "ballPNG", copy)
     harm(copy)
     with pytest.raises(InputError, match=message) as error:
-        folders.run("eval-diligent", copy, "--bits", "16", "--methods", "least-squares", "--out", tmp_path / "out")
+        folders.run("evaluate diligent", copy, "--bits", "16", "--methods", "least-squares", "--out", tmp_path / "out")
     assert "\n" not in str(error.value) and not (tmp_path / "out" / "diligent" / "results.json").exists()
 
 
@@ -243,7 +244,7 @@ def test_the_real_ball(tmp_path):
     errors = {}
     for bits in (8, 16):
         out = tmp_path / str(bits)
-        folders.run("eval-diligent", tmp_path, "--methods", "least-squares", "--bits", bits, "--out", out)
+        folders.run("evaluate diligent", tmp_path, "--methods", "least-squares", "--bits", bits, "--out", out)
         errors[bits] = scores(out)["methods"]["least-squares, true lights"]["ball"]["scores"]["normal_mae"]
     assert errors[16] == pytest.approx(4.17, abs=0.02)
     assert errors[8] == pytest.approx(4.49, abs=0.05)  # the low byte is cut off, not rounded

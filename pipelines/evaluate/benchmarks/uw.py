@@ -1,7 +1,7 @@
-"""`sdps eval-photos`: uncalibrated methods on real photographs, against least squares under the measured lights.
+"""`sdps evaluate uw`: uncalibrated methods on real photographs, against least squares under the measured lights.
 
 There is no ground truth: the error is the mean angle between the normals of a method that finds the lights itself and
-those of one that is told them. The published figures of PF14 stand beside ours.
+those of one that is given them. The published figures of PF14 are in brackets.
 """
 
 import argparse
@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.benchmarks import suite
-from pipelines.benchmarks.psm_photos import list_objects, read_lights, read_photos, resolve_source
-from pipelines.evaluate.evaluation import Result, TestObject
-from pipelines.evaluate.object_pictures import ERROR_LIMIT, Found, tiles
+from pipelines.evaluate.benchmarks import suite
+from pipelines.evaluate.benchmarks.uw_photos import list_objects, read_lights, read_photos, resolve_source
+from pipelines.evaluate.evaluation import Found, Result, TestObject
+from pipelines.evaluate.object_pictures import ERROR_LIMIT, tiles
+from pipelines.evaluate.report.sections import Section, SectionWriter, Table
 from pipelines.evaluate.results import publish
-from pipelines.report.sections import Section, SectionWriter, Table
 from pipelines.shared.flags import add_models, add_out, picked, split_list
 from pipelines.shared.pictures import contact_sheet, fitted
 from render.shared.errors import InputError
@@ -40,7 +40,7 @@ _METRICS = ("normal_mae", "normal_median", "direction_mae")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of `sdps eval-photos`."""
+    """Declare the flags of `sdps evaluate uw`."""
     parser.add_argument("folder", type=Path, help="unpacked photographs: <object>/<object>.<k>.tga and masks")
     parser.add_argument("--objects", action="append", help="commas or repeat (default: all)")
     parser.add_argument("--methods", action="append", metavar="METHOD,LIGHTS+NORMALS,...",
@@ -67,7 +67,7 @@ def main(args: argparse.Namespace) -> int:
     found, _ = suite.run(items, methods, args.models, out / "cache", InferenceConfig(), shown)
     section = Section(name="photos", title="Photographs of the University of Washington", text=DEFINITION, order=60,
                       tables=(table(items, found, args.reference),),
-                      command=f"sdps eval-photos {args.folder} --out {out}")  # fmt: skip
+                      command=f"sdps evaluate uw {args.folder} --out {out}")  # fmt: skip
     writer = SectionWriter(section)
     for item in items:
         pictures = tiles(item, found, shown, "reference, lights known")

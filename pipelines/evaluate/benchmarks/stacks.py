@@ -62,7 +62,7 @@ class Stack:
         mask = self.box.cut(self.full_mask)
         return np.stack([self._shrunk(self._cut(k) * mask[..., None]) for k in range(*part.indices(len(self)))])
 
-    def opened(self) -> "np.ndarray | Stack":
+    def open(self) -> "np.ndarray | Stack":
         """Read every image, so that no method is blamed for a damaged file; of a large stack none is kept.
 
         Returns:
@@ -112,7 +112,7 @@ def files_digest(files: Sequence[Path], *settings: Any) -> str:
     return digest.hexdigest()[:24]
 
 
-def photographed(
+def build_object(
     name: str,
     images: Images,
     mask: np.ndarray,

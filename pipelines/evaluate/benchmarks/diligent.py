@@ -1,4 +1,4 @@
-"""`sdps eval-diligent`: any objects of DiLiGenT, every method, the tables of the paper with all published rows.
+"""`sdps evaluate diligent`: any objects of DiLiGenT, every method, the tables of the paper with all published rows.
 
 Table (a) is light directions, (b) light intensities, (c) normals (SDPS-Net, table "Results of SDPS-Net on the DiLiGenT
 benchmark"). Every number carries its protocol: bits, crop, mask, images of bear.
@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.benchmarks import suite
-from pipelines.benchmarks.stacks import MARGIN, Images, photographed
+from pipelines.evaluate.benchmarks import suite
+from pipelines.evaluate.benchmarks.stacks import MARGIN, Images, build_object
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.shared.flags import from_flags
 from render.exchange.foreign_samples import Source
@@ -74,7 +74,7 @@ class DiligentConfig:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of `sdps eval-diligent`."""
+    """Declare the flags of `sdps evaluate diligent`."""
     suite.add_arguments(parser)
     parser.add_argument("--bits", type=int, default=8, choices=(8, 16),
                         help="16: the PNGs exactly; 8: their high byte, as published (default: 8)")  # fmt: skip
@@ -89,7 +89,7 @@ def main(args: argparse.Namespace) -> int:
     chosen = chosen or select.every_method(select.runs_folder(args.models), inference_config(args))
     return suite.evaluate(
         DILIGENT, args, items, chosen, text=definition(items, config), protocol=to_plain(config),
-        command=f"sdps eval-diligent {args.data} --bits {args.bits} --bear {args.bear}",
+        command=f"sdps evaluate diligent {args.data} --bits {args.bits} --bear {args.bear}",
     )  # fmt: skip
 
 
@@ -131,7 +131,7 @@ def _object(source: Source, config: DiligentConfig) -> TestObject:
     if drop >= len(source.images):
         raise InputError(f"{source.folder}: {len(source.images)} images, --bear 76 drops the first {drop}")
     files = [source.folder / name for name in source.images[drop:]]
-    return photographed(
+    return build_object(
         source.name, Images.of_files(files, lambda path: _read(path, config.bits)), truth.mask,
         source.directions[drop:], source.intensities[drop:], normals=truth.normals, margin=config.margin,
         files=[source.folder / "mask.png", truth.origin], settings=(config.bits,),

@@ -1,7 +1,7 @@
 """Sections of a report: what one evaluation shows, as data on disk, so that a page can be made of all of them.
 
-An evaluation writes its section into `<out>/report/<name>/`: `section.json` and its pictures. `sdps report` collects
-the sections under a folder into one self-contained page.
+An evaluation writes its section into `<out>/report/<name>/`: `section.json` and its pictures. `sdps evaluate
+report` collects the sections under a folder into one self-contained page.
 """
 
 from collections.abc import Sequence
@@ -72,7 +72,7 @@ class Picture:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise InputError(f"kind: {self.kind!r} is none of {', '.join(filter(None, KINDS))}")
+            raise InputError(f"kind: {self.kind!r} is not one of {', '.join(filter(None, KINDS))}")
         if not is_plain_name(self.file):
             raise InputError(f"file: {self.file!r} is not the name of a picture in the section's folder")
 

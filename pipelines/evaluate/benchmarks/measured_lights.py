@@ -1,4 +1,4 @@
-"""`sdps eval-lights`: lighting estimation on real photographs whose lights were measured and whose normals were not.
+"""`sdps evaluate gourd-apple` and `light-stage`: lighting estimation on photographs whose lights were measured.
 
 Gourd&Apple (Alldrin et al. 2008) and the Light Stage Data Gallery (Einarsson et al. 2006), as in SDPS-Net's table
 "Lighting estimation results on the Gourd&Apple dataset and the Light Stage Data Gallery".
@@ -7,8 +7,13 @@ Gourd&Apple (Alldrin et al. 2008) and the Light Stage Data Gallery (Einarsson et
 import argparse
 from collections.abc import Sequence
 
-from pipelines.benchmarks import suite
-from pipelines.benchmarks.lit_photographs import GOURD_APPLE, LIGHT_STAGE, gourd_apple_objects, light_stage_objects
+from pipelines.evaluate.benchmarks import suite
+from pipelines.evaluate.benchmarks.lit_photographs import (
+    GOURD_APPLE,
+    LIGHT_STAGE,
+    gourd_apple_objects,
+    light_stage_objects,
+)
 from pipelines.evaluate.evaluation import TestObject
 from render.shared.errors import InputError
 from sdps.methods import select
@@ -33,15 +38,41 @@ BENCHMARKS = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of `sdps eval-lights`."""
-    suite.add_arguments(parser)
+    """Declare the flags of `sdps eval-lights`, the earlier name of both commands."""
     parser.add_argument("--dataset", required=True, choices=tuple(BENCHMARKS), help="which layout the folder has")
+    _add_common_arguments(parser)
+    _add_gourd_apple_flags(parser)
+    _add_light_stage_flags(parser)
+
+
+def add_gourd_apple_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps evaluate gourd-apple`."""
+    _add_common_arguments(parser)
+    _add_gourd_apple_flags(parser)
+    parser.set_defaults(dataset="gourd-apple", least_z=0.0, gamma=1.0)
+
+
+def add_light_stage_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps evaluate light-stage`."""
+    _add_common_arguments(parser)
+    _add_light_stage_flags(parser)
+    parser.set_defaults(dataset="light-stage", measured_lights=False)
+
+
+def _add_gourd_apple_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--measured-lights", action="store_true",
                         help="gourd-apple: compare with the measured lights, not the refined ones")  # fmt: skip
+
+
+def _add_light_stage_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--least-z", type=float, default=0.0, metavar="Z",
                         help="light-stage: use images whose light direction has z above it (default: 0)")  # fmt: skip
     parser.add_argument("--gamma", type=float, default=1.0,
                         help="light-stage: exponent that makes PNG values linear (default: 1, linear)")  # fmt: skip
+
+
+def _add_common_arguments(parser: argparse.ArgumentParser) -> None:
+    suite.add_arguments(parser)
     parser.add_argument("--longest-side", type=int, default=0, metavar="PIXELS",
                         help="average larger crops down to this, to save memory (default: 0, never)")  # fmt: skip
 
@@ -62,7 +93,7 @@ def main(args: argparse.Namespace) -> int:
     return suite.evaluate(
         bench, args, items, chosen, text=definition(bench, items, about, args.longest_side),
         protocol={name: getattr(args, name) for name in ("measured_lights", "least_z", "gamma", "longest_side")},
-        command=f"sdps eval-lights {args.data} --dataset {args.dataset}",
+        command=f"sdps evaluate {args.dataset} {args.data}",
     )  # fmt: skip
 
 

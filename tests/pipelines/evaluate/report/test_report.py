@@ -12,8 +12,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from pipelines.cli import main
-from pipelines.report.page import render
-from pipelines.report.sections import Picture, Section, SectionWriter, Strip, Table, read_sections
+from pipelines.evaluate.report.page import render
+from pipelines.evaluate.report.sections import Picture, Section, SectionWriter, Strip, Table, read_sections
 from render.shared.errors import InputError
 
 CHROMIUM = next(
@@ -58,7 +58,7 @@ def test_sections_come_back_in_order(out: Path) -> None:
 
 
 def test_the_page_is_one_file_and_escapes_what_it_shows(out: Path, capsys: pytest.CaptureFixture) -> None:
-    assert main(["report", str(out)]) == 0
+    assert main(["evaluate", "report", str(out)]) == 0
     page = (out / "report.html").read_text()
     assert capsys.readouterr().out.strip() == str(out / "report.html")
     assert page.index("First") < page.index("Second &lt;b&gt;") and "<b>" not in page
@@ -93,10 +93,10 @@ def test_learning_curves_are_shown(tmp_path: Path) -> None:
 
 
 def test_what_is_missing_is_one_line(out: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert main(["report", str(tmp_path / "nothing")]) == 2
+    assert main(["evaluate", "report", str(tmp_path / "nothing")]) == 2
     assert "nothing evaluated there yet" in capsys.readouterr().err
     (out / "report" / "late" / "003.png").unlink()
-    assert main(["report", str(out)]) == 2
+    assert main(["evaluate", "report", str(out)]) == 2
     assert "003.png" in capsys.readouterr().err
     (out / "report" / "late" / "section.json").write_text('{"name": "late"')
     with pytest.raises(InputError, match=r"section.json.*run the evaluation"):

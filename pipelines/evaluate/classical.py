@@ -1,4 +1,4 @@
-"""`sdps eval-classical`: every classical method on regenerated scenes, by kind of reflectance and of lights.
+"""`sdps evaluate classical`: every classical method on regenerated scenes, by kind of reflectance and of lights.
 
 The scenes are those of the preset's `test` section under each light set, with random light intensities. The paper's
 figure on PF14 (supplement: good on diffuse, bad on specular reflectance) is a row of these tables.
@@ -8,9 +8,9 @@ import argparse
 from dataclasses import replace
 from typing import Any
 
+from pipelines.evaluate.report.sections import Section, SectionWriter, Table
 from pipelines.evaluate.results import mean, publish
 from pipelines.evaluate.workbench import Workbench
-from pipelines.report.sections import Section, SectionWriter, Table
 from pipelines.shared import presets, scenes
 from pipelines.shared.flags import picked, split_list
 from render.materials import surfaces
@@ -33,7 +33,7 @@ DEFINITION = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of `sdps eval-classical`."""
+    """Declare the flags of `sdps evaluate classical`."""
     presets.add_common_arguments(parser, default="classical")
     parser.add_argument("--methods", action="append", help=f"{', '.join(registry.METHODS)} (default: all)")
     parser.add_argument("--light-sets", action="append", help=f"default: {','.join(LIGHT_SETS)}")
@@ -48,7 +48,8 @@ def main(args: argparse.Namespace) -> int:
     for lights in split_list(args.light_sets) or LIGHT_SETS:
         rows += evaluate(bench, lights)
     section = Section(name="classical", title="Classical methods on regenerated scenes", text=DEFINITION, order=50,
-                      tables=tuple(build_tables(rows, names)), command=f"sdps eval-classical --out {out}")  # fmt: skip
+                      tables=tuple(build_tables(rows, names)),
+                      command=f"sdps evaluate classical --out {out}")  # fmt: skip
     publish(SectionWriter(section), out, out / "results.json", {"rows": rows})
     return 0
 
@@ -56,8 +57,8 @@ def main(args: argparse.Namespace) -> int:
 def evaluate(bench: Workbench, lights: str) -> list[dict[str, Any]]:
     """Run the methods on the scenes under a light set; results by names that are kept in results.json."""
     test = replace(bench.config, lights=lights)
-    wanted, folder = bench.rendered(test, bench.out / scenes.slug(lights))
-    results = bench.evaluated(bench.objects(wanted, folder, test), bench.runners, len(wanted), lights)
+    wanted, folder = bench.render(test, bench.out / scenes.slug(lights))
+    results = bench.evaluation.run(bench.objects(wanted, folder, test), bench.runners, len(wanted), lights)
     return [
         {"method": runner.method.normals, "lights": lights, "shape": scene.shape, "category": category(scene),
          "scores": result.scores, "seconds": result.seconds, "reason": result.reason}

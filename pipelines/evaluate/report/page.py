@@ -1,4 +1,4 @@
-"""`sdps report`: one self-contained page of everything that was evaluated: tables, figures, pictures, training."""
+"""`sdps evaluate report`: one page of everything that was evaluated: tables, figures, pictures, training."""
 
 import argparse
 import base64
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from pipelines.report.sections import Section, Table, read_sections
+from pipelines.evaluate.report.sections import Section, Table, read_sections
 from pipelines.shared import pictures
 from pipelines.shared.presets import Preset
 from render.records.manifest import read_manifest
@@ -25,7 +25,7 @@ _SCRIPT = Path(__file__).with_name("page.js")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of `sdps report`."""
+    """Declare the flags of `sdps evaluate report`."""
     parser.add_argument("folders", nargs="+", type=Path, help="output folders of evaluations and trainings")
     parser.add_argument("--out", type=Path, default=None, help="the page (default: <first folder>/report.html)")
 
@@ -34,7 +34,7 @@ def main(args: argparse.Namespace) -> int:
     """Collect the sections of the folders into a page."""
     path = args.out or args.folders[0] / "report.html"
     if not any(read_sections(folder) for folder in args.folders):
-        raise InputError(f"{args.folders[0]}: nothing evaluated there yet; run `sdps eval-merltest` or its kin first")
+        raise InputError(f"{args.folders[0]}: nothing evaluated there yet; run one of `sdps evaluate` first")
     render(path, args.folders, "Photometric stereo: evaluation", "")
     sys.stdout.write(f"{path}\n")
     return 0

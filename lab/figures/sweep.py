@@ -1,14 +1,20 @@
-"""What the figures share: their form, and which methods they can show."""
+"""What the figures share: the sweep of methods over scenes, the form of a figure, and which methods it can show."""
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from pipelines.report.sections import Table
+from pipelines.evaluate.evaluation import Result, TestObject
+from pipelines.evaluate.report.sections import Table
+from pipelines.evaluate.workbench import Workbench
+from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from sdps.methods import rows
 from sdps.methods.method import Method
+from sdps.methods.runner import Runner
 from sdps.models.registry import TRUE_LIGHTS
 
 METRICS = {  # of the figures: title and unit
@@ -23,7 +29,7 @@ class LeftOut(InputError):
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class Panel:
     """A figure as it is shown and kept.
 
     Attributes:
@@ -39,6 +45,43 @@ class Drawn:
     charts: tuple[tuple[str, str, Figure], ...]
     tables: tuple[Table, ...]
     values: dict[str, Any] = field(default_factory=dict)
+
+
+Variants = Callable[[SceneSpec, TestObject], Iterable[tuple[tuple[Any, ...], TestObject]]]
+"""Of a scene: the objects to score in its place, each with what is varied."""
+Sweep = dict[tuple[Any, ...], list[Result]]
+"""By (method, *what is varied): a result per scene."""
+
+
+def sweep(
+    bench: Workbench,
+    runners: Sequence[Runner],
+    scenes: tuple[Sequence[SceneSpec], Path],
+    variants: Variants,
+    each: int,
+    about: str,
+) -> Sweep:
+    """Score methods on variants of scenes.
+
+    Args:
+        bench: Keeps the results, so that a stopped sweep goes on where it was.
+        runners: The methods.
+        scenes: Scenes and the folder they are rendered into.
+        variants: Makes the objects of a scene.
+        each: Number of variants of a scene.
+        about: What the progress bar says.
+    """
+    wanted, folder = scenes
+    objects = (pair for scene, item in bench.objects(wanted, folder, bench.config) for pair in variants(scene, item))
+    found: Sweep = {}
+    for key, runner, result in bench.evaluation.run(objects, runners, len(wanted) * each, about):
+        found.setdefault((runner.method.name, *key), []).append(result)
+    return found
+
+
+def shapes_of(scenes: Iterable[SceneSpec]) -> tuple[str, ...]:
+    """Return the shapes of scenes, each once."""
+    return tuple(dict.fromkeys(scene.shape for scene in scenes))
 
 
 def paper_row(method: Method) -> str:

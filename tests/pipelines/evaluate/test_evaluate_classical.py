@@ -1,4 +1,4 @@
-"""`sdps eval-classical`, `python -m lab bench-classical`, and the scores kept on disk."""
+"""`sdps evaluate classical`, `python -m lab bench-classical`, and the scores kept on disk."""
 
 import json
 
@@ -14,7 +14,7 @@ SMALL = ["--set", "test.shapes=[sphere]", "--set", "test.materials=['lambertian:
 
 
 def test_tables_hold_scores_and_reasons_and_are_kept(tmp_path, capsys):
-    command = ["eval-classical", *SMALL, "--out", str(tmp_path), "--light-sets", "near-uniform:24,biased:24"]
+    command = ["evaluate", "classical", *SMALL, "--out", str(tmp_path), "--light-sets", "near-uniform:24,biased:24"]
     assert cli.main([*command, "--methods", "least-squares,factorisation,sm10"]) == 0
     text = capsys.readouterr().out
     assert "Normals, mean angular error in degrees: sphere, near-uniform:24" in text
@@ -30,7 +30,7 @@ def test_tables_hold_scores_and_reasons_and_are_kept(tmp_path, capsys):
 
 
 def test_unknown_method_is_one_line(capsys):
-    assert cli.main(["eval-classical", "--methods", "pf-14"]) == 2
+    assert cli.main(["evaluate", "classical", "--methods", "pf-14"]) == 2
     assert "did you mean 'pf14'" in capsys.readouterr().err
 
 

@@ -7,18 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipelines.benchmarks.object_tables import object_table, published_rows
-from pipelines.evaluate.elsewhere import evaluate_elsewhere
-from pipelines.evaluate.evaluation import Evaluation, TestObject
-from pipelines.evaluate.object_pictures import Found, tiles
-from pipelines.evaluate.results import publish, weights_of
-from pipelines.report.sections import Section, SectionWriter, Table
+from pipelines.evaluate.evaluation import Evaluation, Found, TestObject
+from pipelines.evaluate.object_pictures import tiles
+from pipelines.evaluate.published import published_rows
+from pipelines.evaluate.report.sections import Section, SectionWriter, Table
+from pipelines.evaluate.results import object_table, publish, weights_of
 from pipelines.shared import using
-from pipelines.shared.cluster import cluster_config
-from pipelines.shared.cluster.cluster_config import ClusterChoice
 from pipelines.shared.flags import add_out, picked, split_list
 from render.shared.config import to_plain
-from render.shared.progress import progress_bar
 from sdps.inference.inference_config import InferenceConfig, inference_config
 from sdps.methods import select
 from sdps.methods.method import Method
@@ -26,10 +22,10 @@ from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
 
 
-def _opened(item: TestObject) -> Any:
+def _open(item: TestObject) -> Any:
     """Return an object's images, read whole, so that no method is blamed for a damaged file."""
     images: Any = item.load()
-    return images.opened()
+    return images.open()
 
 
 def run(
@@ -39,7 +35,6 @@ def run(
     folder: Path,
     config: InferenceConfig,
     shown: Sequence[str],
-    cluster: ClusterChoice | None = None,
 ) -> tuple[Found, list[Runner]]:
     """Run methods on objects, or take their results from the cache in `folder`.
 
@@ -50,17 +45,13 @@ def run(
         folder: Where results are kept.
         config: How networks are used.
         shown: Methods whose normal maps are kept for pictures.
-        cluster: Whose workers run the methods; this process when omitted.
     """
     runners = [Runner(method, finder(models), config) for method in chosen]
     evaluation = Evaluation(folder)
     found: Found = {runner.method.name: {} for runner in runners}
-    opened = [replace(item, load=partial(_opened, item)) for item in items]
-    if cluster is not None:
-        evaluate_elsewhere(cluster, evaluation, ((item, shown) for item in opened), len(opened), runners, config)
-    for item in progress_bar(opened, desc="evaluate", unit="object", disable=cluster is not None):
-        for runner, result in zip(runners, evaluation.results(item, runners, shown), strict=True):
-            found[runner.method.name][item.name] = result
+    objects = ((item.name, replace(item, load=partial(_open, item))) for item in items)
+    for name, runner, result in evaluation.run(objects, runners, len(items), "evaluate", shown):
+        found[runner.method.name][name] = result
     return found, runners
 
 
@@ -111,9 +102,8 @@ def evaluate(
         protocol: The same for results.json.
         command: The command that does it again, without `--out`.
     """
-    config, shown, file = inference_config(args), pictured(chosen), args.out / bench.name / "results.json"
-    cluster = cluster_config.from_arguments(args)
-    found, runners = run(items, chosen, select.runs_folder(args.models), file.parent / "cache", config, shown, cluster)
+    config, shown, file = inference_config(args), pick_pictured(chosen), args.out / bench.name / "results.json"
+    found, runners = run(items, chosen, select.runs_folder(args.models), file.parent / "cache", config, shown)
     section = Section(
         name=bench.name, title=bench.title, text=text + using.describe(runners, config), order=bench.order,
         tables=build_tables(bench, items, found, chosen), command=f"{command} --out {args.out}",
@@ -186,7 +176,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="--out of `sdps train`, whose models are evaluated (default: shipped ones)")  # fmt: skip
     parser.add_argument("--objects", action="append", help="commas or repeat (default: all in the folder)")
     using.add_arguments(parser)
-    cluster_config.add_arguments(parser)
     add_out(parser, Path("out/real"))
 
 
@@ -200,7 +189,7 @@ def pick(items: Sequence[TestObject], names: list[str] | None) -> list[TestObjec
     return [known[name] for name in picked("object", names, known)]
 
 
-def pictured(chosen: Sequence[Method]) -> list[str]:
+def pick_pictured(chosen: Sequence[Method]) -> list[str]:
     """Return the names of the methods to show, and of the first lighting model."""
     names = select.shown(list(chosen))
     lights = [method.name for method in chosen if method.lights and not method.normals][:1]

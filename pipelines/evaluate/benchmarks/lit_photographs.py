@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.benchmarks.stacks import Images, photographed
+from pipelines.evaluate.benchmarks.stacks import Images, build_object
 from pipelines.evaluate.evaluation import TestObject
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
@@ -55,7 +55,7 @@ def gourd_apple_objects(root: Path, *, refined: bool = True, longest: int = 0) -
         directions, _ = read_directions(folder / lights, 1.0)
         intensities = read_intensities(folder / f"light_intensities{suffix}.txt", len(directions))
         images, mask = find_images(folder, (".exr",), len(directions)), folder / "mask.png"
-        objects.append(photographed(folder.name, images, read_mask(mask), directions, intensities,
+        objects.append(build_object(folder.name, images, read_mask(mask), directions, intensities,
                                     longest=longest, files=[mask]))  # fmt: skip
     return objects
 
@@ -89,7 +89,7 @@ def light_stage_objects(root: Path, *, least_z: float = 0.0, gamma: float = 1.0,
             chosen = front(directions, least_z)
             images = _some(images, chosen)
         matte = next((path for path in sorted(folder.glob("*matte.png"))), folder / "matte.png")
-        objects.append(photographed(folder.name, images, read_mask(matte), directions[chosen], intensities[chosen],
+        objects.append(build_object(folder.name, images, read_mask(matte), directions[chosen], intensities[chosen],
                                     longest=longest, files=[matte], settings=(gamma,)))  # fmt: skip
     return objects
 
@@ -115,7 +115,7 @@ def front(directions: np.ndarray, least_z: float) -> np.ndarray:
 
 
 def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
-    """Read a mask or matte, whatever its values: what most of the image's border shows is the background.
+    """Read a mask or matte of any values: what most of the image's border shows is the background.
 
     Gourd&Apple's object is 1; the Light Stage's is dark in the original files and bright in converted ones.
 

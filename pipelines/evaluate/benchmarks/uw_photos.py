@@ -1,6 +1,6 @@
 """Photographs of the University of Washington's photometric-stereo set (Goldman & Seitz): TGA files in folders.
 
-The layout: `<object>/<object>.<k>.tga` with k from 0, `<object>/<object>.mask.tga`, and beside the objects a `chrome`
+The layout: `<object>/<object>.<k>.tga` with k from 0, `<object>/<object>.mask.tga`, and next to the objects a `chrome`
 sphere under the same lights and `lights.txt`, a number of lights followed by one direction a line (x right, y up, z to
 the camera). The values are linear in radiance and the lights equally strong: on the set's own grey sphere Lambert's law
 holds to 4 to 8 % of the mean as they are and to 18 to 23 % once a display curve (2.2) is taken off, and the twelve
@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from pipelines.benchmarks.stacks import Images, Stack, photographed
+from pipelines.evaluate.benchmarks.stacks import Images, Stack, build_object
 from pipelines.evaluate.evaluation import TestObject
 from render.exchange.ingest import crop_box
 from render.shared.decoding import check_picture, decoding
@@ -24,7 +24,7 @@ from render.shared.errors import InputError
 from render.shared.files import read_bytes, read_text
 
 SPHERES = ("chrome", "gray")
-"""Folders that calibrate the lights and are no objects."""
+"""Folders that calibrate the lights and are not objects."""
 
 _MARGIN = 4
 """Pixels kept around the object."""
@@ -60,7 +60,7 @@ def read_photos(folder: Path, name: str, lights: np.ndarray) -> TestObject:
     if len(lights) != len(images.files):
         raise InputError(f"{name}: {len(images.files)} images but {len(lights)} lights")
     file = folder / name / f"{name}.mask.tga"
-    return photographed(name, images, mask, lights, margin=_MARGIN, files=[file])
+    return build_object(name, images, mask, lights, margin=_MARGIN, files=[file])
 
 
 def read_lights(folder: Path, source: str = "auto") -> np.ndarray:  # (L, 3)
@@ -81,7 +81,7 @@ def read_lights(folder: Path, source: str = "auto") -> np.ndarray:  # (L, 3)
     try:
         values = np.array(read_text(path).split(), np.float64)
     except ValueError as error:
-        raise InputError(f"{path}: holds what is no number; want a count, then x y z of each light") from error
+        raise InputError(f"{path}: is not all numbers; want a count, then x y z of each light") from error
     if len(values) < 4 or len(values) != 1 + 3 * int(values[0]):
         raise InputError(f"{path}: want a count, then x y z of each light; found {len(values)} numbers")
     directions = values[1:].reshape(-1, 3)
@@ -115,13 +115,13 @@ def chrome_lights(images: np.ndarray, mask: np.ndarray, where: str = "chrome") -
         where: For error messages.
 
     Raises:
-        InputError: a mask that is no disc, or an image without highlight.
+        InputError: a mask that is not a disc, or an image without highlight.
     """
     rows, columns = np.nonzero(mask)
     radius = float(np.sqrt(mask.sum() / np.pi))
     extent = (np.ptp(rows) + 1, np.ptp(columns) + 1)
     if max(abs(side / (2.0 * radius) - 1.0) for side in extent) > 0.05:
-        raise InputError(f"{where}: the mask is no disc ({extent[1]} x {extent[0]} pixels); the sphere must be whole")
+        raise InputError(f"{where}: the mask is not a disc ({extent[1]} x {extent[0]} pixels); show the whole sphere")
     inner = ndimage.binary_erosion(mask, iterations=max(1, round(0.03 * radius)))  # the rim mirrors the surroundings
     directions = []
     for number, image in enumerate(images):
