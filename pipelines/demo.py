@@ -115,10 +115,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps demo`."""
     presets.add_common_arguments(parser, default="demo")
     parser.add_argument("--materials", default="gold-metallic-paint,chrome,lambertian:0.5",
-                        help="materials that the bunny is regenerated in (default: %(default)s)")  # fmt: skip
-    parser.add_argument(
-        "--lights", default="merltest", help="lights that it is regenerated under (default: %(default)s)"
-    )
+                        help="materials that the bunny is regenerated in")  # fmt: skip
+    parser.add_argument("--light-set", default="merltest", help="light set that it is regenerated under")
+    parser.add_argument("--lights", dest="light_set", default="merltest", help=argparse.SUPPRESS)  # its earlier name
 
 
 def main(args: argparse.Namespace) -> int:
@@ -134,7 +133,7 @@ def main(args: argparse.Namespace) -> int:
         ["train", *common, str(out)],
         ["eval-merltest", *common, str(out)],
         ["regenerate", *common, str(out / "regenerated"), "--shapes", "bunny", "--materials", args.materials,
-         "--lights", args.lights],
+         "--light-set", args.light_set],
     )  # fmt: skip
     from pipelines.cli import main as run
 

@@ -18,8 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         "(data.lights=stage data.light_count=256)")  # fmt: skip
     parser.add_argument("--out", required=True, help="root of the tree; an interrupted run goes on there")
     parser.add_argument("--layout", default="unips", help="layout of the tree; unips is the one without lights' files")
-    parser.add_argument("--images", type=int, default=10, help="images of each scene (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the mixtures (default: %(default)s)")
+    parser.add_argument("--images", type=int, default=10, help="images of each scene")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the mixtures")
     add_fields(parser, mixing.LightMix)
     parser.add_argument("--bits", type=int, default=None, help="8 or 16 per channel (default: 16)")
     parser.add_argument("--exposure", default=None, help="factor on radiance or 'auto', per scene (default: auto)")

@@ -36,7 +36,7 @@ def combine(
         lights = lights or prefix + pair.lighting
         normals = prefix + pair.normals
     if normals is None:
-        raise InputError("--lights and --second need --normals as well; see `sdps models`")
+        raise InputError("--lights and --second need --normals as well; see `sdps list models`")
     lights = lights or _default_lights(normals, find)
     if normals in CLASSICAL:
         _check_classical(normals, lights, second, intensities)
