@@ -41,8 +41,8 @@ def main(args: argparse.Namespace) -> int:
     """Fit the built-in model to the table, write the material and a picture to judge it by.
 
     Raises:
-        InputError: not a MERL table, one with nothing to fit, a name that is no file name, or a folder that cannot be
-            written.
+        InputError: not a MERL table, one with nothing to fit, a name that is not a file name, or a folder that cannot
+            be written.
     """
     path = Path(args.file)
     if path.suffix.lower() != merl.SUFFIX:

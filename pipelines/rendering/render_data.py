@@ -143,7 +143,7 @@ def render_planned(
         rendered = len(summary.lines)
         if summary.failed:
             first = summary.failed[0]
-            raise InputError(f"{folder}: {len(summary.failed)} scenes failed, {first['id']} thus: {first['reason']}")
+            raise InputError(f"{folder}: {len(summary.failed)} scenes failed, first {first['id']}: {first['reason']}")
     if rendered:
         write_preview(scenes, folder)
     return rendered

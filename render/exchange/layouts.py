@@ -58,7 +58,7 @@ class Layout:
         directions: Whether a file of its own holds the direction of each image's light.
         places: Names the scenes of a manifest.
         folder: Folder of one scene, relative to `base`.
-        write: Writes one scene into an empty folder; gets the final folder too, for files beside it.
+        write: Writes one scene into an empty folder; gets the final folder too, for files next to it.
         lists: Writes what names the scenes in the root; gets (scene, place) in the manifest's order.
         check: Gets the data folder and the scenes' numbers of lights; raises InputError where the tree has no place
             for them.
@@ -106,7 +106,7 @@ def _write_mask(folder: Path, sample: Sample) -> None:
 
 
 def write_psfcn(folder: Path, final: Path, place: Place, sample: Sample) -> None:
-    """Write the images and their list, and beside the folder the normal map the materials of the view share.
+    """Write the images and their list, and next to the folder the normal map the materials of the view share.
 
     Raises:
         InputError: a normal map is there already and differs.

@@ -137,7 +137,7 @@ def checked(rows: object, name: str, lines: Sequence[int] = ()) -> np.ndarray:  
         lines: The rows' lines in a text.
 
     Raises:
-        InputError: no list, no row, or a row that is no light above the horizon (named by its number).
+        InputError: no list, no row, or a row that is not a light above the horizon (named by its number).
     """
     if not isinstance(rows, list) or not rows:
         raise InputError(f"{name}: directions: expected a list of [x, y, z] rows")

@@ -103,7 +103,7 @@ def mesh_files(family: MeshFamily) -> list[Path]:
 
 
 def _in_folder(folder: Path) -> Iterator[Path]:
-    """Yield the files of a folder whose endings are those of meshes; what stands beside them, as textures, is left."""
+    """Yield the files of a folder whose endings are those of meshes; other files, such as textures, are left."""
     from trimesh.exchange.load import mesh_formats
 
     formats = mesh_formats() - {"xyz"}  # points alone

@@ -87,7 +87,7 @@ def _git(git: str, folder: Path, *arguments: str) -> str | None:
 def headers(folder: Path, there: Sequence[SceneSpec]) -> dict[str, str]:
     """Read provenance from the headers of some shards, spread evenly; differing values are listed.
 
-    Shards that cannot be read are passed over; `sdps data validate` tells them.
+    Shards that cannot be read are passed over; `sdps data validate` names them.
     """
     found: dict[str, dict[str, None]] = {key: {} for key in HEADERS}
     for place in np.unique(np.linspace(0, len(there) - 1, min(READ, len(there))).round().astype(int)):

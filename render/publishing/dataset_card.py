@@ -164,7 +164,7 @@ def render_card(
 
 
 def _front_matter(text: Description, counts: Composition) -> dict[str, Any]:
-    """Return what Hugging Face reads; a licence that is no short identifier is given by name or link."""
+    """Return what Hugging Face reads; a licence that is not a short identifier is given by name or link."""
     licence = {"license": text.license.lower()}
     if text.license.startswith(("http://", "https://")):
         licence = {"license": "other", "license_name": "see-link", "license_link": text.license}

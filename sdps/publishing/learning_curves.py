@@ -1,4 +1,4 @@
-"""Learning curves of a run, or of several over each other, from their `metrics.jsonl`."""
+"""Learning curves of a run from their `metrics.jsonl`."""
 
 import math
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ def read_metrics(path: str | Path) -> Rows:
     """Read a `metrics.jsonl`, one dict per line, each with its `step`; a half-written last line is passed over.
 
     Raises:
-        InputError: missing or empty file, or a line that is no metrics.
+        InputError: missing or empty file, or a line that does not hold metrics.
     """
     rows: Rows = []
     lines = read_text(path).splitlines()
@@ -50,7 +50,7 @@ def read_metrics(path: str | Path) -> Rows:
                 break
             raise InputError(f"{path}: line {number} is not JSON ({error}); train this run again") from error
         if not isinstance(row, dict) or not isinstance(row.get("step"), int):
-            raise InputError(f"{path}: line {number} has no step, so it is no metrics; train this run again")
+            raise InputError(f"{path}: line {number} has no step, so it does not hold metrics; train this run again")
         rows.append({key: value for key, value in row.items() if isinstance(value, int | float)})
     if not rows:
         raise InputError(f"{path}: holds no metrics yet; wait for the first line or train longer")

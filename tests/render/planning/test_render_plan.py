@@ -91,7 +91,7 @@ def test_impossible_distances_are_refused(change, message):
 def test_a_prefix_changes_names_and_nothing_else():
     plain, named = plan(SMALL), plan(replace(SMALL, prefix="a-"))
     assert [replace(scene, id=f"a-{scene.id}") for scene in plain] == named
-    with pytest.raises(InputError, match="is no name of a file"):
+    with pytest.raises(InputError, match="is not a file name"):
         replace(SMALL, prefix="../")
 
 
