@@ -154,12 +154,12 @@ data-status data-validate data-preview data-card: $(READY)
 
 regenerate: OUT = out/regenerated
 regenerate: $(ASSETS_READY)
-	$(SDPS) regenerate --preset $(PRESET) --shapes '$(SHAPES)' --materials '$(MATERIALS)' --lights '$(LIGHTS)' \
+	$(SDPS) regenerate --preset $(PRESET) --shapes '$(SHAPES)' --materials '$(MATERIALS)' --light-set '$(LIGHTS)' \
 		--out $(OUT) $(if $(MITSUBA),--mitsuba) $(SETTINGS)
 
 demo: PRESET = demo
 demo: $(ASSETS_READY)
-	$(SDPS) demo --preset $(PRESET) --out $(OUT) --materials '$(MATERIALS)' --lights '$(LIGHTS)' $(SETTINGS)
+	$(SDPS) demo --preset $(PRESET) --out $(OUT) --materials '$(MATERIALS)' --light-set '$(LIGHTS)' $(SETTINGS)
 
 test: $(ASSETS_READY)
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow and not gpu"

@@ -22,6 +22,7 @@ class Command(NamedTuple):
         run: Function of the module that takes the parsed flags and returns the exit code.
         stores: Whether its folders may be addresses in object storage.
         hidden: Whether it is an earlier name, which works and is not listed.
+        example: One line or two that end its help.
     """
 
     module: str
@@ -30,6 +31,7 @@ class Command(NamedTuple):
     run: str = "main"
     stores: bool = False
     hidden: bool = False
+    example: str = ""
 
 
 class Group(NamedTuple):
@@ -40,52 +42,91 @@ class Group(NamedTuple):
 
 
 DATA = Group("plan, check, preview, describe, export, relight and import data folders", {
-    "plan": Command("pipelines.data.data_plan", "plan the scenes of a preset; estimate disk and time", stores=True),
-    "status": Command("pipelines.data.data_status", "show what is done, failed and left, and the rate", stores=True),
-    "validate": Command("pipelines.data.data_validate", "check every shard of a folder", stores=True),
-    "preview": Command("pipelines.data.data_preview",
-                       "write contact sheets and a page with light, material and shape statistics", stores=True),
-    "card": Command("pipelines.data.data_card", "write the dataset card and Croissant JSON", stores=True),
-    "export": Command("pipelines.data.data_exchange", "write scenes in a layout other loaders read", stores=True),
-    "relight": Command("pipelines.data.data_relight", "mix images under many lights from a light stage"),
-    "import": Command("pipelines.data.data_exchange", "turn PS-FCN trees and DiLiGenT folders into shards",
-                      "add_import_arguments", "import_main"),
-    "pack": Command("pipelines.data.data_pack", "pack scenes into WebDataset tars for streaming", stores=True),
+    "plan": Command("pipelines.data.plan", "plan the scenes of a preset; estimate disk and time", stores=True,
+                    example="sdps data plan --preset small --set data.size=64"),
+    "status": Command("pipelines.data.status", "show what is done, failed and left, and the rate", stores=True,
+                      example="sdps data status out/small/data"),
+    "validate": Command("pipelines.data.validate", "check every shard of a folder", stores=True,
+                        example="sdps data validate out/small/data --workers 2"),
+    "preview": Command("pipelines.data.preview",
+                       "write contact sheets and a page with light, material and shape statistics", stores=True,
+                       example="sdps data preview out/small/data --count 48"),
+    "card": Command("pipelines.data.card", "write the dataset card and Croissant JSON", stores=True,
+                    example="sdps data card out/small/data --license cc-by-4.0 --creator 'A. Name'"),
+    "export": Command("pipelines.data.exchange", "write scenes in a layout other loaders read", stores=True,
+                      example="sdps data export out/small/data --layout psfcn --out out/psfcn"),
+    "relight": Command("pipelines.data.relight", "mix images under many lights from a light stage",
+                       example="sdps data relight out/stage/data --environments studio --out out/relit"),
+    "import": Command("pipelines.data.exchange", "turn PS-FCN trees and DiLiGenT folders into shards",
+                      "add_import_arguments", "import_main",
+                      example="sdps data import DiLiGenT/pmsData --layout diligent --crop --out out/diligent"),
+    "pack": Command("pipelines.data.pack", "pack scenes into WebDataset tars for streaming", stores=True,
+                    example="sdps data pack out/small/data --out out/packed"),
+})  # fmt: skip
+
+_MATERIALS = Command("pipelines.rendering.catalogue", "list the built-in materials", "add_material_arguments",
+                     "materials_main", example="sdps list materials --category metal --out out")  # fmt: skip
+_SHAPES = Command("pipelines.rendering.catalogue", "list the shape families", "add_shape_arguments", "shapes_main",
+                  example="sdps list shapes --out out")  # fmt: skip
+_MODELS = Command("pipelines.rendering.catalogue", "list the learned models", "add_model_arguments", "models_main",
+                  example="sdps list models --role normals")  # fmt: skip
+
+LIST = Group("list what there is: materials, shapes, models, light sets, presets", {
+    "materials": _MATERIALS,
+    "shapes": _SHAPES,
+    "models": _MODELS,
+    "light-sets": Command("pipelines.rendering.catalogue", "list the light sets and distributions", "add_no_arguments",
+                          "light_sets_main", example="sdps list light-sets"),
+    "presets": Command("pipelines.rendering.catalogue", "list the presets", "add_no_arguments", "presets_main",
+                       example="sdps list presets"),
 })  # fmt: skip
 
 EVALUATE = Group("score methods on rendered scenes and real photographs, and write the report", {
-    "merltest": Command("pipelines.evaluate.merltest", "render and score MERL-Test scenes"),
-    "diligent": Command("pipelines.evaluate.benchmarks.diligent", "score methods on DiLiGenT's objects, by folder"),
+    "merltest": Command("pipelines.evaluate.merltest", "render and score MERL-Test scenes",
+                        example="sdps evaluate merltest --preset small"),
+    "diligent": Command("pipelines.evaluate.benchmarks.diligent", "score methods on DiLiGenT's objects, by folder",
+                        example="sdps evaluate diligent DiLiGenT/pmsData"),
     "gourd-apple": Command("pipelines.evaluate.benchmarks.measured_lights", "score lights on Gourd&Apple",
-                           "add_gourd_apple_arguments"),
+                           "add_gourd_apple_arguments", example="sdps evaluate gourd-apple datasets/GourdApple"),
     "light-stage": Command("pipelines.evaluate.benchmarks.measured_lights",
-                           "score lights on the Light Stage Data Gallery", "add_light_stage_arguments"),
+                           "score lights on the Light Stage Data Gallery", "add_light_stage_arguments",
+                           example="sdps evaluate light-stage datasets/LightStage"),
     "uw": Command("pipelines.evaluate.benchmarks.uw",
-                  "score uncalibrated methods on photographs of the University of Washington"),
-    "classical": Command("pipelines.evaluate.classical", "compare the classical methods on rendered scenes"),
-    "report": Command("pipelines.evaluate.report.page", "collect everything evaluated into one page"),
+                  "score uncalibrated methods on photographs of the University of Washington",
+                  example="sdps evaluate uw datasets/psmImages"),
+    "classical": Command("pipelines.evaluate.classical", "compare the classical methods on rendered scenes",
+                         example="sdps evaluate classical --out out/classical"),
+    "report": Command("pipelines.evaluate.report.page", "collect everything evaluated into one page",
+                      example="sdps evaluate report out/small"),
 })  # fmt: skip
 
 COMMANDS: dict[str, Command | Group] = {
-    "infer": Command("pipelines.infer", "find normals, lights and a surface in a folder of photographs"),
-    "app": Command("pipelines.app.app", "serve a local page for photographs, scenes and data"),
-    "doctor": Command("pipelines.doctor", "show what this machine has and what is missing"),
-    "demo": Command("pipelines.demo", "render, train, evaluate and regenerate, fitted to this machine"),
-    "render-data": Command("pipelines.rendering.render_data", "render the training scenes of a preset", stores=True),
+    "infer": Command("pipelines.infer", "find normals, lights and a surface in a folder of photographs",
+                     example="sdps infer photos --out out/vase\nsdps infer photos --lights lights.lp --mask mask.png"),
+    "app": Command("pipelines.app.app", "serve a local page for photographs, scenes and data", example="sdps app"),
+    "doctor": Command("pipelines.doctor", "show what this machine has and what is missing",
+                      example="sdps doctor --fix"),
+    "demo": Command("pipelines.demo", "render, train, evaluate and regenerate, fitted to this machine",
+                    example="sdps demo --out out/demo"),
+    "render-data": Command("pipelines.rendering.render_data", "render the training scenes of a preset", stores=True,
+                           example="sdps render-data --preset small --out out/small"),
     "data": DATA,
-    "models": Command("pipelines.train.list_models", "list the learned models"),
-    "train": Command("pipelines.train.train", "train models, by default LCNet, then NENet", stores=True),
+    "list": LIST,
+    "train": Command("pipelines.train.train", "train models, by default LCNet, then NENet", stores=True,
+                     example="sdps train --preset small --models lcnet,nenet"),
     "evaluate": EVALUATE,
-    "regenerate": Command("pipelines.rendering.regenerate", "render test scenes of chosen shapes and materials"),
-    "fit-material": Command("pipelines.rendering.fit_material", "fit the built-in model to a MERL .binary table"),
-    "materials": Command(
-        "pipelines.rendering.catalogue", "list the built-in materials", "add_material_arguments", "materials_main"
-    ),
-    "shapes": Command("pipelines.rendering.catalogue", "list the shape families", "add_shape_arguments", "shapes_main"),
+    "regenerate": Command("pipelines.rendering.regenerate", "render test scenes of chosen shapes and materials",
+                          example="sdps regenerate --shapes bunny --materials chrome --light-set merltest"),
+    "fit-material": Command("pipelines.rendering.fit_material", "fit the built-in model to a MERL .binary table",
+                            example="sdps fit-material chrome.binary --out materials"),
+    "materials": _MATERIALS._replace(hidden=True),
+    "shapes": _SHAPES._replace(hidden=True),
+    "models": _MODELS._replace(hidden=True),
     "eval-merltest": EVALUATE.commands["merltest"]._replace(hidden=True),
     "eval-diligent": EVALUATE.commands["diligent"]._replace(hidden=True),
     "eval-lights": Command("pipelines.evaluate.benchmarks.measured_lights",
-                           "score lights on Gourd&Apple or Light Stage", hidden=True),
+                           "score lights on Gourd&Apple or Light Stage", hidden=True,
+                           example="sdps evaluate gourd-apple datasets/GourdApple"),
     "eval-classical": EVALUATE.commands["classical"]._replace(hidden=True),
     "eval-photos": EVALUATE.commands["uw"]._replace(hidden=True),
     "report": EVALUATE.commands["report"]._replace(hidden=True),
@@ -98,8 +139,48 @@ IN_LAB = ("bench", "bench-checks", "bench-classical", "bench-infer", "bench-surf
 Commands = Mapping[str, Command | Group]
 
 
+GROUPS = {
+    "what goes in": {"preset", "set", "models", "data", "mask", "images", "gamma", "scale", "self-test", "method",
+                     "methods", "objects"},
+    "lights": {"lights", "light-set", "intensities", "frame", "light-distance"},
+    "which scenes": {"ids", "split", "limit", "count", "skip-missing", "shard", "retry-failed", "shapes", "materials",
+                     "category", "role"},
+    "what comes out": {"out", "json", "layout", "bits", "exposure", "mitsuba", "photographs", "tensorboard"},
+    "the machine": {"workers", "keep-free", "timeout", "cache-gb", "cluster", "cluster-config", "stream", "precision",
+                    "light-views", "normal-views", "verify"},
+}  # fmt: skip
+"""Headings of flags in every command's help; a flag that is not here stands under `options`."""
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Help that shows the default of every flag whose text does not."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text, value = action.help or "", action.default
+        nothing = value in (None, [], "", (), argparse.SUPPRESS) or isinstance(value, bool)
+        if nothing or not action.option_strings or "default" in text:
+            return text
+        if isinstance(value, tuple):
+            value = ",".join(map(str, value))
+        shown = f"{value:g}" if isinstance(value, float) else str(value)
+        return f"{text} (default: {shown.replace('%', '%%')})"
+
+
 class _Parser(argparse.ArgumentParser):
-    """An argument parser whose complaints are one line."""
+    """An argument parser that groups flags by `GROUPS`, shows defaults, and whose complaints are one line."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**{"formatter_class": _Help, **settings})
+        for title in GROUPS:  # in this order; a group without flags is not shown
+            self.add_argument_group(title)
+
+    def add_argument(self, *names: str, **settings: Any) -> argparse.Action:
+        """Add a flag to the group its name belongs to."""
+        title = next((title for title, words in GROUPS.items() if names and names[0].lstrip("-") in words), None)
+        if title is None or not names[0].startswith("-") or settings.get("help") == argparse.SUPPRESS:
+            return super().add_argument(*names, **settings)
+        group = next(group for group in self._action_groups if group.title == title)
+        return group.add_argument(*names, **settings)
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; see `{self.prog} --help`")
@@ -141,8 +222,12 @@ def _add_commands(
     for name, command in commands.items():
         about = command.about
         hidden = isinstance(command, Command) and command.hidden
-        told: dict[str, Any] = {"description": f"{about[0].upper()}{about[1:]}."} | ({} if hidden else {"help": about})
-        child = children.add_parser(name, **told)
+        words_of_help: dict[str, Any] = {"description": f"{about[0].upper()}{about[1:]}."}
+        if not hidden:
+            words_of_help["help"] = about
+        if isinstance(command, Command) and command.example:
+            words_of_help["epilog"] = "example:\n" + "\n".join(f"  {line}" for line in command.example.splitlines())
+        child = children.add_parser(name, **words_of_help)
         if name != wanted:
             continue
         if isinstance(command, Group):
@@ -191,7 +276,7 @@ def main(argv: Sequence[str] | None = None, commands: Commands = COMMANDS, progr
     except KeyboardInterrupt:
         sys.stderr.write(f"{program}: stopped; what is finished is kept, run the same command again to go on\n")
         return 130
-    except BrokenPipeError:  # the reader of a list closed early, e.g. `sdps materials | head`
+    except BrokenPipeError:  # the reader of a list closed early, e.g. `sdps list materials | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:  # a name that is too long, a folder that may not be read, a disk that vanished

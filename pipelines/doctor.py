@@ -79,7 +79,7 @@ def examine(folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
 
 
 def _disk_line(free: int) -> str:
-    """Describe the free bytes; a small disk is no fault, since rendering itself refuses what does not fit."""
+    """Describe the free bytes; a small disk is not an error, since rendering itself refuses what does not fit."""
     low = f"; the demo takes about {gigabytes(DEMO_BYTES)}, choose another --out" if free < DEMO_BYTES else ""
     return gigabytes(free) + low
 

@@ -27,7 +27,7 @@ _MOST_SIDE = 700  # of the object, in pixels: twice that and more is thinned for
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps infer`."""
     parser.add_argument("folder", type=Path, nargs="?", help="photographs of a static object under moving light")
-    parser.add_argument("--out", type=Path, default=Path("out/infer"), help="output folder (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("out/infer"), help="output folder")
     parser.add_argument("--method", default="auto", metavar="NAME",
                         help="any model or classical method: sdps, lcnet+psfcn, pf14, ... (default: auto)")  # fmt: skip
     parser.add_argument("--models", type=Path, default=None, help="folder of trained runs (default: shipped weights)")

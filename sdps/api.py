@@ -189,7 +189,7 @@ def train(
     """Train a model on a rendered data folder, resuming what is there.
 
     Args:
-        model: A name such as `lcnet` (lights) or `nenet` (normals), as `sdps models` lists them.
+        model: A name such as `lcnet` (lights) or `nenet` (normals), as `sdps list models` lists them.
         data: Data folder (`render.render_plan`), with scenes of the split `train` and, for validation, `val`.
         out: Folder of the runs; this one is `models/<model>` in it. What a model is trained on (NENet on LCNet's
             lights) is taken from there if it was trained there, else the pretrained weights are.

@@ -29,8 +29,7 @@ FOLDERS = [
     )),
     "sdps",
     *(f"pipelines.{name}" for name in (
-        "shared", "shared.cluster", "rendering", "data.preview", "data", "train", "evaluate.report", "evaluate",
-        "evaluate.benchmarks",
+        "shared", "shared.cluster", "rendering", "data", "train", "evaluate.report", "evaluate", "evaluate.benchmarks",
     )),
     "pipelines", "pipelines.app.common", "pipelines.app.pages", "pipelines.app",
     "lab.shared", "lab.bench", "lab.figures", "lab.studies", "lab.releases", "lab",
@@ -39,8 +38,9 @@ RANK = {folder: place for place, folder in enumerate(FOLDERS)}
 PACKAGES = ("render", "sdps", "pipelines", "lab")
 LIGHT = ("render.shared", "render.shared.imaging", "render.records")
 """Folders of `render` that `sdps` may use; they load neither mitsuba nor torch."""
-MAY_RECUR = {"__init__.py", "api.py", "registry.py"}
-"""A registry is one in every folder that has one, and `api` is what a package offers from its root."""
+MAY_RECUR = {"__init__.py", "api.py", "registry.py", "plan.py", "validate.py", "relight.py"}
+"""A registry is one in every folder that has one, and `api` is what a package offers from its root. A command in
+`pipelines/data` has the name of what it does, and so have the modules that do it."""
 ENTRIES = 12
 LONGER = {"sdps.refinement.fused._pass": 90}  # one loop, compiled whole
 """Functions that may have more than 50 lines, and how many."""

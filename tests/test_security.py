@@ -202,7 +202,7 @@ def test_no_page_or_card_takes_names_for_markup(tmp_path: Path, capsys: pytest.C
 
 def without_ours(page: str) -> str:
     """Return a page without the one script it may have, which is a file of ours, and the data of that script."""
-    for script in ("pipelines/data/preview/preview.js", "pipelines/evaluate/report/page.js"):
+    for script in ("pipelines/data/preview.js", "pipelines/evaluate/report/page.js"):
         page = page.replace(f"<script>\n{(ROOT / script).read_text()}</script>", "")
     return re.sub(r'<script type="application/json" id="stages">[^<>]*</script>', "", page)
 

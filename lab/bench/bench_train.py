@@ -87,7 +87,7 @@ class BenchTrainConfig:
     def __post_init__(self) -> None:
         check_fields(self, "positive", "seconds", "rounds", "scenes", "images")
         if not self.models:
-            raise InputError("models must name at least one; see `sdps models`")
+            raise InputError("models must name at least one; see `sdps list models`")
         for model in self.models:
             role = registry.entry(model).role
             if role not in WAITING_TARGETS:

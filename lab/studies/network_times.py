@@ -32,7 +32,7 @@ def estimator(name: str, precision: str) -> Estimator:
 def main() -> int:
     """Time the networks named and print a line for each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="+", help="normal models of `sdps models`")
+    parser.add_argument("names", nargs="+", help="normal models of `sdps list models`")
     parser.add_argument("--images", type=int, default=96)
     parser.add_argument("--side", type=int, default=96, help="pixels")
     parser.add_argument("--rounds", type=int, default=3)

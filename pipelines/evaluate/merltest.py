@@ -105,7 +105,7 @@ def table_rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[lis
     """
     constant = Method(name="constant predictor", normals=CONSTANT)
     if any((args.lighting, args.normals, args.intensities)):
-        method = rows.chosen(out, args.lighting, args.normals, None, args.intensities)
+        method = rows.from_flags(out, args.lighting, args.normals, args.intensities)
         reference = Method(name="least-squares, true lights", lights="true", normals="least-squares")
         return [], [method, *([reference] if method.name != reference.name else []), constant]
     normals = rows.normal_methods(out, preset.test.shipped, preset.test)

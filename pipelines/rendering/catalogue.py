@@ -1,18 +1,21 @@
-"""`sdps materials` and `sdps shapes`: what there is to render, as a list or as a contact sheet."""
+"""`sdps list`: materials and shapes, also as a contact sheet, models, light sets and presets."""
 
 import argparse
+import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.shared import pictures
+from pipelines.shared import pictures, presets
 from pipelines.shared.flags import split_list
+from pipelines.shared.text_tables import render_text
 from render.materials import library, surfaces
 from render.materials.model import Material
 from render.materials.textures import textured
 from render.materials.textures.textured import Textured
+from render.planning import light_sets
 from render.planning.plan import material_pool
 from render.records.manifest import View
 from render.shared.errors import InputError, unknown
@@ -27,15 +30,74 @@ _TURNED = View(rotation=(0.9063, 0.0, 0.4226, 0.0746, 0.9843, -0.1600, -0.4160, 
 
 
 def add_material_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of `sdps materials`."""
+    """Declare the flags of `sdps list materials`."""
     parser.add_argument("--category", default=None, help="only this category; procedural: one of each kind")
     parser.add_argument("--materials", action="append", help="only these names and files; commas or repeat")
     parser.add_argument("--out", default=None, help="also render a contact sheet of spheres, <out>/materials.png")
 
 
 def add_shape_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of `sdps shapes`."""
+    """Declare the flags of `sdps list shapes`."""
     parser.add_argument("--out", default=None, help="also render a contact sheet, <out>/shapes.png")
+
+
+def add_model_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of `sdps list models`."""
+    parser.add_argument("--role", choices=("lighting", "normals", "pixels"), default=None,
+                        help="only the models of this role")  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def add_no_arguments(_: argparse.ArgumentParser) -> None:
+    """Declare nothing: the list has no flags."""
+
+
+def light_sets_main(_: argparse.Namespace) -> int:
+    """List the fixed light sets, and the distributions that a number of lights is drawn from."""
+    for name in light_sets.names():
+        sys.stdout.write(f"{name:<22} fixed, {len(light_sets.load(name))} lights\n")
+    for name, draw in light_sets.DISTRIBUTIONS.items():
+        sys.stdout.write(f"{name + ':<count>':<22} {(draw.__doc__ or '').splitlines()[0]}\n")
+    sys.stdout.write(f"{'<file>':<22} a YAML file with `directions`, or three numbers a line\n")
+    return 0
+
+
+def presets_main(_: argparse.Namespace) -> int:
+    """List the presets."""
+    for name in presets.names():
+        sys.stdout.write(f"{name:<12} {presets.load(name).description}\n")
+    return 0
+
+
+def models_main(args: argparse.Namespace) -> int:
+    """List the learned models, with parameter counts, roles and what they are trained on."""
+    from sdps.models.registry import COMBINATIONS, MODELS
+
+    models = {name: item for name, item in MODELS.items() if args.role in (None, item.role)}
+    if args.json:
+        listed = [
+            {"name": name, "role": item.role, "parameters": item.parameters, "paper": item.paper,
+             "lights": item.lights, "summary": item.summary, "reconstruction": item.reconstruction,
+             "recipe": dict(item.recipe)}
+            for name, item in models.items()
+        ]  # fmt: skip
+        sys.stdout.write(json.dumps(listed, indent=2) + "\n")
+        return 0
+    rows = [
+        [name, f"{item.parameters:,}", item.role, item.paper or "-", item.lights or "-", item.summary]
+        for name, item in models.items()
+    ]
+    header = ["model", "parameters", "role", "paper", "trained on lights of", "what it is"]
+    sys.stdout.write(render_text("Models", header, rows, left={0, 2, 3, 4, 5}))
+    if args.role is None:
+        rows = [
+            [name, f"{pair.parameters():,}", " + ".join(pair.members()), pair.paper or "-", pair.summary]
+            for name, pair in COMBINATIONS.items()
+        ]
+        header = ["combination", "parameters", "models", "paper", "what it is"]
+        sys.stdout.write("\n" + render_text("Combinations", header, rows, left={0, 2, 3, 4}))
+        sys.stdout.write("\nAny lighting model works with any normal model: --lights NAME --normals NAME.\n")
+    return 0
 
 
 def materials_main(args: argparse.Namespace) -> int:

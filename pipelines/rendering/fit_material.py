@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipelines.shared import pictures
+from pipelines.shared.charts import new_figure
 from render.materials import merl, model
 from render.materials.fit import fitting, spheres
 from render.materials.merl import MerlTable
@@ -40,8 +41,8 @@ def main(args: argparse.Namespace) -> int:
     """Fit the built-in model to the table, write the material and a picture to judge it by.
 
     Raises:
-        InputError: not a MERL table, one with nothing to fit, a name that is no file name, or a folder that cannot be
-            written.
+        InputError: not a MERL table, one with nothing to fit, a name that is not a file name, or a folder that cannot
+            be written.
     """
     path = Path(args.file)
     if path.suffix.lower() != merl.SUFFIX:
@@ -79,7 +80,7 @@ def fit(table: MerlTable, name: str) -> Material:
 
 def comparison(table: MerlTable, material: Material) -> Figure:
     """Draw spheres of table and fit side by side under five lights, their difference, and slices through both."""
-    figure = Figure(figsize=(10.4, 9.6), dpi=100, layout="constrained")
+    figure = new_figure(10.4, 9.6)
     figure.suptitle(f"{material.name}: error {material.fit_error:.1%}", fontsize=11)
     parts: Any = figure.subfigures(2, 1, height_ratios=(2, 1.1))
     upper, lower = parts

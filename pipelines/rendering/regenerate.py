@@ -24,9 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--materials", action="append", help="names, categories, all, lambertian:0.5, .yaml, .binary "
                         "and .bsdf files, mixtures such as stripes:7:chrome+blue-fabric, procedural:wood:7, "
                         "folders of maps")  # fmt: skip
-    parser.add_argument(
-        "--lights", action="append", help="merltest, diligent, grid:96, hand-held:40, ..., or a file of directions"
-    )
+    parser.add_argument("--light-set", action="append", metavar="NAME|FILE",
+                        help="merltest, diligent, grid:96, hand-held:40, ..., or a file of directions")  # fmt: skip
+    parser.add_argument("--lights", dest="light_set", action="append", help=argparse.SUPPRESS)  # its earlier name
     parser.add_argument("--camera-distance", type=float, default=None, metavar="D", help="perspective camera at D half "
                         "image widths from the object's centre (default: orthographic)")  # fmt: skip
     parser.add_argument("--light-distance", type=float, default=None, metavar="D", help="near lights at D half image "
@@ -42,14 +42,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Render the scenes and a contact sheet of them."""
     preset, _ = presets.from_arguments(args)
-    lights = split_list(args.lights) or [preset.test.lights]
-    if len(lights) != 1:
-        raise InputError(f"--lights: name one light set per run, got {', '.join(lights)}")
+    light_sets = split_list(args.light_set) or [preset.test.lights]
+    if len(light_sets) != 1:
+        raise InputError(f"--light-set: name one light set per run, got {', '.join(light_sets)}")
     test = replace(
         preset.test,
         shapes=tuple(split_list(args.shapes)) or preset.test.shapes,
         materials=tuple(split_list(args.materials)) or preset.test.materials,
-        lights=lights[0],
+        lights=light_sets[0],
         camera_distance=preset.test.camera_distance if args.camera_distance is None else args.camera_distance,
         light_distance=preset.test.light_distance if args.light_distance is None else args.light_distance,
     )
@@ -61,11 +61,11 @@ def main(args: argparse.Namespace) -> int:
     )
     if args.mitsuba:
         save_for_mitsuba(wanted, folder / "mitsuba")
-        sys.stdout.write(f"{folder / 'mitsuba'}: {len(wanted)} scenes for stock Mitsuba; each README.txt tells how\n")
+        sys.stdout.write(f"{folder / 'mitsuba'}: {len(wanted)} scenes for stock Mitsuba; each README.txt says how\n")
     if args.photographs:
         photographs.save_photographs(wanted, folder, folder / "photographs", test.sensor or SensorModel(), test.seed)
         sys.stdout.write(
-            f"{folder / 'photographs'}: {len(wanted)} scenes as photographs; camera.json tells which camera\n"
+            f"{folder / 'photographs'}: {len(wanted)} scenes as photographs; camera.json says which camera\n"
         )
     return 0
 

@@ -20,7 +20,7 @@ T = TypeVar("T", bound="DataclassInstance")
 def add_cache_argument(parser: argparse.ArgumentParser) -> None:
     """Declare how much of data in object storage is kept on this disk."""
     parser.add_argument("--cache-gb", type=float, default=CACHE_GB, metavar="GB",
-                        help="of data in object storage, keep this much here (default: %(default)g)")  # fmt: skip
+                        help="of data in object storage, keep this much here")  # fmt: skip
 
 
 def add_fields(parser: argparse.ArgumentParser, config: type, names: Iterable[str] = ()) -> None:
@@ -38,7 +38,7 @@ def add_fields(parser: argparse.ArgumentParser, config: type, names: Iterable[st
             f"--{entry.name.replace('_', '-')}",
             type=_words if get_origin(entry.type) is tuple else entry.type,
             default=entry.default,
-            help=f"{text[0].lower()}{text[1:]} (default: %(default)s)",
+            help=f"{text[0].lower()}{text[1:]}",
         )
 
 
@@ -58,7 +58,7 @@ def from_flags(config: type[T], args: argparse.Namespace, **others: object) -> T
 
 def add_out(parser: argparse.ArgumentParser, default: str | Path) -> None:
     """Declare `--out`."""
-    parser.add_argument("--out", type=Path, default=default, help="output folder (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=default, help="output folder")
 
 
 def add_models(parser: argparse.ArgumentParser) -> None:

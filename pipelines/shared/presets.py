@@ -38,7 +38,7 @@ class TestConfig(InferenceConfig):
         intensity_range: Range the light intensities are drawn from, uniformly.
         repeats: Draws of random intensities per scene; scores are averaged over them.
         pictures: Scenes shown in the report, per shape.
-        shipped: Shipped ways beside what is trained, such as `sdps` or `lcnet-soft+psfcn`; `all` for every one.
+        shipped: Shipped ways besides what is trained, such as `sdps` or `lcnet-soft+psfcn`; `all` for every one.
         sensor: Cameras of `regenerate --photographs`; not given: all of `render.shared.imaging.sensor.SensorModel`.
     """
 
@@ -74,7 +74,7 @@ class TestConfig(InferenceConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """Everything the commands need; saved, resolved, beside whatever they write.
+    """Everything the commands need; saved, resolved, next to what they write.
 
     Attributes:
         name: Name of the preset.

@@ -13,7 +13,7 @@ class StreamConfig:
     Attributes:
         window: Scenes kept in memory, from which batches are drawn; no more than the plan has.
         fresh: New scenes per batch, above 0; may be below 1.
-        depth: Finished scenes kept ready beside the window; changes nothing but waiting.
+        depth: Finished scenes kept ready in addition to the window; changes only how long training waits.
         threads: Threads that render; 0 takes half of the cores and leaves the rest to the trainer.
         recycle: Scenes after which the process is replaced, since Mitsuba keeps some memory of every scene.
         timeout: Seconds to wait for a scene before giving up; 0 waits for ever.

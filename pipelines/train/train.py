@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Train what is asked for, resuming whatever is there; exit code 130 when stopped by a signal."""
+    """Train what is asked for, resuming what is there; exit code 130 when stopped by a signal."""
     from sdps.methods.pretrained import MODELS_FOLDER, is_run
     from sdps.training import recipes
     from sdps.training.distributed import team

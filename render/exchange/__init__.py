@@ -1,5 +1,5 @@
 """Exchange with the folder layouts that other photometric-stereo code reads and writes.
 
-`export` turns shards into the layouts of `layouts.LAYOUTS`, `rules` checks such a tree against what its loaders
-demand, `ingest` turns PS-FCN trees and DiLiGenT folders into shards. docs/reference/formats.md describes the layouts.
+`export` turns shards into the layouts of `layouts.LAYOUTS`, `ingest` turns PS-FCN trees and DiLiGenT folders into
+shards. docs/reference/formats.md describes the layouts.
 """

@@ -112,16 +112,10 @@ def _check_shards(folder: Path, scenes: Sequence[SceneSpec]) -> None:
 def _check_lights(folder: Path, scenes: Sequence[SceneSpec], options: ExportOptions) -> None:
     """Refuse numbers of lights the layout cannot hold."""
     counts = {len(scene.lights) for scene in scenes}
-    if options.layout == "diligent" and len(counts) > 1:
-        raise InputError(
-            f"{folder}: scenes have from {min(counts)} to {max(counts)} lights, but a DiLiGenT root has one names.txt "
-            "for all; export them to folders of their own with --ids"
-        )
+    LAYOUTS[options.layout].check(str(folder), counts)
     if options.mixed is not None:
         mixing.require_enough(min(counts), str(folder))
         options.mixed.load()
-    if options.layout == "psfcn" and min(counts) < 2:
-        raise InputError(f"{folder}: a scene has one light, but PS-FCN's loaders need at least two")
 
 
 def scene_folder(root: Path, layout: Layout, place: Place) -> Path:
@@ -148,7 +142,7 @@ def _write_scene(folder: Path, root: Path, scene: SceneSpec, place: Place, optio
         marker["light_positions"] = np.asarray(scene.light_positions(), np.float64).round(6).tolist()
     if scene.view.camera_distance is not None:
         marker["camera_distance"] = scene.view.camera_distance
-    if options.layout == "unips" and options.mixed is None:
+    if not layout.directions and options.mixed is None:
         marker |= {
             "light_directions": sample.directions.tolist(),
             "light_intensities": sample.intensities.tolist(),

@@ -53,7 +53,7 @@ class Source:
     truth: Callable[[], Truth] = field(repr=False)
 
     def exposure(self) -> float | None:
-        """Return the exposure our own export recorded beside the images, None in trees of others."""
+        """Return the exposure our own export recorded next to the images, None in trees of others."""
         path = self.folder / MARKER
         if not path.is_file():
             return None

@@ -15,9 +15,8 @@ import numpy as np
 from render.exchange import frame
 from render.exchange.folders import read_record
 from render.exchange.foreign_samples import Source, Truth
+from render.exchange.layouts import LAYOUTS
 from render.exchange.names import legal_name, unique_names
-from render.exchange.read_diligent import diligent_sources
-from render.exchange.read_psfcn import psfcn_sources
 from render.records.manifest import MANIFEST, SceneSpec, View, read_manifest, write_manifest
 from render.records.shards import Shard, is_whole, to_half, write_shard
 from render.shared.config import to_plain
@@ -27,7 +26,9 @@ from render.shared.progress import progress_bar
 from render.shared.temporary import is_empty
 
 RECORD = "import.json"
-READERS: Mapping[str, Callable[[Path], list[Source]]] = {"psfcn": psfcn_sources, "diligent": diligent_sources}
+READERS: Mapping[str, Callable[[Path], list[Source]]] = {
+    name: layout.read for name, layout in LAYOUTS.items() if layout.read
+}
 SIZE_MULTIPLE = 4  # the normal networks halve the image twice
 
 

@@ -1,14 +1,20 @@
-"""The layouts shards are exported to: names, files of one scene, and lists of the whole tree."""
+"""The layouts of exchange: names, files of one scene, lists of the whole tree, and what is special about each.
+
+A new layout is a function that writes a scene and an entry of `LAYOUTS`.
+"""
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.io import savemat
 
+from render.exchange.foreign_samples import Source
 from render.exchange.names import Place, object_places, view_places
+from render.exchange.read_diligent import diligent_sources
+from render.exchange.read_psfcn import psfcn_sources
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, write_text
@@ -52,8 +58,12 @@ class Layout:
         directions: Whether a file of its own holds the direction of each image's light.
         places: Names the scenes of a manifest.
         folder: Folder of one scene, relative to `base`.
-        write: Writes one scene into an empty folder; gets the final folder too, for files beside it.
+        write: Writes one scene into an empty folder; gets the final folder too, for files next to it.
         lists: Writes what names the scenes in the root; gets (scene, place) in the manifest's order.
+        check: Gets the data folder and the scenes' numbers of lights; raises InputError where the tree has no place
+            for them.
+        advise: Gets the tree and the splits in it; returns what is to be said after an export.
+        read: Lists the samples of such a tree for `ingest`; None where it is only written.
     """
 
     about: str
@@ -66,6 +76,9 @@ class Layout:
     folder: Callable[[Place], str]
     write: Callable[[Path, Path, Place, Sample], None]
     lists: Callable[[Path, Sequence[tuple[SceneSpec, Place]]], None]
+    check: Callable[[str, Collection[int]], None] = lambda folder, counts: None
+    advise: Callable[[str, Collection[str]], str] = lambda tree, splits: ""
+    read: Callable[[Path], list[Source]] | None = None
 
 
 def image_names(count: int, pattern: str = "{:03d}.png", first: int = 0) -> list[str]:
@@ -93,7 +106,7 @@ def _write_mask(folder: Path, sample: Sample) -> None:
 
 
 def write_psfcn(folder: Path, final: Path, place: Place, sample: Sample) -> None:
-    """Write the images and their list, and beside the folder the normal map the materials of the view share.
+    """Write the images and their list, and next to the folder the normal map the materials of the view share.
 
     Raises:
         InputError: a normal map is there already and differs.
@@ -116,6 +129,17 @@ def list_psfcn(root: Path, placed: Sequence[tuple[SceneSpec, Place]]) -> None:
         lines = [f"{place.shape}/{place.name}" for scene, place in placed if scene.split == split]
         if lines or split != "test":
             write_text(root / f"{split}_mtrl.txt", lines_text(lines))
+
+
+def _check_psfcn(folder: str, counts: Collection[int]) -> None:
+    if min(counts) < 2:
+        raise InputError(f"{folder}: a scene has one light, but PS-FCN's loaders need at least two")
+
+
+def _advise_psfcn(tree: str, splits: Collection[str]) -> str:
+    if "val" in splits:
+        return ""
+    return f"{tree}: val_mtrl.txt is empty; export scenes of split 'val' too before training on it\n"
 
 
 def write_custom(folder: Path, _final: Path, _place: Place, sample: Sample) -> None:
@@ -151,6 +175,14 @@ def write_diligent(folder: Path, _final: Path, _place: Place, sample: Sample) ->
     (folder / "normal.txt").write_text("\n".join(numbers), encoding="utf-8", newline="\n")
 
 
+def _check_diligent(folder: str, counts: Collection[int]) -> None:
+    if len(counts) > 1:
+        raise InputError(
+            f"{folder}: scenes have from {min(counts)} to {max(counts)} lights, but a DiLiGenT root has one names.txt "
+            "for all; export them to folders of their own with --ids"
+        )
+
+
 def list_diligent(root: Path, placed: Sequence[tuple[SceneSpec, Place]]) -> None:
     """Write objects.txt and names.txt into pmsData, which SDPS-Net reads instead of looking into the folders."""
     root = root / "pmsData"
@@ -168,11 +200,13 @@ def write_unips(folder: Path, _final: Path, _place: Place, sample: Sample) -> No
 
 LAYOUTS: Mapping[str, Layout] = {
     "psfcn": Layout("PS-FCN / SDPS-Net training tree", "Images", (8,), 1.0, False, True, view_places,
-                    lambda place: f"{place.shape}/{place.name}", write_psfcn, list_psfcn),
+                    lambda place: f"{place.shape}/{place.name}", write_psfcn, list_psfcn,
+                    _check_psfcn, _advise_psfcn, psfcn_sources),
     "custom": Layout("SDPS-Net's UPS_Custom_Dataset folder", "", (8, 16), "auto", True, True, object_places,
                      lambda place: place.name, write_custom, list_custom),
     "diligent": Layout("DiLiGenT's pmsData folder", "pmsData", (16, 8), "auto", True, True, object_places,
-                       lambda place: f"{place.name}PNG", write_diligent, list_diligent),
+                       lambda place: f"{place.name}PNG", write_diligent, list_diligent,
+                       _check_diligent, read=diligent_sources),
     "unips": Layout("UniPS / SDM-UniPS test folder", "", (16, 8), "auto", True, False, object_places,
                     lambda place: f"{place.name}.data", write_unips, lambda root, placed: None),
 }  # fmt: skip

@@ -98,7 +98,7 @@ def _diligent_truth(folder: Path) -> Truth:
         try:
             normals = numbers.astype(np.float64).reshape(*mask.shape, 3)
         except ValueError as error:
-            raise InputError(f"{origin}: holds something that is no number ({error}); restore the file") from error
+            raise InputError(f"{origin}: holds something that is not a number ({error}); restore the file") from error
     else:
         normals = _read_mat(origin)
     if normals.shape != (*mask.shape, 3):

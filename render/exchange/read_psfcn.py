@@ -49,7 +49,7 @@ def _psfcn_source(root: Path, entry: str, split: str, listed: Path) -> Source:
     shape, material = entry.split("/")
     folder = root / "Images" / shape / material
     names, directions = read_light_list(folder / f"{shape}_{material}.txt")
-    normals = root / "Images" / shape / f"{shape}_normal.png"  # its background tells the mask
+    normals = root / "Images" / shape / f"{shape}_normal.png"  # its background gives the mask
     return Source(
         name=f"{shape}_{material}", shape=shape, material=material, split=split, folder=folder,
         where=f"Images/{entry}", images=tuple(names), directions=directions, intensities=np.ones_like(directions),

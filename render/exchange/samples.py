@@ -60,7 +60,8 @@ class ExportOptions:
         if self.intensities != "unit" and not layout.intensities:
             raise InputError(f"layout {self.layout} has no file for intensities; leave them at 'unit'")
         if self.mixed is not None and layout.directions:
-            raise InputError(f"layout {self.layout} has one direction per image, mixed light has none; take unips")
+            others = " or ".join(name for name, other in LAYOUTS.items() if not other.directions)
+            raise InputError(f"layout {self.layout} has one direction per image, mixed light has none; take {others}")
         check_fields(self, "at least 1", "images")
         check_fields(self, "not negative", "seed")
 

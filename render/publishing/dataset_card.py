@@ -2,20 +2,21 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from render.checks.folder_checks import CHECKSUMS
 from render.planning import provenance
-from render.planning.plan_counts import PlanCounts
+from render.planning.plan_counts import PlanCounts, count_plan
 from render.publishing import croissant
 from render.publishing.croissant import Description
-from render.records.manifest import MANIFEST, SceneSpec
-from render.records.mirror import shard_path
+from render.records.manifest import MANIFEST, SceneSpec, read_manifest
+from render.records.mirror import select_rendered, shard_path
 from render.records.shards import file_hash
 from render.shared.config import read_yaml, to_yaml
 from render.shared.errors import InputError
-from render.shared.files import atomic_path, read_json
+from render.shared.files import atomic_path, read_json, write_json, write_text
 from render.shared.progress import progress_bar
 from render.shared.templates import fill
 
@@ -32,7 +33,80 @@ _FILES = {
     "validation.json": "result of `sdps data validate`",
     "preview.html": "plots and sample scenes",
 }
+_LISTED = {
+    MANIFEST: "The plan: one line per scene.",
+    CONFIG: "The resolved configuration.",
+    CHECKSUMS: "SHA-256 of every shard, of the manifest and of the configuration.",
+}
 _TEMPLATE = Path(__file__).with_name("dataset_card.md.j2")
+
+
+def write_card(
+    folder: str | Path,
+    name: str = "",
+    license: str = UNKNOWN,
+    url: str = "",
+    creator: str = "",
+    cite: str = "",
+) -> tuple[Path, list[str]]:
+    """Write `checksums.txt`, `croissant.json` and `DATASET_CARD.md` into a data folder.
+
+    Args:
+        folder: Data folder with a manifest; it may be rendered in part.
+        name, license, url, creator, cite: What the maker of the data says; see
+        `render.publishing.croissant.Description`.
+
+    Returns:
+        The folder, and the flags still to be given before the data are published.
+
+    Raises:
+        InputError: not a data folder, nothing rendered in it, or an empty licence.
+    """
+    folder = Path(folder)
+    if not license:
+        raise InputError("--license is empty; give an identifier such as cc-by-4.0, or a URL")
+    scenes = read_manifest(folder)
+    there = select_rendered(folder, scenes)
+    if not there:
+        raise InputError(f"{folder}: no shard is there yet; run `sdps render-data` first")
+    counts = count_plan(scenes)
+    text = Description(
+        name=name or _data_name(folder),
+        about=_describe(counts),
+        license=license,
+        url=url,
+        creator=creator,
+        cite=cite,
+        date=datetime.now(UTC).date().isoformat(),
+    )
+    write_checksums(folder, there)
+    files = {file: about for file, about in _LISTED.items() if (folder / file).is_file()}
+    write_json(folder / croissant.FILE, croissant.describe(folder, text, list(counts.splits), files))
+    write_text(folder / CARD, render_card(folder, scenes, there, counts, text))
+    given = {"--license": license != UNKNOWN, "--url": url, "--creator": creator}
+    return folder, [flag for flag, value in given.items() if not value]
+
+
+def _data_name(folder: Path) -> str:
+    """Name a data set after its preset, or after its folder (the one above, when that is `data`)."""
+    try:
+        name = read_yaml(folder / CONFIG).get("name")
+    except InputError:
+        name = None
+    resolved = folder.resolve()
+    return f"Photometric stereo, {name or (resolved.parent if resolved.name == 'data' else resolved).name}"
+
+
+def _describe(counts: PlanCounts) -> str:
+    """Say in two sentences what the data are."""
+    sizes = ", ".join(counts.sizes)
+    families = ", ".join(counts.families)
+    kind, place = ("lights", "direction or position") if counts.near else ("directional lights", "direction")
+    return (
+        f"{counts.scenes:,} scenes for photometric stereo ({families}), each one object under {kind} "
+        f"of known {place}: {counts.images:,} linear RGB images ({sizes} pixels) with normals and mask. "
+        f"{len(counts.materials):,} materials; {counts.varying:,} scenes vary spatially."
+    )
 
 
 def write_checksums(folder: Path, there: Sequence[SceneSpec]) -> dict[str, str]:
@@ -90,7 +164,7 @@ def render_card(
 
 
 def _front_matter(text: Description, counts: PlanCounts) -> dict[str, Any]:
-    """Return what Hugging Face reads; a licence that is no short identifier is given by name or link."""
+    """Return what Hugging Face reads; a licence that is not a short identifier is given by name or link."""
     licence = {"license": text.license.lower()}
     if text.license.startswith(("http://", "https://")):
         licence = {"license": "other", "license_name": "see-link", "license_link": text.license}

@@ -31,7 +31,7 @@ def combine(lights: str | None, normals: str | None, intensities: str | None, fi
         lights = lights or prefix + pair.lighting
         normals = prefix + pair.normals
     if normals is None:
-        raise InputError("--lights and --intensities need --normals as well; see `sdps models`")
+        raise InputError("--lights and --intensities need --normals as well; see `sdps list models`")
     lights = lights or _default_lights(normals, find)
     if normals in CLASSICAL:
         _check_classical(normals, lights, intensities)

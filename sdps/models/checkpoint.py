@@ -135,7 +135,7 @@ def _read_header(path: str | Path, header: dict[str, str]) -> tuple[str, dict[st
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: damaged header ({error}); copy or train it again") from error
     if name not in registry.MODELS:
-        raise InputError(f"{path}: holds {name!r}, a model this version does not know; see `sdps models`")
+        raise InputError(f"{path}: holds {name!r}, a model this version does not know; see `sdps list models`")
     return name, options, metadata
 
 

@@ -1,4 +1,4 @@
-"""Learning curves of a run, or of several over each other, from their `metrics.jsonl`."""
+"""Learning curves of a run from their `metrics.jsonl`."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from render.shared.errors import InputError, unknown
+from render.shared.errors import InputError
 from render.shared.files import atomic_path, parse_json, read_text
 
 Rows = list[dict[str, float]]
@@ -38,7 +38,7 @@ def read_metrics(path: str | Path) -> Rows:
     """Read a `metrics.jsonl`, one dict per line, each with its `step`; a half-written last line is passed over.
 
     Raises:
-        InputError: missing or empty file, or a line that is no metrics.
+        InputError: missing or empty file, or a line that does not hold metrics.
     """
     rows: Rows = []
     lines = read_text(path).splitlines()
@@ -50,7 +50,7 @@ def read_metrics(path: str | Path) -> Rows:
                 break
             raise InputError(f"{path}: line {number} is not JSON ({error}); train this run again") from error
         if not isinstance(row, dict) or not isinstance(row.get("step"), int):
-            raise InputError(f"{path}: line {number} has no step, so it is no metrics; train this run again")
+            raise InputError(f"{path}: line {number} has no step, so it does not hold metrics; train this run again")
         rows.append({key: value for key, value in row.items() if isinstance(value, int | float)})
     if not rows:
         raise InputError(f"{path}: holds no metrics yet; wait for the first line or train longer")
@@ -79,51 +79,6 @@ def write_curves(metrics_file: str | Path, picture: str | Path) -> None:
             axes = figure.add_subplot(high, columns, number + 1)
             _draw(axes, rows, panel)
             _hours_above(axes, rows, label=number < columns)
-        with atomic_path(picture) as temporary:
-            figure.savefig(temporary)
-
-
-def compare_curves(
-    runs: Mapping[str, str | Path],
-    picture: str | Path,
-    value: str = "val_normal_mae",
-    fits: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
-) -> None:
-    """Draw one metric of several runs over each other, against steps and, where recorded, against hours.
-
-    Args:
-        runs: The `metrics.jsonl` of each run by the name its curve gets.
-        picture: PNG to write, 1,000 pixels wide.
-        value: Name of the metric.
-        fits: Steps and values fitted to some or all runs, by the run's name; drawn dotted, against steps alone, and
-            all axes are then logarithmic.
-
-    Raises:
-        InputError: no runs, a run without metrics, or none that recorded `value`.
-    """
-    if not runs:
-        raise InputError("no runs to compare; name at least one metrics.jsonl")
-    read = {name: read_metrics(path) for name, path in runs.items()}
-    known = {key for rows in read.values() for row in rows for key in row}
-    if value not in known:
-        raise unknown("metric", value, sorted(known - {"step", "seconds"}))
-    kept = {name: rows for name, rows in read.items() if any(value in row for row in rows)}
-    scales = ["step"] if fits or not any(map(_timed, kept.values())) else ["step", "hours"]
-    with rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH, 4.2), dpi=_DPI, layout="constrained")
-        for number, against in enumerate(scales):
-            axes = figure.add_subplot(1, len(scales), number + 1)
-            _draw_runs(axes, kept, value, against)
-            if number == 0:
-                axes.legend(ncols=1 + len(kept) // 10)
-        if fits:
-            for place, name in enumerate(kept):
-                if name in fits:
-                    axes.plot(*fits[name], ls=":", lw=1.3, color=f"C{place % 10}")
-            axes.set(xscale="log", yscale="log")
-            axes.autoscale()
-            axes.yaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_formatter("{x:g}")
         with atomic_path(picture) as temporary:
             figure.savefig(temporary)
 

@@ -11,7 +11,7 @@ from data_folders import good_folder
 from matplotlib.figure import Figure
 from sdps_scenes import sphere_normals
 
-from pipelines.data.data_preview import preview
+from pipelines.data.preview import preview
 from pipelines.evaluate.report.page import render
 from pipelines.evaluate.report.sections import Section, SectionWriter, Tile
 from pipelines.shared.pictures import error_map, normal_map

@@ -12,11 +12,11 @@ import yaml
 from data_folders import good_folder, scene_of, sphere_shard, write_folder
 
 from pipelines.cli import main
-from pipelines.data.data_card import write_card
 from render.planning import provenance
 from render.planning.plan_counts import count_plan
 from render.planning.provenance import ORIGINAL, UNSTATED, material_terms, mesh_terms
 from render.publishing.croissant import CONFORMS_TO
+from render.publishing.dataset_card import write_card
 from render.records.manifest import read_manifest
 
 

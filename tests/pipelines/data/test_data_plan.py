@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from pipelines.cli import main
-from pipelines.data import data_status
+from pipelines.data import status
 from pipelines.rendering import render_data
-from render.planning import budget
+from render.planning import budget, folder_state
 from render.planning.budget import Pace
 from render.planning.plan import DataConfig, plan
 from render.records import ledger
@@ -114,19 +114,19 @@ def test_status_of_an_interrupted_folder(tmp_path):
     stamped(tmp_path, scenes, [10_000, 40], failed=scenes[4:6])
     (tmp_path / scenes[0].file).write_bytes(b"short")
     (tmp_path / "shards" / ".half.1.tmp.exr").write_bytes(b"x")
-    state = data_status.status(tmp_path)
+    state = folder_state.folder_state(tmp_path)
     assert (state["scenes"], state["done"], state["failed"], state["left"], state["damaged"]) == (8, 3, 2, 3, 1)
     assert state["reasons"] == {"timed out after 600 s": 2}
     # 4 scenes in two runs of 20 s each, whatever lies between them
     assert state["overall_per_hour"] == pytest.approx(360, rel=0.05)
     assert state["seconds_left"] == pytest.approx(30, rel=0.05)
     assert state["bytes_used"] == 300 and state["bytes_needed"] == 300
-    assert "3 of 8 scenes done, 2 failed, 3 left" in data_status.render_text(state)
+    assert "3 of 8 scenes done, 2 failed, 3 left" in status.render_text(state)
 
 
 def test_machines_side_by_side_count_once():
-    assert data_status.covered([(0, 10), (5, 12), (20, 21)]) == 13
-    assert data_status.scene_rates([]) == {"recent_per_hour": None, "overall_per_hour": None}
+    assert folder_state.covered([(0, 10), (5, 12), (20, 21)]) == 13
+    assert folder_state.scene_rates([]) == {"recent_per_hour": None, "overall_per_hour": None}
 
 
 def test_status_looks_at_every_scene_a_few_times_however_many_failed(tmp_path, monkeypatch):
@@ -138,11 +138,11 @@ def test_status_looks_at_every_scene_a_few_times_however_many_failed(tmp_path, m
             return super().__iter__()
 
     ids = Counted(f"s{number}" for number in range(300))
-    monkeypatch.setattr(data_status, "scene_ids", lambda folder: ids)
-    monkeypatch.setattr(data_status, "read_failed", lambda folder: {id: [{"reason": "x"}] for id in list(ids)[:200]})
-    monkeypatch.setattr(data_status.budget, "disk_bytes", lambda scenes: 0)
-    monkeypatch.setattr(data_status, "read_manifest", lambda folder: [])
-    assert data_status.status(tmp_path)["failed"] == 200
+    monkeypatch.setattr(folder_state, "scene_ids", lambda folder: ids)
+    monkeypatch.setattr(folder_state, "read_failed", lambda folder: {id: [{"reason": "x"}] for id in list(ids)[:200]})
+    monkeypatch.setattr(folder_state.budget, "disk_bytes", lambda scenes: 0)
+    monkeypatch.setattr(folder_state, "read_manifest", lambda folder: [])
+    assert folder_state.folder_state(tmp_path)["failed"] == 200
     assert Counted.looks < 10
 
 
@@ -152,10 +152,10 @@ def test_status_reads_ids_in_any_form_and_tells_what_is_no_data_folder(capsys, t
     from render.shared.config import to_plain
 
     write_manifest(tmp_path, scenes)
-    assert data_status.scene_ids(tmp_path) == [scene.id for scene in scenes]
+    assert folder_state.scene_ids(tmp_path) == [scene.id for scene in scenes]
     rows = [json.dumps(to_plain(scene), sort_keys=True) for scene in scenes]
     (tmp_path / "manifest.jsonl").write_text("\n".join(rows) + "\n")
-    assert data_status.scene_ids(tmp_path) == [scene.id for scene in scenes] == [s.id for s in read_manifest(tmp_path)]
+    assert folder_state.scene_ids(tmp_path) == [scene.id for scene in scenes] == [s.id for s in read_manifest(tmp_path)]
     assert "sdps data plan" in fails(capsys, "data", "status", str(tmp_path / "none"))
 
 

@@ -11,10 +11,9 @@ from data_folders import MATERIALS, good_folder, scene_of, sphere_shard, write_f
 from PIL import Image
 
 from pipelines.cli import main
-from pipelines.data.data_preview import ON_PAGE, PER_SHEET, preview
-from pipelines.data.preview import preview_plots
-from pipelines.data.preview.preview_page import BUDGET, gallery
-from pipelines.shared import pictures
+from pipelines.data.preview import ON_PAGE, PER_SHEET, preview
+from pipelines.data.preview_page import BUDGET, gallery
+from pipelines.shared import charts, pictures
 from render.planning.plan_counts import category, components, count_plan, family, light_directions
 from render.records.manifest import View
 
@@ -170,16 +169,16 @@ def test_plots_take_the_ink_of_the_page():
     directions = rng.normal(size=(4000, 3))
     directions = np.abs(directions / np.linalg.norm(directions, axis=1, keepdims=True))
     for plot in (
-        preview_plots.light_disc(directions[:50]),
-        preview_plots.light_disc(directions),
-        preview_plots.histogram([0.5], "one value"),
-        preview_plots.histogram([0.0, 0.0], "nothing positive", log=True),
-        preview_plots.bars({f"name {k}": 40 - k for k in range(40)}, "many"),
+        charts.light_disc_svg(directions[:50]),
+        charts.light_disc_svg(directions),
+        charts.histogram([0.5], "one value"),
+        charts.histogram([0.0, 0.0], "nothing positive", log=True),
+        charts.bars({f"name {k}": 40 - k for k in range(40)}, "many"),
     ):
         assert plot.startswith("<svg") and "currentColor" in plot and "#010203" not in plot and "#040506" not in plot
-    assert "<image" in preview_plots.light_disc(directions)
-    assert "<image" not in preview_plots.light_disc(directions[:50])
-    angles = preview_plots.elevations(np.array([[0, 0, 1], [1, 0, 0], [0, 0.5**0.5, 0.5**0.5]]))
+    assert "<image" in charts.light_disc_svg(directions)
+    assert "<image" not in charts.light_disc_svg(directions[:50])
+    angles = charts.elevations(np.array([[0, 0, 1], [1, 0, 0], [0, 0.5**0.5, 0.5**0.5]]))
     np.testing.assert_allclose(angles, [90, 0, 45])
 
 

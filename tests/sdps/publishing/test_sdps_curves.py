@@ -91,21 +91,6 @@ def test_files_that_are_no_metrics_are_refused(tmp_path: Path, text: str | None,
     assert not (tmp_path / "curves.png").exists()
 
 
-def test_runs_are_compared(tmp_path: Path) -> None:
-    runs = {f"run {number}": write_metrics(tmp_path / f"{number}.jsonl", seconds=number != 1) for number in range(3)}
-    learning_curves.compare_curves(runs, tmp_path / "runs.png")
-    with Image.open(tmp_path / "runs.png") as picture:
-        assert picture.size == (1000, 420)
-
-
-def test_comparing_wants_runs_and_a_metric_they_have(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no runs to compare"):
-        learning_curves.compare_curves({}, tmp_path / "runs.png")
-    run = write_metrics(tmp_path / "metrics.jsonl", metric="val_direction_mae")
-    with pytest.raises(InputError, match="did you mean 'val_direction_mae'"):
-        learning_curves.compare_curves({"lcnet": run}, tmp_path / "runs.png", value="val_directions_mae")
-
-
 def test_nothing_global_is_left_behind(tmp_path: Path) -> None:
     before = dict(matplotlib.rcParams)
     path = write_metrics(tmp_path / "metrics.jsonl", 20)

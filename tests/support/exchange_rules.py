@@ -1,4 +1,4 @@
-"""Checks of an exported tree, or of one somebody else made, against what the loaders of its layout demand.
+"""Checks of an exported tree against what the loaders of its layout demand.
 
 The rules are those of docs/reference/formats.md. Reading goes through the strict readers of this package; every
 violation is one line that starts with the file it is in.
@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from exchange_loaders import SAMPLES, Pictures, Samples
 
 from render.exchange import frame
 from render.exchange.folders import MARKER, read_record
 from render.exchange.foreign_samples import Note, noted
 from render.exchange.layouts import LAYOUTS
-from render.exchange.loaders import SAMPLES, Pictures, Samples
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.mirror import shard_path
 from render.records.shards import read_shard

@@ -20,8 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, help="data folder (the one with manifest.jsonl)")
     parser.add_argument("--out", required=True, help="folder or address to write; an interrupted run goes on there")
     parser.add_argument("--tar-mb", type=float, default=128.0, metavar="MB",
-                        help="largest size of a tar (default: %(default)g)")  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="seed of the order of the scenes (default: %(default)s)")
+                        help="largest size of a tar")  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, help="seed of the order of the scenes")
     parser.add_argument("--skip-missing", action="store_true", help="leave out planned scenes that have no shard yet")
     add_cache_argument(parser)
 

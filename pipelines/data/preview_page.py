@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.data.preview import preview_plots as plots
-from pipelines.data.preview.preview_sample import STAGE_COLUMNS, Sample, Stage
-from pipelines.shared import pictures
+from pipelines.data.preview_sample import STAGE_COLUMNS, Sample, Stage
+from pipelines.shared import charts, pictures
 from render.planning.plan_counts import PlanCounts, light_directions
 from render.records.manifest import SceneSpec
 from render.shared.config import read_yaml
@@ -90,18 +89,18 @@ def _plots(directions: np.ndarray, counts: PlanCounts, sample: Sample) -> dict[s
     rows, elevation = sample.statistics, "elevation above the image plane, degrees"
     return {
         "lights": [
-            plots.light_disc(directions),
-            plots.histogram(plots.elevations(directions), elevation, bounds=(0, 90)),
+            charts.light_disc_svg(directions),
+            charts.histogram(charts.elevations(directions), elevation, bounds=(0, 90)),
         ],
         "materials": [
-            plots.bars(counts.categories, "scenes per material category"),
-            plots.bars(counts.materials, "scenes per material"),
-            plots.bars(counts.families, "scenes per shape family"),
+            charts.bars(counts.categories, "scenes per material category"),
+            charts.bars(counts.materials, "scenes per material"),
+            charts.bars(counts.families, "scenes per shape family"),
         ],
         "measured": [
-            plots.histogram([row.area for row in rows], "mask area, share of the frame", bounds=(0, 1)),
-            plots.histogram([row.level for row in rows], "exposure: 95th percentile of radiance", log=True),
-            plots.histogram(np.concatenate(sample.slants), "slant of the normals, degrees", bounds=(0, 90)),
+            charts.histogram([row.area for row in rows], "mask area, share of the frame", bounds=(0, 1)),
+            charts.histogram([row.level for row in rows], "exposure: 95th percentile of radiance", log=True),
+            charts.histogram(np.concatenate(sample.slants), "slant of the normals, degrees", bounds=(0, 90)),
         ],
     }
 

@@ -1,9 +1,6 @@
-"""`sdps data status`: what of a data folder is done, failed and left, and when it will be finished."""
+"""What of a data folder is done, failed and left, at what rate, and when it will be finished."""
 
-import argparse
-import json
 import re
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -13,29 +10,14 @@ from typing import Any
 from render.planning import budget
 from render.records import ledger
 from render.records.manifest import MANIFEST, no_manifest, read_failed, read_manifest
-from render.records.mirror import display_name, mirror_of, open_folder
+from render.records.mirror import display_name, mirror_of
 
 REASONS = 5  # most frequent reasons of failure that are shown
 QUIET = 300.0  # seconds without a finished scene after which a run is taken for stopped
 _ID = re.compile(rb'^\{"id": "([^"\\]*)"', re.MULTILINE)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of `sdps data status`."""
-    parser.add_argument("folder", type=Path, help="data folder, e.g. out/small/data")
-    parser.add_argument("--verify", action="store_true", help="check every shard by its hash")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-
-
-def main(args: argparse.Namespace) -> int:
-    """Print the state of the folder."""
-    with open_folder(args.folder) as folder:
-        state = status(folder, verify=args.verify)
-    sys.stdout.write(json.dumps(state, indent=2) + "\n" if args.json else render_text(state))
-    return 0
-
-
-def status(folder: Path, *, verify: bool = False) -> dict[str, Any]:
+def folder_state(folder: Path, *, verify: bool = False) -> dict[str, Any]:
     """Collect the state of a data folder; plain values, ready for JSON.
 
     Args:
@@ -113,35 +95,9 @@ def scene_rates(runs: Sequence[Sequence[dict[str, Any]]]) -> dict[str, float | N
 
 
 def covered(spans: Sequence[tuple[float, float]]) -> float:
-    """Return the length of the union of intervals: machines that work side by side count once."""
+    """Return the length of the union of intervals: machines that work at the same time count once."""
     total, end = 0.0, float("-inf")
     for first, last in sorted(spans):
         total += max(0.0, last - max(first, end))
         end = max(end, last)
     return total
-
-
-def render_text(state: dict[str, Any]) -> str:
-    """Lay out a state for people."""
-    lines = [
-        f"{state['folder']}: {state['done']:,} of {state['scenes']:,} scenes done, {state['failed']:,} failed, "
-        f"{state['left']:,} left"
-    ]
-    if state["damaged"]:
-        lines[0] += f" ({state['damaged']:,} of them damaged or unfinished on disk)"
-    for reason, count in state["reasons"].items():
-        lines.append(f"failed: {count:,} x {reason}")
-    if state["overall_per_hour"]:
-        lines.append(
-            f"rate: {state['recent_per_hour'] or 0:,.0f} scenes/hour over the last {budget.RECENT}, "
-            f"{state['overall_per_hour']:,.0f} overall; last one {budget.duration(state['seconds_since_last'])} ago"
-        )
-    if state["left"] and state["seconds_left"]:
-        lines.append(f"left: about {budget.duration(state['seconds_left'])} at this rate")
-    free = f", {budget.gigabytes(state['bytes_free'])} free" if state["bytes_free"] is not None else ""
-    place = "disk" if free else "store"
-    lines.append(
-        f"{place}: {budget.gigabytes(state['bytes_used'])} used, about {budget.gigabytes(state['bytes_needed'])} more "
-        f"needed{free}"
-    )
-    return "\n".join(lines) + "\n"

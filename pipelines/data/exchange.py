@@ -1,4 +1,4 @@
-"""`sdps data export` and `sdps data import`: trees that other photometric-stereo code reads, and their checks."""
+"""`sdps data export` and `sdps data import`: trees that other photometric-stereo code reads."""
 
 import argparse
 import sys
@@ -8,56 +8,44 @@ from typing import Literal
 from pipelines.shared.flags import add_cache_argument
 from render.exchange.ingest import READERS, ImportOptions, ingest
 from render.exchange.layouts import LAYOUTS
-from render.exchange.rules import RuleReport, check_tree
 from render.exchange.samples import ExportOptions
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.mirror import open_folder, select_rendered
 from render.shared.errors import InputError
 
-_SHOWN = 20
+UNCHECKED = "--check is gone: what other loaders read is held by tests of the export; leave it out"
 _MARGIN = 15  # pixels; the margin SDPS-Net crops DiLiGenT with
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps data export`."""
     layouts = "; ".join(f"{name}: {layout.about}" for name, layout in LAYOUTS.items())
-    parser.add_argument("folder", help="data folder; with --check and no --out, the tree to check")
+    parser.add_argument("folder", help="data folder (the one with manifest.jsonl)")
     parser.add_argument("--layout", required=True, help=layouts)
-    parser.add_argument("--out", default=None, help="root of the tree; an interrupted export goes on there")
-    parser.add_argument("--bits", type=int, default=None, help="8 or 16 per channel (default: 8 for psfcn and custom, "
-                        "16 for diligent and unips)")  # fmt: skip
+    parser.add_argument("--out", required=True, help="root of the tree; an interrupted export goes on there")
+    parser.add_argument("--bits", type=int, default=None, help=f"8 or 16 per channel (default: {_defaults('bits')})")
     parser.add_argument("--exposure", default=None, help="factor on radiance (1: white facing its light is full scale) "
-                        "or 'auto', per scene (default: 1 for psfcn, auto for the others)")  # fmt: skip
+                        f"or 'auto', per scene (default: {_defaults('exposure')})")  # fmt: skip
     parser.add_argument("--intensities", default="unit", help="'unit', or 'seed': one per image in [0.2, 2), seeded")
     parser.add_argument("--ids", nargs="+", default=[], metavar="ID", help="only these scenes")
     parser.add_argument("--split", default=None, choices=("train", "val", "test"), help="only this split")
-    parser.add_argument("--limit", type=int, default=None, help="only the first so many (of a check: spread evenly)")
+    parser.add_argument("--limit", type=int, default=None, help="only the first so many")
     parser.add_argument("--skip-missing", action="store_true", help="leave out planned scenes that have no shard yet")
-    parser.add_argument("--check", action="store_true", help="check the tree against the rules of its loaders; "
-                        "exit code 1 if it breaks one")  # fmt: skip
+    add_check_argument(parser)
     add_cache_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Export, check, or both."""
+    """Export the scenes, and say what was rounded away and what has no place in the layout."""
+    from render.exchange.export import export, select
+
     options = ExportOptions(
         layout=args.layout, bits=args.bits, exposure=exposure_flag(args.exposure), intensities=args.intensities
     )
-    if args.out is None:
-        if not args.check:
-            raise InputError("--out is missing; give the folder to export to, or --check to check FOLDER itself")
-        return report(check_tree(args.folder, args.layout, limit=args.limit), args.folder)
     with open_folder(args.folder, args.cache_gb) as folder:
-        return _export(args, str(folder), options)
-
-
-def _export(args: argparse.Namespace, folder: str, options: ExportOptions) -> int:
-    """Export scenes of a folder, tell how it went, and check the tree if asked to."""
-    from render.exchange.export import export, select
-
-    scenes = planned(folder, skip_missing=args.skip_missing)
-    chosen = select(scenes, ids=args.ids, split=args.split, limit=args.limit)
-    done = export(folder, args.out, options, chosen)
+        scenes = planned(str(folder), skip_missing=args.skip_missing)
+        chosen = select(scenes, ids=args.ids, split=args.split, limit=args.limit)
+        done = export(folder, args.out, options, chosen)
     sys.stdout.write(
         f"{args.out}: {len(done.scenes)} scenes as {args.layout}, {done.written} written now, {done.kept} kept\n"
     )
@@ -65,9 +53,19 @@ def _export(args: argparse.Namespace, folder: str, options: ExportOptions) -> in
     for field, words in (("clipped", "clipped"), ("black", "lit but rounded to black")):
         mean, most, worst = done.worst(field)
         sys.stdout.write(f"{words}: {mean:.2%} of the object's values on average, at most {most:.2%} ({worst})\n")
-    if args.layout == "psfcn" and not any(scene["split"] == "val" for scene in done.scenes.values()):
-        sys.stdout.write(f"{args.out}: val_mtrl.txt is empty; export scenes of split 'val' too before training on it\n")
-    return report(check_tree(args.out, args.layout, source=folder), args.out) if args.check else 0
+    sys.stdout.write(LAYOUTS[args.layout].advise(args.out, {scene["split"] for scene in done.scenes.values()}))
+    return 0
+
+
+def _defaults(field: str) -> str:
+    """Say what each layout takes where a flag is not given."""
+    values = {name: getattr(layout, field) for name, layout in LAYOUTS.items()}
+    return ", ".join(f"{name} {value[0] if isinstance(value, tuple) else value}" for name, value in values.items())
+
+
+def add_check_argument(parser: argparse.ArgumentParser) -> None:
+    """Accept `--check`: it checked the tree until the loaders' rules became tests of the export."""
+    parser.add_argument("--check", action="store_true", help=argparse.SUPPRESS)
 
 
 def _lost(scenes: Sequence[SceneSpec], layout: str) -> str:
@@ -110,27 +108,13 @@ def exposure_flag(text: str | None) -> float | Literal["auto"] | None:
         raise InputError(f"--exposure {text}: expected a positive number or 'auto'") from error
 
 
-def report(found: RuleReport, tree: str) -> int:
-    """Print what a check found; return 0 when nothing."""
-    for line in found.violations[:_SHOWN]:
-        sys.stdout.write(f"{line}\n")
-    if len(found.violations) > _SHOWN:
-        sys.stdout.write(f"... and {len(found.violations) - _SHOWN} more\n")
-    sys.stdout.write("".join(f"warning: {line}\n" for line in found.warnings))
-    low, high = found.lights
-    lights = f"{low}" if low == high else f"{low} to {high}"
-    verdict = f"{len(found.violations)} violations" if found.violations else "every rule of its loaders holds"
-    sys.stdout.write(f"{tree}: {found.samples} samples of {lights} lights; {verdict}\n")
-    return 1 if found.violations else 0
-
-
 def add_import_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps data import`."""
     parser.add_argument("tree", help="root of the tree to import")
     parser.add_argument("--layout", required=True, help=f"{' or '.join(READERS)}")
     parser.add_argument("--out", required=True, help="data folder to write; an interrupted import goes on there")
     parser.add_argument("--split", default=None, choices=("train", "val", "test"),
-                        help="split of all scenes (default: psfcn by its lists, diligent 'test')")  # fmt: skip
+                        help="split of all scenes (default: that of the tree's lists, else test)")  # fmt: skip
     parser.add_argument("--crop", type=int, nargs="?", const=_MARGIN, default=None, metavar="MARGIN",
                         help="crop to the mask's bounding box and a margin in pixels (15 if none is given), sides "
                         "rounded up to multiples of 4")  # fmt: skip
@@ -139,13 +123,13 @@ def add_import_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def import_main(args: argparse.Namespace) -> int:
-    """Import, and tell what looks flipped."""
+    """Import, and say what looks flipped."""
     options = ImportOptions(layout=args.layout, split=args.split, crop=args.crop, y_down=args.y_down, limit=args.limit)
-    report = ingest(args.tree, args.out, options)
+    found = ingest(args.tree, args.out, options)
     sys.stdout.write(
-        f"{args.out}: {len(report.scenes)} scenes from {args.layout}, {report.written} written now, {report.kept} "
+        f"{args.out}: {len(found.scenes)} scenes from {args.layout}, {found.written} written now, {found.kept} "
         "kept; depth is unknown (zeros)\n"
     )
-    for name, found in report.suspicions.items():
-        sys.stdout.write(f"{name}: {'; '.join(found)}; if y points down in the source, import it with --y-down\n")
+    for name, faults in found.suspicions.items():
+        sys.stdout.write(f"{name}: {'; '.join(faults)}; if y points down in the source, import it with --y-down\n")
     return 0

@@ -67,8 +67,8 @@ def stock(folders: list[Path], kind: str = "scalar_rgb", seeds: int = REPEATS) -
     if kind.startswith("llvm"):
         library = variant.choose().llvm
         environment["DRJIT_LIBLLVM_PATH"] = str(library)
-        folders = {str(path.parent) for path in variant.load_companions(library)}
-        environment |= {"LD_LIBRARY_PATH": ":".join(folders)} if folders else {}
+        libraries = {str(path.parent) for path in variant.load_companions(library)}
+        environment |= {"LD_LIBRARY_PATH": ":".join(libraries)} if libraries else {}
     command = [sys.executable, "-c", STOCK, kind, str(seeds), *map(str, folders)]
     subprocess.run(command, env=environment, cwd=folders[0], check=True, capture_output=True, timeout=600)
     return [np.load(folder / "images.npy") for folder in folders]

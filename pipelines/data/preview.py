@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.data.preview import preview_page
-from pipelines.data.preview.preview_sample import Sample, caption, read_sample
+from pipelines.data import preview_page
+from pipelines.data.preview_sample import Sample, caption, read_sample
 from pipelines.shared import pictures
 from pipelines.shared.flags import add_cache_argument
 from render.planning.plan_counts import count_plan
@@ -39,7 +39,7 @@ def main(args: argparse.Namespace) -> int:
 def preview(folder: str | Path, count: int = PER_SHEET) -> list[Path]:
     """Write `preview.png` (or `preview-000.png`, ... for more than 24 scenes) and `preview.html` into the folder.
 
-    Scenes that are not rendered yet, and shards that cannot be read, are left out and told on the page.
+    Scenes that are not rendered yet, and shards that cannot be read, are left out and named on the page.
 
     Args:
         folder: Data folder with a manifest.
