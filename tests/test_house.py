@@ -32,7 +32,7 @@ FOLDERS = [
         "shared", "shared.cluster", "rendering", "data.preview", "data", "train", "report", "evaluate",
         "benchmarks",
     )),
-    "pipelines", "pipelines.app.work", "pipelines.app.rooms", "pipelines.app",
+    "pipelines", "pipelines.app.common", "pipelines.app.pages", "pipelines.app",
     "lab.shared", "lab.bench", "lab.figures", "lab.studies", "lab.releases", "lab",
 ]  # fmt: skip
 RANK = {folder: place for place, folder in enumerate(FOLDERS)}

@@ -3,9 +3,9 @@
     python -m lab.studies.reflectance_modes
 
 Spheres of the fitted MERL materials that networks are trained on (the held-out ones are left out), under 100 lights;
-normals and lights are known. What `sdps.refinement.image_model` has of reflectance is fitted to each sphere. What is
-left, as logarithms, is explained by least squares with the terms of `sdps.refinement.modes`. Written: the mean product
-of their coefficients over the materials, without the tenth of materials with the largest ones.
+normals and lights are known. The reflectance of refinement without its modes is fitted to each sphere. What is left,
+as logarithms, is explained by least squares with `mode_terms` of `sdps.refinement.reflectance`. Written: the mean
+product of their coefficients over the materials, without the tenth of materials with the largest ones.
 """
 
 import argparse
@@ -23,10 +23,11 @@ from render.materials.library import held_out, load, names
 from render.materials.model import Material, evaluate
 from render.shared.files import atomic_path
 from sdps.refinement.descent import Problem, Weights, solve
-from sdps.refinement.image_model import State, factors
-from sdps.refinement.modes import ASSET, MODES, left_over, terms
-from sdps.refinement.problems import problem_of
-from sdps.refinement.refine import start_of
+from sdps.refinement.image_model import State, build_model
+from sdps.refinement.modes import ASSET, compare_logs
+from sdps.refinement.problems import build_problem
+from sdps.refinement.refine import build_start
+from sdps.refinement.reflectance import MODES, measure_angles, mode_terms
 
 _SIDE, _LIGHTS, _ITERATIONS = 42, 100, 300
 _KEPT = 0.9  # share of the materials
@@ -57,13 +58,14 @@ def coefficients(material: Material, lights: np.ndarray) -> np.ndarray:  # (MODE
     for number, light in enumerate(lights):
         wi, wo = shading_frame(normals, light)
         images[:, :, number] = np.pi * evaluate(material, wi, wo) * np.maximum(wi[:, 2:], 0.0)
-    problem: Problem = problem_of(images, mask, 1, np.ones((len(lights), 3)), np.full((3, len(lights)), np.inf))
-    state: State = start_of(problem, normals, lights, np.ones((len(lights), 3)))
+    problem: Problem = build_problem(images, mask, 1, np.ones((len(lights), 3)), np.full((3, len(lights)), np.inf))
+    state: State = build_start(problem, normals, lights, np.ones((len(lights), 3)))
     free = frozenset({"log_albedo", "log_strength", "body", "lobes", "log_sharpness"})
     state = solve(problem, state, free=free, iterations=_ITERATIONS, boost=4.0, weights=Weights())
-    left, weights = left_over(factors(state), problem.images, problem.kept)
-    shapes = terms(*(torch.from_numpy(part.astype(np.float32)) for part in (normals, lights)))
-    shapes = torch.cat([torch.ones_like(shapes[..., :1]), shapes], dim=-1).flatten(0, 1).double()  # (P L, 1 + MODES)
+    left, weights = compare_logs(build_model(state), problem.images, problem.usable)
+    angles = measure_angles(*(torch.from_numpy(part.astype(np.float32)) for part in (normals, lights)))
+    shapes = torch.stack([torch.ones_like(left), *mode_terms(angles)], dim=-1)
+    shapes = shapes.flatten(0, 1).double()  # (P L, 1 + MODES)
     root = weights.flatten().double().sqrt()[:, None]
     least = 1e-4 * torch.eye(1 + MODES, dtype=torch.float64) / weights.numel()
     scaled = shapes * root

@@ -8,7 +8,7 @@ import threading
 import webbrowser
 from pathlib import Path
 
-from pipelines.app.work.uploads import Limits
+from pipelines.app.common.uploads import Limits
 from render.shared.errors import InputError
 
 _NEEDED = ("starlette", "uvicorn")
@@ -37,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(f"{' and '.join(missing)} missing: pip install sdps[app]")
-    limits = _limits(args)
+    limits = _read_limits(args)
     import uvicorn
 
     from pipelines.app.server import build
@@ -66,7 +66,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _limits(args: argparse.Namespace) -> Limits:
+def _read_limits(args: argparse.Namespace) -> Limits:
     for name in ("max_files", "max_megabytes", "max_megapixels"):
         if not getattr(args, name) > 0:
             raise InputError(f"--{name.replace('_', '-')}: must be above 0, got {getattr(args, name)}")

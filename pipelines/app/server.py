@@ -17,12 +17,12 @@ from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Re
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from pipelines.app.rooms import data_routes, photo_routes, studio_routes
-from pipelines.app.rooms.handling import number
-from pipelines.app.work.jobs import Jobs
-from pipelines.app.work.refusals import Refused
-from pipelines.app.work.sessions import COOKIE, Sessions
-from pipelines.app.work.uploads import BESIDE, PICTURES, Limits, kinds
+from pipelines.app.common.jobs import Jobs
+from pipelines.app.common.refusals import Refused
+from pipelines.app.common.sessions import COOKIE, Sessions
+from pipelines.app.common.uploads import BESIDE, PICTURES, Limits, list_kinds
+from pipelines.app.pages import data_routes, photo_routes, studio_routes
+from pipelines.app.pages.handling import read_number
 from render.shared.errors import InputError
 from render.shared.templates import fill
 
@@ -54,7 +54,7 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        tidy = asyncio.create_task(_tidy(sessions, jobs))
+        tidy = asyncio.create_task(_clean_up(sessions, jobs))
         yield
         tidy.cancel()
 
@@ -71,9 +71,9 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
     app = Starlette(
         routes=routes,
         middleware=[
-            Middleware(BaseHTTPMiddleware, dispatch=_guard(host)),
+            Middleware(BaseHTTPMiddleware, dispatch=_make_guard(host)),
         ],
-        exception_handlers={InputError: _told, ClientDisconnect: _left},
+        exception_handlers={InputError: _answer_refusal, ClientDisconnect: _end_request},
         lifespan=lifespan,
     )
     app.state.reading = asyncio.Semaphore(2)  # scenes at a time
@@ -87,14 +87,14 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
     return app
 
 
-async def _tidy(sessions: Sessions, jobs: Jobs) -> None:
+async def _clean_up(sessions: Sessions, jobs: Jobs) -> None:
     """Remove sessions that nobody uses any more. Their jobs end first, or would write into folders that are gone."""
     while True:
         await asyncio.sleep(_TIDY)
         await asyncio.to_thread(sessions.expire, ended=jobs.forget)
 
 
-def _guard(host: str) -> Callable[[Request, Callable[[Request], Awaitable[Response]]], Awaitable[Response]]:
+def _make_guard(host: str) -> Callable[[Request, Callable[[Request], Awaitable[Response]]], Awaitable[Response]]:
     """Return what refuses foreign requests, finds the session, and sets the headers of every answer."""
     known = {host, "127.0.0.1", "localhost", "[::1]"}
 
@@ -131,30 +131,30 @@ async def _page(request: Request) -> Response:
     accepted = ",".join((*PICTURES, *BESIDE, ".zip"))
     template = HERE / "templates" / f"{room}.html.j2"
     return HTMLResponse(
-        fill(template, rooms=ROOMS, room=room, limits=limits, accepted=accepted, kinds=kinds()),
+        fill(template, rooms=ROOMS, room=room, limits=limits, accepted=accepted, kinds=list_kinds()),
     )  # fmt: skip
 
 
 async def _job(request: Request) -> Response:
     jobs: Jobs = request.app.state.jobs
-    job = jobs.get(request.state.session.token, number(request, "number"))
+    job = jobs.get(request.state.session.token, read_number(request, "number"))
     return JSONResponse({"message": "no such job"}, 404) if job is None else JSONResponse(jobs.describe(job))
 
 
 async def _cancel(request: Request) -> Response:
     jobs: Jobs = request.app.state.jobs
-    job = jobs.get(request.state.session.token, number(request, "number"))
+    job = jobs.get(request.state.session.token, read_number(request, "number"))
     if job is None:
         return JSONResponse({"message": "no such job"}, 404)
     jobs.cancel(job)
     return JSONResponse(jobs.describe(job))
 
 
-async def _told(_: Request, error: Exception) -> Response:
+async def _answer_refusal(_: Request, error: Exception) -> Response:
     """Answer a mistake of the user, or what the server refuses, with its one line."""
     return JSONResponse({"message": str(error)}, error.status if isinstance(error, Refused) else 400)
 
 
-async def _left(_: Request, error: Exception) -> Response:
+async def _end_request(_: Request, error: Exception) -> Response:
     """End the request of somebody who went away in the middle of it; nobody reads the answer."""
     return Response(status_code=400)

@@ -1,6 +1,6 @@
-"""The data term and its gradient, fused: one pass over pixels and images, compiled by numba.
+"""The data term and its gradient in one pass over pixels and images, compiled by numba.
 
-`sdps.refinement.image_model.difference` is the same term written down plainly in torch; the tests hold both together.
+The tests compare it with `image_model.difference`, which takes the reflectance from `reflectance`.
 """
 
 import os
@@ -15,21 +15,19 @@ from torch import Tensor
 
 from sdps.refinement.image_model import (
     DATA_FLOOR,
-    LEAST_COSINE,
-    LOBES,
     ROBUST,
     SHADE_FLOOR,
     SHADOW_EXCESS,
     SHADOW_WEIGHT,
-    SHAPES,
-    Factors,
+    Model,
 )  # fmt: skip
+from sdps.refinement.reflectance import LEAST_COSINE, LOBES, SHAPES
 
-# Threads that wait shall sleep: spinning, two of them took up to thirty times as long beside other busy processes.
+# Waiting threads must sleep: if they spin, two of them take up to thirty times as long next to busy processes.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 BLOCKS = 64
-"""Parts the pixels are cut into. Sums are taken part by part, so results do not depend on the number of threads."""
+"""Parts of the pixels. Sums are taken part by part, so results do not depend on the number of threads."""
 _FLOOR, _ROBUST, _SHADE = np.float32(DATA_FLOOR), np.float32(ROBUST), np.float32(SHADE_FLOOR)
 _EXCESS, _WEIGHT = np.float32(SHADOW_EXCESS), np.float32(SHADOW_WEIGHT)
 _LEAST = np.float32(LEAST_COSINE)
@@ -105,7 +103,7 @@ def _matte(n: Any, body: np.ndarray, lights: np.ndarray, matte: np.ndarray) -> N
 def _matte_gradient(
     n: Any, body: np.ndarray, lights: np.ndarray, change: np.ndarray, own: np.ndarray, shape: np.ndarray
 ) -> tuple[Any, Any, Any]:
-    """Add what relative changes of D (L,) are worth to the gradients of lights and body; return the normal's."""
+    """Add the share of D in the gradients of lights and body, given relative changes of D (L,); return the normal's."""
     first, second, third, last = body[0], body[1], body[2], body[3]
     view, steep = max(n[2], _LEAST), _ONE if n[2] > _LEAST else _ZERO
     gx = gy = gz = b0 = b1 = b2 = b3 = _ZERO
@@ -140,12 +138,12 @@ def _matte_gradient(
 def _pass(
     normals: np.ndarray, albedo: np.ndarray, strength: np.ndarray, body: np.ndarray, amplitudes: np.ndarray,
     sharpness: np.ndarray, lights: np.ndarray, half: np.ndarray, shares: np.ndarray, images: np.ndarray,
-    kept: np.ndarray, total: np.ndarray, pixel: np.ndarray, light: np.ndarray, lobe: np.ndarray, shape: np.ndarray,
+    usable: np.ndarray, total: np.ndarray, pixel: np.ndarray, light: np.ndarray, lobe: np.ndarray, shape: np.ndarray,
 ) -> None:  # fmt: skip
     """Add up the term and its gradients.
 
     Args: normals (P, 3), albedo (P, 3), strength (P,), body (4,), amplitudes (K,), sharpness (K,), lights (3, L),
-    half (3, L), shares (3, L) reciprocal intensities, images (P, 3, L), kept (P, L) 0 or 1. Written: total (B,),
+    half (3, L), shares (3, L) reciprocal intensities, images (P, 3, L), usable (P, L) 0 or 1. Written: total (B,),
     pixel (P, 7) for normals, albedo and strength, light (B, 9, L) for directions, half vectors and log intensities,
     lobe (B, 2, K), shape (B, 4).
     """
@@ -180,9 +178,9 @@ def _pass(
                 a0, a1, a2 = _ONE / (s0 * s0 + _FLOOR), _ONE / (s1 * s1 + _FLOOR), _ONE / (s2 * s2 + _FLOOR)
                 e0, e1, e2 = (np.sqrt(d0 * d0 * a0 + _ROBUST), np.sqrt(d1 * d1 * a1 + _ROBUST),
                               np.sqrt(d2 * d2 * a2 + _ROBUST))  # fmt: skip
-                w0 = kept[p, i] * (_WEIGHT if d0 > _EXCESS * s0 else _ONE)
-                w1 = kept[p, i] * (_WEIGHT if d1 > _EXCESS * s1 else _ONE)
-                w2 = kept[p, i] * (_WEIGHT if d2 > _EXCESS * s2 else _ONE)
+                w0 = usable[p, i] * (_WEIGHT if d0 > _EXCESS * s0 else _ONE)
+                w1 = usable[p, i] * (_WEIGHT if d1 > _EXCESS * s1 else _ONE)
+                w2 = usable[p, i] * (_WEIGHT if d2 > _EXCESS * s2 else _ONE)
                 term += w0 * e0 + w1 * e1 + w2 * e2
                 q0, q1, q2 = w0 * d0 * a0 / e0, w1 * d1 * a1 / e1, w2 * d2 * a2 / e2
                 g0 += q0 * shade * value
@@ -225,7 +223,7 @@ class _DataTerm(torch.autograd.Function):
     """The mean of the robust differences, and its gradient found on the way."""
 
     @staticmethod
-    def forward(context: Any, images: Tensor, kept: Tensor, *parts: Tensor) -> Tensor:
+    def forward(context: Any, images: Tensor, usable: Tensor, *parts: Tensor) -> Tensor:
         arrays = (part.detach().numpy() for part in parts)
         normals, albedo, strength, body, amplitudes, sharpness, directions, half, logs = arrays
         count, lamps = images.shape[0], images.shape[2]
@@ -234,7 +232,7 @@ class _DataTerm(torch.autograd.Function):
         shape = np.zeros((BLOCKS, SHAPES), np.float32)
         _pass(
             normals, albedo, strength, body, amplitudes, sharpness, np.ascontiguousarray(directions.T),
-            np.ascontiguousarray(half.T), np.ascontiguousarray(np.exp(-logs.T)), images.numpy(), kept.numpy(), total,
+            np.ascontiguousarray(half.T), np.ascontiguousarray(np.exp(-logs.T)), images.numpy(), usable.numpy(), total,
             pixel, light, lobe, shape,
         )  # fmt: skip
         scale = 1.0 / images.numel()
@@ -252,12 +250,12 @@ class _DataTerm(torch.autograd.Function):
         return (None, None, *(part * incoming.float() for part in context.saved_tensors))
 
 
-def data_term(made: Factors, images: Tensor, kept: Tensor) -> Tensor:
+def data_term(model: Model, images: Tensor, usable: Tensor) -> Tensor:
     """Return the mean of r (`sdps.refinement.image_model`) over pixels, channels and images; differentiable.
 
     Args:
-        made: The model; float32 on the CPU.
+        model: The model; float32 on the CPU.
         images: (P, 3, L) float32, I / G, contiguous.
-        kept: (P, L) float32, 0 where an observation counts for nothing, else 1.
+        usable: (P, L) float32, 0 where an observation is ignored, else 1.
     """
-    return _DataTerm.apply(images, kept, *(part.contiguous() for part in made))
+    return _DataTerm.apply(images, usable, *(part.contiguous() for part in model))

@@ -1,20 +1,16 @@
-"""The image-formation model: a coloured body with white highlights, directional lights, robust differences.
+"""The image-formation model: an object's reflectance (`reflectance`), directional lights, robust differences.
 
-Pixel p, image i, channel c; n unit normal, l unit direction to the light, v = (0, 0, 1), h = (l + v) / |l + v|:
+Pixel p, image i, channel c; f without G is rho D + S of `reflectance`:
 
     q_pic = (rho_pc D_pi + S_pi) max(n_p . l_i, 0)                                      predicted radiance
-    D_pi  = exp(b_1 (x + y) + b_2 x y + b_3 (x^2 + y^2) + b_4 o)                        body; 1 is Lambertian
-    x, y  = 1 - n . l, 1 - n . v                                                        at grazing angles
-    o     = (l . v - n . l n . v) / (max(n . l, n . v) if positive, else 1)             towards the light, and away
-    S_pi  = s_p sum_k a_k exp(kappa_k (n_p . h_i - 1)) / (l_i . h_i)^2                  spherical Gaussians
     y_pic = I_pic / (e_ic G_pi)                                                         radiance under equal lights
     r_pic = w_pic sqrt((q_pic - y_pic)^2 / (sigma_pic^2 + 0.05) + 1e-4)                 robust difference
     sigma_pic = (rho_pc D_pi + S_pi) max(n_p . l_i, 0.05)                               constant in the gradient
 
-with I divided by its mean over the object, after light that other parts of it throw there is taken off, and e by its
-own mean. G is what reflectance of real materials adds (`modes`), constant in the gradient; functions here take I / G.
-w is 0 where a pixel is black although it is lit elsewhere (`shadowed`) or a cast shadow was traced (`transport`), 0.15
-where it is darker than the model explains by half of sigma (perhaps another shadow), else 1.
+with I divided by its mean over the object, after light that bounced off other parts of it is subtracted, and e by its
+own mean. G is constant in the gradient; functions here take I / G. w is 0 where a pixel is black although it is lit
+elsewhere (`find_shadows`) or a cast shadow was traced (`transport`), 0.15 where it is darker than the model explains
+by half of sigma (perhaps another shadow), else 1.
 """
 
 from typing import NamedTuple
@@ -24,12 +20,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize, softplus
 
-LOBES = 8
-SHAPES = 4
-"""Numbers b that say how the body's reflectance depends on the angles. o is the term of Oren and Nayar (1994) as
-Fujii writes it: cos(azimuth between l and v) sin sin / max(cos, cos)."""
-LEAST_COSINE = 0.02
-"""Cosines in D are held above it."""
+from sdps.refinement.reflectance import half_vectors, measure_angles, reflect
+
 DATA_FLOOR = 0.05
 """Added to the squared scale of a difference, so that dark pixels do not outweigh bright ones."""
 ROBUST = 1e-4
@@ -46,12 +38,12 @@ class State(NamedTuple):
         log_albedo: (P, 3) logarithm of rho.
         log_strength: (P,) logarithm of s.
         body: (4,) b.
-        lobes: (K,) a_k before softplus.
+        lobes: (K,) a before softplus.
         log_sharpness: (K,) logarithm of kappa.
         directions: (L, 3) from the surface to the light, towards unit length.
         log_intensities: (L, 3).
-        whiteness: () albedo of the brightest parts, which tells how much light they throw on others.
-        modes: (M,) m of `sdps.refinement.modes`.
+        whiteness: () albedo of the brightest parts, which decides how much light bounces.
+        modes: (M,) m of `sdps.refinement.reflectance`.
     """
 
     normals: Tensor
@@ -66,8 +58,8 @@ class State(NamedTuple):
     modes: Tensor
 
 
-class Factors(NamedTuple):
-    """The state as the model multiplies it.
+class Model(NamedTuple):
+    """The state as the equations use it.
 
     Attributes:
         normals: (P, 3) unit.
@@ -92,11 +84,11 @@ class Factors(NamedTuple):
     log_intensities: Tensor
 
 
-def factors(state: State) -> Factors:
-    """Return what the model multiplies; differentiable."""
+def build_model(state: State) -> Model:
+    """Return the state as the equations use it; differentiable."""
     normals, directions = normalize(state.normals, dim=-1), normalize(state.directions, dim=-1)
     logs = state.log_intensities
-    return Factors(
+    return Model(
         normals=normals,
         albedo=state.log_albedo.exp(),
         strength=state.log_strength.exp(),
@@ -104,12 +96,12 @@ def factors(state: State) -> Factors:
         amplitudes=softplus(state.lobes),
         sharpness=state.log_sharpness.exp(),
         directions=directions,
-        half=normalize(directions + directions.new_tensor([0.0, 0.0, 1.0]), dim=-1),
+        half=half_vectors(directions),
         log_intensities=logs - logs.logsumexp((0, 1)) + np.log(logs.numel()),
     )
 
 
-def shadowed(radiance: Tensor) -> Tensor:  # (P, L) bool
+def find_shadows(radiance: Tensor) -> Tensor:  # (P, L) bool
     """Return where a pixel is black: below a tenth of the mean of its darkest 90 % of images.
 
     Args:
@@ -121,42 +113,24 @@ def shadowed(radiance: Tensor) -> Tensor:  # (P, L) bool
     return grey < _BLACK * darker
 
 
-def difference(made: Factors, images: Tensor, dark: Tensor) -> Tensor:  # (P, 3, L)
-    """Return r of the module's text, plainly: the reference of `fused.data_term`, by autograd.
+def measure_differences(model: Model, images: Tensor, dark: Tensor) -> Tensor:  # (P, 3, L)
+    """Return r of the module's text, whose mean is `fused.data_term`; differentiable.
 
     Args:
-        made: The model.
+        model: The model.
         images: (P, 3, L), I / G.
-        dark: (P, L) bool, observations that count for nothing.
+        dark: (P, L) bool, observations that are ignored.
     """
-    cosine = made.normals @ made.directions.T  # (P, L)
-    reflected = reflectance(made)
-    observed = images / made.log_intensities.exp().T  # (P, 3, L)
+    cosine = model.normals @ model.directions.T  # (P, L)
+    reflected = reflect_without_modes(model)
+    observed = images / model.log_intensities.exp().T  # (P, 3, L)
     sigma = (reflected * cosine.clamp_min(SHADE_FLOOR)[:, None]).detach()
     gap = reflected * cosine.clamp_min(0.0)[:, None] - observed
     weight = torch.where(gap > SHADOW_EXCESS * sigma, SHADOW_WEIGHT, 1.0) * ~dark[:, None]
     return weight * (gap**2 / (sigma**2 + DATA_FLOOR) + ROBUST).sqrt()
 
 
-def reflectance(made: Factors) -> Tensor:  # (P, 3, L)
-    """Return rho D + S of the module's text."""
-    lag = (made.normals @ made.half.T - 1.0).clamp_max(0.0)
-    lobes = (made.amplitudes[:, None, None] * (made.sharpness[:, None, None] * lag).exp()).sum(dim=0)
-    # The denominator of a microfacet highlight, 4 n.l n.v, is 4 (l.h)^2 where n = h; and 2 (l.h)^2 = 1 + l.v.
-    specular = made.strength[:, None] * lobes * (2.0 / (1.0 + made.directions[:, 2]))  # (P, L)
-    return made.albedo[..., None] * body(made)[:, None] + specular[:, None]
-
-
-def body(made: Factors) -> Tensor:  # (P, L)
-    """Return D of the module's text."""
-    x, y, o = grazing(made.normals, made.directions)
-    shapes = torch.stack([x + y, x * y, x**2 + y**2, o])  # (4, P, L)
-    return torch.tensordot(made.body, shapes, 1).exp()
-
-
-def grazing(normals: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return x, y and o of the module's text; (P, L), (P, 1) and (P, L)."""
-    light = (normals @ directions.T).clamp_min(LEAST_COSINE)
-    view = normals[:, 2:].clamp_min(LEAST_COSINE)
-    across = directions[:, 2] - light * view
-    return 1.0 - light, 1.0 - view, across / torch.where(across > 0.0, torch.maximum(light, view), 1.0)
+def reflect_without_modes(model: Model) -> Tensor:  # (P, 3, L)
+    """Return rho D + S."""
+    angles = measure_angles(model.normals, model.directions)
+    return reflect(angles, model.albedo, model.strength, model.body, model.amplitudes, model.sharpness)

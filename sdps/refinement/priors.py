@@ -1,4 +1,4 @@
-"""What is known of normals, highlights and lights before any photograph: smoothness, integrability, spread."""
+"""Priors: normals and highlights are smooth, normals are those of a surface, lights stay near the start as a whole."""
 
 from typing import NamedTuple
 
@@ -8,14 +8,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 _STEEPEST = 0.1
-"""Least n_z that slopes are taken with."""
+"""Least n_z when slopes are computed."""
 _ROUND = 1e-6
 _STRETCH_FREE, _SHIFT_FREE = 0.1, 0.02
-"""What the lights as a whole may stretch (logarithm) and shift for nothing."""
+"""What the lights as a whole may stretch (logarithm) and shift without a penalty."""
 
 
 class Neighbours(NamedTuple):
-    """Which pixels of a mask lie beside each other.
+    """Which pixels of a mask lie next to each other.
 
     Attributes:
         pairs: (E, 2) pixels with a common side.
@@ -26,7 +26,7 @@ class Neighbours(NamedTuple):
     cells: Tensor
 
 
-def neighbours(mask: np.ndarray) -> Neighbours:
+def find_neighbours(mask: np.ndarray) -> Neighbours:
     """Return the neighbours among the true pixels of a mask (H, W), numbered row by row."""
     number = np.full(mask.shape, -1, np.int64)
     number[mask] = np.arange(mask.sum())
@@ -37,34 +37,34 @@ def neighbours(mask: np.ndarray) -> Neighbours:
     return Neighbours(*(torch.from_numpy(part[(part >= 0).all(axis=1)]) for part in (pairs, squares)))
 
 
-def roughness(values: Tensor, beside: Neighbours) -> Tensor:
+def measure_roughness(values: Tensor, near: Neighbours) -> Tensor:
     """Return the mean length of the difference between neighbours, of normals (P, 3) or numbers (P,)."""
-    if not len(beside.pairs):
+    if not len(near.pairs):
         return values.new_zeros(())
-    gap = values[beside.pairs[:, 0]] - values[beside.pairs[:, 1]]  # (E, ...)
+    gap = values[near.pairs[:, 0]] - values[near.pairs[:, 1]]  # (E, ...)
     return (gap**2).reshape(len(gap), -1).sum(dim=1).add(_ROUND).sqrt().mean()
 
 
-def curl(normals: Tensor, beside: Neighbours) -> Tensor:
+def measure_curl(normals: Tensor, near: Neighbours) -> Tensor:
     """Return how far normals are from being those of a surface: the mean of |curl of the slopes| n_z^2 over cells.
 
     Args:
         normals: (P, 3) unit.
-        beside: Neighbours among the pixels.
+        near: Neighbours among the pixels.
     """
-    if not len(beside.cells):
+    if not len(near.cells):
         return normals.new_zeros(())
     depth = normals[:, 2].clamp_min(_STEEPEST)
     slopes = -normals[:, :2] / depth[:, None]  # dz/dx, dz/dy
-    above_left, above_right, below_left, below_right = slopes[beside.cells].unbind(dim=1)
+    above_left, above_right, below_left, below_right = slopes[near.cells].unbind(dim=1)
     # Rows run down and y runs up.
     along_y = (above_left + above_right - below_left - below_right)[:, 0] / 2
     along_x = (above_right + below_right - above_left - below_left)[:, 1] / 2
-    least = depth[beside.cells].amin(dim=1)
+    least = depth[near.cells].amin(dim=1)
     return (((along_y - along_x) * least**2) ** 2 + _ROUND).sqrt().mean()
 
 
-def anchor(directions: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+def measure_drift(directions: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
     """Return how far the lights (L, 3) as a whole have left the start: their spread, and where they point on average.
 
     Bas-relief transforms stretch and shift all lights alike, and photographs of a matte object hardly resist them.

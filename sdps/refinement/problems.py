@@ -1,4 +1,4 @@
-"""The pixels that are refined: gathered from the images, divided by their mean, and which of them count."""
+"""The pixels that are refined: read from the images, divided by their mean, without unusable observations."""
 
 import tempfile
 
@@ -9,48 +9,48 @@ from torch import Tensor
 from render.shared.errors import InputError
 from sdps.inference.image_source import ObjectImages
 from sdps.refinement.descent import Problem
-from sdps.refinement.image_model import State, factors, shadowed
+from sdps.refinement.image_model import State, build_model, find_shadows
 
 _LIT_SHARE = 0.1
 _LEAST_ALBEDO = 1e-3
 _PART = 4096  # pixels worked on at once where arrays of all images are made
 CACHE_BYTES = 2**30
-"""Pixels gathered from the images are kept in memory up to so much, beyond it in a file of the temporary folder."""
+"""Pixels are kept in memory up to this size; above it, in a temporary file."""
 
 
-def gathered(scene: ObjectImages, which: np.ndarray) -> np.ndarray:  # (P, 3, L) float32
+def gather_pixels(scene: ObjectImages, which: np.ndarray) -> np.ndarray:  # (P, 3, L) float32
     """Read the pixels of a mask (h, w), image by image."""
-    values = room_for((int(which.sum()), 3, len(scene)))
+    values = allocate((int(which.sum()), 3, len(scene)))
     for number in range(len(scene)):
         values[:, :, number] = scene.read(number, number + 1)[0][which]
     return values
 
 
-def on_grid(mask: np.ndarray, stride: int) -> np.ndarray:
+def select_grid(mask: np.ndarray, stride: int) -> np.ndarray:
     """Return which pixels of a mask (h, w) are on the grid of every `stride`-th row and column."""
     grid = np.zeros_like(mask)
     grid[::stride, ::stride] = mask[::stride, ::stride]
     return grid
 
 
-def problem_of(
+def build_problem(
     values: np.ndarray, mask: np.ndarray, stride: int, intensities: np.ndarray, full: np.ndarray,
     mean: float | None = None,
 ) -> Problem:  # fmt: skip
-    """Return the grid of every `stride`-th pixel; at 1 the pixels `values` are divided in place, not copied.
+    """Return the grid of every `stride`-th pixel; at stride 1, `values` are divided in place, not copied.
 
     Args:
-        values: (P, 3, L) radiance of the object's pixels; at a stride, of all of them or of the grid's alone.
+        values: (P, 3, L) radiance of all the object's pixels, or of the grid's alone.
         mask: (H, W) bool.
         stride: Of the grid.
         intensities: (L, 3) or (L, 1).
-        full: (3, L), from where on a channel is clipped.
-        mean: What the values are divided by; their own if not given.
+        full: (3, L), radiance at which a channel is clipped.
+        mean: What the values are divided by; by default their own mean.
 
     Raises:
-        InputError: they are black.
+        InputError: all values are 0.
     """
-    grid = on_grid(mask, stride)
+    grid = select_grid(mask, stride)
     if stride > 1 and len(values) != grid.sum():
         values = values[grid[mask]]
     mean = mean or float(np.mean([part.mean(dtype=np.float64) for part in values.transpose(2, 0, 1)]))
@@ -58,34 +58,34 @@ def problem_of(
         raise InputError("refinement: the object is black in every image")
     gathered = torch.from_numpy(values)
     shares = torch.from_numpy((intensities.mean() / intensities).astype(np.float32)).T  # (3, L)
-    kept = torch.from_numpy(room_for((len(values), values.shape[2])))
-    for part in parts_of(len(values)):
+    usable = torch.from_numpy(allocate((len(values), values.shape[2])))
+    for part in split_pixels(len(values)):
         clipped = torch.from_numpy((values[part] >= full).any(axis=1))
         gathered[part] /= mean
-        kept[part] = (~shadowed(gathered[part] * shares) & ~clipped).float()
-    return Problem(mask[::stride, ::stride], gathered, kept, mean)
+        usable[part] = (~find_shadows(gathered[part] * shares) & ~clipped).float()
+    return Problem(mask[::stride, ::stride], gathered, usable, mean)
 
 
-def room_for(shape: tuple[int, ...]) -> np.ndarray:
-    """Return room for float32 values: in memory, or in a file if they are many."""
+def allocate(shape: tuple[int, ...]) -> np.ndarray:
+    """Return an uninitialised float32 array: in memory, or in a temporary file if it is large."""
     if 4 * np.prod(shape, dtype=np.int64) <= CACHE_BYTES:
         return np.empty(shape, np.float32)
-    with tempfile.TemporaryFile() as file:  # its place on the disk goes with the array
+    with tempfile.TemporaryFile() as file:  # the file is removed with the array
         return np.memmap(file, np.float32, "w+", shape=shape)
 
 
-def parts_of(count: int) -> list[slice]:
-    """Return the parts of so many pixels that are worked on at once."""
+def split_pixels(count: int) -> list[slice]:
+    """Return the slices of `count` pixels that are worked on at once."""
     return [slice(start, min(start + _PART, count)) for start in range(0, count, _PART)]
 
 
-def log_albedo(problem: Problem, state: State) -> Tensor:  # (P, 3)
+def estimate_log_albedo(problem: Problem, state: State) -> Tensor:  # (P, 3)
     """Return the median over images of radiance by shading, where there is shading."""
-    made = factors(state)
+    model = build_model(state)
     found = torch.empty(len(problem.images), 3)
-    shares = torch.exp(-made.log_intensities).T  # (3, L)
-    for part in parts_of(len(found)):
-        shade = (made.normals[part] @ made.directions.T).clamp_min(0.0)  # (p, L)
+    shares = torch.exp(-model.log_intensities).T  # (3, L)
+    for part in split_pixels(len(found)):
+        shade = (model.normals[part] @ model.directions.T).clamp_min(0.0)  # (p, L)
         lit = shade > _LIT_SHARE * shade.mean(dim=1, keepdim=True)
         ratio = problem.images[part] * shares / shade.clamp_min(1e-6)[:, None]
         found[part] = ratio.masked_fill(~lit[:, None], torch.nan).nanmedian(dim=2).values

@@ -1,7 +1,6 @@
-"""Refine what a method found of an object: its normals and lights, until a simple model explains the photographs.
+"""Refine the normals and lights that a method found, until a simple model explains the photographs.
 
-The equations stand in `sdps.refinement.image_model`, the priors in `priors`.
-What was measured: docs/studies/refinement.md.
+The model is in `image_model` and `reflectance`, the priors are in `priors`, measurements in docs/studies/refinement.md.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,18 +18,18 @@ from sdps.core.integration import integrate
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.inference.tiles import Tile, release_memory, tiles
 from sdps.refinement.descent import Problem, Weights, solve
-from sdps.refinement.fine import finer, pictures
-from sdps.refinement.image_model import LOBES, SHAPES, State, factors
-from sdps.refinement.modes import MODES
-from sdps.refinement.problems import gathered, log_albedo, on_grid, problem_of
+from sdps.refinement.fine import collect, upsample
+from sdps.refinement.image_model import State, build_model
+from sdps.refinement.problems import build_problem, estimate_log_albedo, gather_pixels, select_grid
 from sdps.refinement.refined import Refined
+from sdps.refinement.reflectance import LOBES, MODES, SHAPES
 from sdps.refinement.transport import trace
 
 _FEWEST = 4
 _OF_PIXELS = frozenset({"normals", "log_albedo", "log_strength"})
 _SHARPEST, _BROADEST = 300.0, 10.0
 _START_HEIGHT = -4.0
-_BRIGHTEST, _WHITENESS = 0.95, 0.3  # quantile of the brightest parts, and the albedo they begin with
+_BRIGHTEST, _WHITENESS = 0.95, 0.3  # quantile of the brightest parts, and the albedo they start with
 TILE_BYTES = 3 * 2**29
 """Memory for the pixels that are refined at once; objects whose box fits are one tile."""
 _PIXEL_BYTES, _OBSERVATION_BYTES = 1200, 20
@@ -39,16 +38,16 @@ _HALO = 16
 
 @dataclass(frozen=True, kw_only=True)
 class RefineConfig:
-    """How an object is refined. How the defaults were chosen: docs/studies/refinement.md.
+    """How an object is refined; docs/studies/refinement.md says how the defaults were chosen.
 
     Attributes:
-        coarse_pixels: Pixels of the coarse grid, about.
+        coarse_pixels: About how many pixels the coarse grid has.
         iterations: On the coarse grid, with everything free.
-        bounces: How often light is followed from one part of the object to another; 0 leaves that and shadows out.
-        iterations_before: On the coarse grid for the surface that shadows and such light are traced on.
-        boost: What the coarse grid's learning rates are multiplied by.
-        fine_iterations: On every pixel, with the lights as the coarse grid found them.
-        fine_boost: The same on every pixel.
+        bounces: How often light is followed between parts of the object; 0 ignores bounced light and cast shadows.
+        iterations_before: On the coarse grid, for the surface that shadows and bounced light are traced on.
+        boost: Factor of the learning rates on the coarse grid.
+        fine_iterations: On every pixel, with the lights that the coarse grid found.
+        fine_boost: Factor of the learning rates on every pixel.
         fine_curl: Weight of the curl on every pixel.
     """
 
@@ -83,13 +82,13 @@ def refine(
     Args:
         images: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time.
         mask: (H, W) bool.
-        normals: (H, W, 3) unit, where a method put them.
+        normals: (H, W, 3) unit, as a method found them.
         lights: (L, 3) unit directions from the surface to the light.
         intensities: (L,) or (L, 3).
-        directions_given: Directions stay. Intensities always move: they also take up what the model misses in an image.
+        directions_given: Leave directions as they are. Intensities always move: they also absorb what the model misses.
         config: Iterations and rates.
-        stray: Take stray light off the images.
-        saturation: Radiance from which on a channel is clipped; such observations count for nothing.
+        stray: Subtract stray light from the images.
+        saturation: Radiance at which a channel is clipped; such observations are ignored.
 
     Raises:
         InputError: fewer than four images, shapes that do not fit, or an object that is black.
@@ -99,51 +98,51 @@ def refine(
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
     most = TILE_BYTES // (_PIXEL_BYTES + _OBSERVATION_BYTES * len(scene)) if stride > 1 else scene.mask.size
     parts = tiles(scene.mask, most, _HALO)
-    values = gathered(scene, scene.mask if len(parts) == 1 else on_grid(scene.mask, stride))
-    problem = problem_of(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
-    begun = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
+    values = gather_pixels(scene, scene.mask if len(parts) == 1 else select_grid(scene.mask, stride))
+    problem = build_problem(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
+    start_normals = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
     free = frozenset(State._fields) - ({"directions"} if directions_given else set())
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
     with progress_bar(None, total=before + config.iterations + fine * len(parts), desc="refine") as bar:
-        move = partial(solve, free=free, boost=config.boost, weights=Weights(), after=_advance(bar))
-        start = start_of(problem, begun, lights, gains)
+        move = partial(solve, free=free, boost=config.boost, weights=Weights(), on_step=_advance(bar))
+        start = build_start(problem, start_normals, lights, gains)
         if before:
-            problem = _traced(problem, move(problem, start, iterations=before), config.bounces)
-            start = start._replace(log_albedo=log_albedo(problem, start))
+            problem = _trace_light(problem, move(problem, start, iterations=before), config.bounces)
+            start = start._replace(log_albedo=estimate_log_albedo(problem, start))
         state = move(problem, start, iterations=config.iterations)
         if stride == 1:
-            return pictures(scene, [(parts[0], problem, state)], state)
+            return collect(scene, [(parts[0], problem, state)], state)
         weights = Weights(curl=(config.fine_curl, config.fine_curl))
         settle = partial(move, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
-        return pictures(scene, _every_pixel(scene, parts, values, problem, stride, state, full, settle), state)
+        return collect(scene, _refine_tiles(scene, parts, values, problem, stride, state, full, settle), state)
 
 
-def _every_pixel(
+def _refine_tiles(
     scene: ObjectImages, parts: list[Tile], values: np.ndarray, coarse: Problem, stride: int, state: State,
     full: np.ndarray, settle: Callable[[Problem, State], State],
 ) -> Iterator[tuple[Tile, Problem, State]]:  # fmt: skip
-    """Yield every pixel, tile by tile; `values` are all pixels' where one tile holds them."""
+    """Yield the tiles with their refined pixels; `values` are those of all pixels if there is one tile."""
 
-    def found(tile: Tile) -> tuple[Tile, Problem, State]:  # keeps nothing of one tile while the next is made
+    def refine_tile(tile: Tile) -> tuple[Tile, Problem, State]:  # holds nothing of one tile while the next is made
         part = scene.part(tile.outer_rows, tile.outer_columns)
-        own = values if len(parts) == 1 else gathered(part, part.mask)
-        problem, begun = finer(own, scene, tile, coarse, stride, state, full)
-        return tile, problem, settle(problem, begun)
+        own = values if len(parts) == 1 else gather_pixels(part, part.mask)
+        problem, start = upsample(own, scene, tile, coarse, stride, state, full)
+        return tile, problem, settle(problem, start)
 
     for tile in parts:
-        yield found(tile)
+        yield refine_tile(tile)
         if len(parts) > 1:
             release_memory()
 
 
 def _advance(bar: Any) -> Callable[[], None]:
-    """Return what moves the bar on by an iteration, and says so."""
+    """Return a function that advances the bar by one iteration and reports it."""
 
-    def after() -> None:
+    def on_step() -> None:
         bar.update()
         stage("refinement", bar.n, bar.total)
 
-    return after
+    return on_step
 
 
 def _checked(
@@ -161,8 +160,8 @@ def _checked(
     return np.broadcast_to(np.reshape(intensities, (count, -1)), (count, 3))
 
 
-def start_of(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> State:
-    """Return the state that a method's normals and lights begin with."""
+def build_start(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> State:
+    """Return the state that refinement starts from, given a method's normals and lights."""
     count = len(problem.images)
     state = State(
         normals=torch.from_numpy(np.array(normals, np.float32)),
@@ -177,13 +176,13 @@ def start_of(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensit
         modes=torch.zeros(MODES),
     )
     state.normals[:, 2].clamp_min_(1e-3)
-    return state._replace(log_albedo=log_albedo(problem, state))
+    return state._replace(log_albedo=estimate_log_albedo(problem, state))
 
 
-def _traced(problem: Problem, state: State, bounces: int) -> Problem:
-    """Return the problem without observations in cast shadows, and with the light between parts of the object."""
-    made = factors(state)
-    normals, lights, albedo = (part.numpy() for part in (made.normals, made.directions, made.albedo))
+def _trace_light(problem: Problem, state: State, bounces: int) -> Problem:
+    """Return the problem without observations in cast shadows, and with bounced light."""
+    model = build_model(state)
+    normals, lights, albedo = (part.numpy() for part in (model.normals, model.directions, model.albedo))
     laid = np.zeros((*problem.mask.shape, 3))
     laid[problem.mask] = normals
     heights = integrate(laid, problem.mask, discontinuities=True).z
@@ -192,5 +191,5 @@ def _traced(problem: Problem, state: State, bounces: int) -> Problem:
     first, more = (found.bounced(normals, albedo / brightest, lights, count) for count in (1, bounces))
     twice = float(more.sum() / max(first.sum(), 1e-9)) - 1.0
     first *= brightest
-    kept = problem.kept * torch.from_numpy(found.lit)
-    return problem._replace(kept=kept, bounced=torch.from_numpy(first), twice=twice)
+    usable = problem.usable * torch.from_numpy(found.lit)
+    return problem._replace(usable=usable, bounced=torch.from_numpy(first), twice=twice)

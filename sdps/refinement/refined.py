@@ -15,10 +15,10 @@ class Refined:
         intensities: (L, 3) float32, mean 1.
         albedo: (H, W, 3) float32, zero outside the mask, up to a common factor.
         strength: (H, W) float32, of the highlights, zero outside the mask.
-        body: (4,) numbers b of the body's reflectance (`sdps.refinement.image_model`); 0 is Lambertian.
+        body: (4,) numbers b of the body (`sdps.refinement.reflectance`); 0 is Lambertian.
         amplitudes: (K,) of the lobes.
         sharpness: (K,) of the lobes.
-        modes: (M,) numbers m of `sdps.refinement.modes`; 0 adds nothing.
+        modes: (M,) numbers m of the modes; 0 adds nothing.
         pixel_residual: (H, W) float32, mean robust difference, zero outside the mask.
         image_residual: (L,) float32, the same of each image.
     """

@@ -1,10 +1,10 @@
 """Shadows and light between the parts of an object, traced over the surface that its normals integrate to.
 
-The surface is a height field z(x, y) over the pixels, seen from above; what lies under it is taken to be solid. Pixel
+The surface is a height field z(x, y) over the pixels, seen from above; everything under it is solid. Pixel
 p, image i; n unit normal, l unit direction to the light, V whether two points see each other, A a pixel's area on the
 surface:
 
-    lit_pi  = 1 where the way from p towards l_i stays above the surface
+    lit_pi  = 1 where the ray from p towards l_i stays above the surface
     F_pq    = V_pq max(n_p . w, 0) max(-n_q . w, 0) A_q / (pi r^2)          w, r direction and distance from p to q
     B       = rho E + rho F (rho E) + ...,   E_pi = lit_pi max(n_p . l_i, 0)   radiosity, Lambertian; light pi
     bounced = B - rho E
@@ -19,19 +19,19 @@ import numba
 import numpy as np
 
 _OFFSET = 0.3
-"""Rays run so many pixels above the surface, since its slopes are not exact."""
+"""Rays start this many pixels above the surface, since its slopes are not exact."""
 _LEAST_COSINE = np.float32(0.02)
 _LEAST_PACE = np.float32(1e-4)
-_BESIDE = np.float32(1.44)  # squared distance of neighbours, which do not see each other
+_ADJACENT = np.float32(1.44)  # squared distance of neighbours, which do not see each other
 _STEEPEST = 0.15  # n_z, for the areas
 _ONE = np.float32(1.0)
 
 
 class Transport(NamedTuple):
-    """How light travels over a surface of P pixels under L lights.
+    """How light travels between P pixels of a surface under L lights.
 
     Attributes:
-        lit: (P, L) bool, whether the pixel sees the light; also true where it faces away.
+        lit: (P, L) bool, whether nothing blocks the light; true also where the pixel faces away.
         factors: (P, P) float32, F; rows sum to at most 1.
     """
 
@@ -39,13 +39,13 @@ class Transport(NamedTuple):
     factors: np.ndarray
 
     def bounced(self, normals: np.ndarray, albedo: np.ndarray, lights: np.ndarray, bounces: int = 2) -> np.ndarray:
-        """Return the radiance (P, 3, L) float32 that the surface throws on itself.
+        """Return the radiance (P, 3, L) float32 of bounced light.
 
         Args:
             normals: (P, 3) unit.
-            albedo: (P, 3), of one white Lambertian 1.
+            albedo: (P, 3), 1 for a white Lambertian surface.
             lights: (L, 3) unit directions.
-            bounces: How often light is reflected before it is seen, beyond the first.
+            bounces: How often light is reflected after its first reflection.
         """
         direct = np.where(self.lit, np.maximum(normals @ lights.T, 0.0), 0.0).astype(np.float32)  # (P, L)
         found = np.empty((len(normals), 3, len(lights)), np.float32)
@@ -61,7 +61,7 @@ class Transport(NamedTuple):
 
 
 def trace(heights: np.ndarray, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> Transport:
-    """Trace shadows, and which pixels see each other.
+    """Trace cast shadows and which pixels see each other.
 
     Args:
         heights: (H, W), towards the camera, in pixels; not read outside the mask.
@@ -85,7 +85,7 @@ def trace(heights: np.ndarray, mask: np.ndarray, normals: np.ndarray, lights: np
 
 @numba.njit(cache=True)
 def _height(field: np.ndarray, row: Any, column: Any) -> Any:
-    """Return the height between four pixels, bilinear; -inf beside the object, where nothing is in the way."""
+    """Return the height between four pixels, bilinear; -inf outside the object, where nothing blocks."""
     r, c = min(int(row), field.shape[0] - 2), min(int(column), field.shape[1] - 2)
     down, right = row - r, column - c
     upper = field[r, c] * (_ONE - right) + field[r, c + 1] * right
@@ -95,7 +95,7 @@ def _height(field: np.ndarray, row: Any, column: Any) -> Any:
 
 @numba.njit(cache=True)
 def _blocked(field: np.ndarray, start: Any, way: Any, steps: int) -> bool:
-    """Tell whether the surface rises above the `steps` - 1 places that `way` leads to from a point."""
+    """Return whether the surface rises above one of the `steps` - 1 points reached from `start` in steps of `way`."""
     x, y, z = start
     for _ in range(1, steps):
         x, y, z = x + way[0], y + way[1], z + way[2]
@@ -132,7 +132,7 @@ def _form_factors(
             leaves = dx * normals[p, 0] + dy * normals[p, 1] + dz * normals[p, 2]
             arrives = -(dx * normals[q, 0] + dy * normals[q, 1] + dz * normals[q, 2])
             least = _LEAST_COSINE * np.sqrt(squared)
-            if squared < _BESIDE or leaves < least or arrives < least:
+            if squared < _ADJACENT or leaves < least or arrives < least:
                 continue
             steps = max(int(max(abs(dx), abs(dy))), 1)
             tx, ty, tz = above[q, 0] - start[0], above[q, 1] - start[1], above[q, 2] - start[2]

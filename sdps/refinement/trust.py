@@ -124,11 +124,11 @@ def _features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.nda
 
 
 def _doubt(mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> str:
-    """Return why photographs such as these do not tell the shape, or nothing."""
+    """Return why photographs such as these cannot show the shape, or nothing."""
     if len(lights) < FEWEST_IMAGES:
         return f"{len(lights)} images are too few to refine with; {FEWEST_IMAGES} are needed"
     if np.linalg.svd(lights, compute_uv=False)[-1] / np.sqrt(len(lights)) < _PLANE:
-        return "the lights lie in one plane with the object, so photographs do not tell its shape"
+        return "the lights lie in one plane with the object, so photographs cannot show its shape"
     if np.sqrt(np.square(normals[mask] - normals[mask].mean(axis=0)).sum(axis=1).mean()) < _FLAT:
-        return "the object is flat, so photographs do not tell its tilt from the lights' directions"
+        return "the object is flat, so photographs cannot show its tilt apart from the lights' directions"
     return ""

@@ -172,7 +172,7 @@ class Page:
 
     def __enter__(self) -> "Page":
         from pipelines.app import server
-        from pipelines.app.work.uploads import Limits
+        from pipelines.app.common.uploads import Limits
 
         kept = tempfile.tempdir, server.Jobs
         tempfile.tempdir, server.Jobs = self.temporary.name, AtOnce
@@ -189,11 +189,11 @@ class Page:
 
     def photographs(self, source: Path | None) -> None:
         """Begin a set with photographs, if there are some, and a finished run."""
-        self.set = self.session.new_place()
+        self.set = self.session.make_place()
         place = self.session.folder / self.set
         shutil.copytree(source, place / "photos") if source else (place / "photos").mkdir()
         self.app.state.jobs.number = 1
-        studio = self.session.folder / "studio"
+        studio = self.session.folder / "studio-"
         studio.mkdir(exist_ok=True)
         (studio / "scene.zip").write_bytes(b"")
         view = place / "runs" / "1" / "view"
@@ -250,7 +250,7 @@ class AtOnce:
 
     def submit(self, owner: str, task: str, **arguments: Any) -> int:
         """Run a job; its refusal goes to standard error."""
-        from pipelines.app.rooms import photo_tasks, studio_tasks
+        from pipelines.app.pages import photo_tasks, studio_tasks
         from render.materials import library
         from render.shapes.files.mesh_file import load_mesh
 
@@ -258,12 +258,12 @@ class AtOnce:
             if task in ("check", "infer"):
                 json.dumps(getattr(photo_tasks, task)(**arguments))
             elif task == "shard":
-                studio_tasks.shard_scene(**arguments)
+                studio_tasks.prepare_shard(**arguments)
             elif task == "preset":
-                studio_tasks.training_preset(**arguments)
+                studio_tasks.make_training_preset(**arguments)
             elif task in ("scene", "keep"):
                 arguments["place"] = Path(arguments["place"])
-                spec = studio_tasks.wanted(**{key: value for key, value in arguments.items() if key != "direct"})
+                spec = studio_tasks.check_choice(**{key: value for key, value in arguments.items() if key != "direct"})
                 if Path(spec["shape"]).is_file():
                     load_mesh(Path(spec["shape"]))
                 library.load(spec["material"])

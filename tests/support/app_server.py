@@ -26,8 +26,8 @@ def application(folder: Path, **limits: int) -> Iterator[tuple[str, Any]]:
     """Serve on a free port; yield the address and the application."""
     import uvicorn
 
+    from pipelines.app.common.uploads import Limits
     from pipelines.app.server import build
-    from pipelines.app.work.uploads import Limits
 
     app = build(folder, Limits(**limits))
     config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning")

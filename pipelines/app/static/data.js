@@ -1,6 +1,6 @@
 // The room "Data and runs".
 
-import { $, ask, element, follow, showError } from "./jobs.js";
+import { $, ask, element, follow, own, showError } from "./jobs.js";
 import { LightStage } from "./light_stage.js";
 import { LightPad } from "./relight.js";
 
@@ -80,9 +80,9 @@ function tiles() {
 
 async function light(row) {
   try {
-    const about = await follow(await ask(query("start", { id: row.id }), { method: "POST" }), $("lamp-status"), "Scene");
+    const about = await follow(await ask(own(query("start", { id: row.id })), { method: "POST" }), $("lamp-status"), "Scene");
     if (!about) return;
-    const [basis, truth] = await Promise.all(["basis.bin", "truth.bin"].map(async (name) => (await fetch(`/data/files/${name}`)).arrayBuffer()));
+    const [basis, truth] = await Promise.all(["basis.bin", "truth.bin"].map(async (name) => (await fetch(own(`/data/files/${name}`))).arrayBuffer()));
     state.stage = new LightStage(basis, truth, about);
     $("lamp-title").textContent = `${row.id}: ${row.shape}, ${row.material}`;
     $("lamp-card").hidden = false;

@@ -20,6 +20,13 @@ export async function ask(path, options = {}) {
 export const post = (path, value = {}) =>
   ask(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(value) });
 
+// The address of what belongs to this tab alone, such as the scene it shows. Loading the page again keeps the tab's name.
+export function own(path) {
+  const name = sessionStorage.getItem("tab") ?? Math.random().toString(16).slice(2, 14);
+  sessionStorage.setItem("tab", name);
+  return `${path}${path.includes("?") ? "&" : "?"}tab=${name}`;
+}
+
 export function showError(box, error) {
   box.hidden = false;
   box.className = "status error";

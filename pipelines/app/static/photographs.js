@@ -149,7 +149,8 @@ async function show(run) {
   $("report").href = inSet(`files/runs/${run.number}/files/report.html`);
   $("normals").src = inRun("normals.png");
   $("depth").src = inRun("depth.png");
-  const object = new Reflectance(await (await fetch(inRun("basis.bin"))).arrayBuffer(), run);
+  const [basis, tables] = await Promise.all([inRun("basis.bin"), run.tables && inRun("tables.bin")].map(async (address) => address && (await fetch(address)).arrayBuffer()));
+  const object = new Reflectance(basis, run, tables);
   if (state.run !== run) return;
   new LightPad($("relit-light"), $("relit"), (light) => object.draw($("relit"), light), run.lights);
   sphere(run);
@@ -217,7 +218,7 @@ function chart({ observed, model }, [row, column], run) {
   if (model) svg.append(element("polyline", { points: model.map((v, i) => `${x(i)},${y(v)}`).join(" "), fill: "none", stroke: "var(--accent)", "stroke-width": 0.7 }));
   observed.forEach((v, i) => svg.append(element("circle", { cx: x(i), cy: y(v), r: 0.9, fill: "#e0702c" }, element("title", {}, `${run.files[i]}: ${v.toFixed(4)}`))));
   $("chart").replaceChildren(svg);
-  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: ${run.lobes.body ? "the refined model" : "Lambert's law"} on what was found. ` : ""}Highest: ${most.toFixed(3)}.`;
+  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: ${run.tables ? "the refined model" : "Lambert's law"} on what was found. ` : ""}Highest: ${most.toFixed(3)}.`;
 }
 
 // ---- Comparison ----

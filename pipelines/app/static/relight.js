@@ -8,7 +8,7 @@ for (let i = 0; i < 4096; i++) {
   const v = i / 4095;
   CURVE[i] = Math.round(255 * (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055));
 }
-export const coded = (v) => CURVE[v >= 1 ? 4095 : v <= 0 ? 0 : (v * 4095) | 0];
+export const coded = (v) => CURVE[v >= 1 ? 4095 : v <= 0 ? 0 : (v * 4095 + 0.5) | 0];
 
 // A disc of directions, with two sliders for the keyboard. `surface`: a picture on which dragging works as well.
 export class LightPad {
@@ -66,52 +66,65 @@ export class LightPad {
   }
 }
 
-// An object by normals, albedo and highlights (`object_view.py`, whose `shading` this repeats).
+// An object by normals, albedo and highlights (`object_view.py`), and tables of how it reflects, which Python evaluates
+// (`reflectance_tables.py` says what they hold); without tables it is Lambertian.
 export class Reflectance {
-  constructor(buffer, view) {
+  constructor(basis, view, tables = null) {
     const count = view.width * view.height;
     this.view = view;
-    this.normals = new Int16Array(buffer, 0, 3 * count);
-    this.albedo = new Uint16Array(buffer, 6 * count, 3 * count);
-    this.strength = new Uint16Array(buffer, 12 * count, count);
+    this.normals = new Int16Array(basis, 0, 3 * count);
+    this.albedo = new Uint16Array(basis, 6 * count, 3 * count);
+    this.strength = new Uint16Array(basis, 12 * count, count);
+    if (!tables) return;
+    const size = 2 * view.tables.matte.reduce((product, entries) => product * entries);
+    this.matte = new Float32Array(tables, 0, size);
+    this.glossy = new Float32Array(tables, 4 * size);
   }
 
   draw(canvas, light) {
-    const { width, height, lobes } = this.view, context = canvas.getContext("2d");
+    const { width, height } = this.view, context = canvas.getContext("2d");
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    const image = context.createImageData(width, height), data = image.data;
-    const [lx, ly, lz] = light, refined = Boolean(lobes.body);
-    const [hx, hy, hz] = refined ? half(light) : [0, 0, 1], spread = refined ? 1 / Math.max(lx * hx + ly * hy + lz * hz, 1e-3) ** 2 : 0;
-    const glints = refined ? table(lobes) : null, b = lobes.body, m = lobes.modes;
+    const image = context.createImageData(width, height), data = image.data, [lx, ly, lz] = light;
     const peak = this.view.albedo / 65535, shine = this.view.strength / 65535, n = this.normals, a = this.albedo;
     for (let p = 0, i = 0; i < width * height; i++, p += 3) {
       data[4 * i + 3] = 255;
-      const nx = n[p] / 32767, ny = n[p + 1] / 32767, nz = n[p + 2] / 32767, cosine = nx * lx + ny * ly + nz * lz;
+      const nz = n[p + 2] / 32767, cosine = (n[p] * lx + n[p + 1] * ly) / 32767 + nz * lz;
       if (cosine <= 0) continue;
-      let body = 1, gloss = 0;
-      if (refined) {
-        const lit = Math.max(cosine, 0.02), seen = Math.max(nz, 0.02), x = 1 - lit, y = 1 - seen;
-        let opposed = lz - lit * seen;
-        if (opposed > 0) opposed /= Math.max(lit, seen);
-        const near = nx * hx + ny * hy + nz * hz, s = x + y, t = Math.max(1 - near, 0);
-        const g = m[0] * s * opposed + m[1] * (1 - lz) * opposed + m[2] * s * x * y + m[3] * s * (x - y) ** 2 + m[4] * t * t + m[5] * Math.sqrt(t);
-        const factor = Math.exp(Math.min(0.7, Math.max(-0.7, g)));
-        body = factor * Math.exp(b[0] * s + b[1] * x * y + b[2] * (x * x + y * y) + b[3] * opposed);
-        gloss = factor * shine * this.strength[i] * glints[Math.min(4095, Math.max(0, 4095 * near) | 0)] * spread;
-      }
+      const [body, lobes] = this.matte ? this.reflect(cosine, nz, lz) : [1, 0], gloss = shine * this.strength[i] * lobes;
       for (let c = 0; c < 3; c++) data[4 * i + c] = coded((peak * a[p + c] * body + gloss) * cosine);
     }
     context.putImageData(image, 0, 0);
   }
+
+  // What albedo and highlight strength are multiplied with, of the cosines n.l, n.v and l.v.
+  reflect(cosine, facing, across) {
+    const { least, limit, matte, glossy } = this.view.tables;
+    const l = Math.max(cosine, least), v = Math.max(facing, least), more = Math.min(1, Math.max(l, v));
+    const slant = Math.acosh(1 / more) / Math.acosh(1 / least), balance = more > least ? (l - v) / (more - least) : 0;
+    const azimuth = (across - l * v) / Math.sqrt(Math.max((1 - l * l) * (1 - v * v), 1e-12));
+    const tilt = Math.sqrt(Math.max(0, 1 - (cosine + facing) / Math.sqrt(2 + 2 * across)));
+    between(around, this.matte, matte, (azimuth + 1) / 2, (balance + 1) / 2, slant);
+    between(above, this.glossy, glossy, 0, across, tilt);
+    const factor = Math.exp(Math.min(limit, Math.max(-limit, around[1] + above[1])));
+    return [factor * Math.exp(around[0]), factor * above[0]];
+  }
 }
 
-function half([x, y, z]) {
-  const length = Math.hypot(x, y, z + 1);
-  return [x / length, y / length, (z + 1) / length];
-}
+const around = new Float64Array(2), above = new Float64Array(2);
 
-function table({ amplitudes, sharpness }) { // of n . h
-  const values = new Float32Array(4096);
-  for (let i = 0; i < 4096; i++) for (let k = 0; k < amplitudes.length; k++) values[i] += amplitudes[k] * Math.exp(sharpness[k] * (i / 4095 - 1));
-  return values;
+// The two values that a table holds at a place, linear between its entries, into `found`; shares of the way along the
+// axes, the last of which runs fastest.
+function between(found, table, sizes, outer, middle, inner) {
+  const depth = sizes.length === 3 ? sizes[0] - 1 : 0, rows = sizes.at(-2) - 1, columns = sizes.at(-1) - 1;
+  const z = depth * Math.min(1, Math.max(0, outer)), y = rows * Math.min(1, Math.max(0, middle)), x = columns * Math.min(1, Math.max(0, inner));
+  const k = Math.min(z | 0, Math.max(depth - 1, 0)), j = Math.min(y | 0, rows - 1), i = Math.min(x | 0, columns - 1);
+  const row = 2 * (columns + 1), right = x - i, down = y - j, deep = z - k;
+  found[0] = found[1] = 0;
+  for (let back = 0; back < (depth ? 2 : 1); back++) {
+    const weight = back ? deep : 1 - deep, start = ((k + back) * (rows + 1) + j) * row + 2 * i;
+    for (let value = 0; value < 2; value++) {
+      const at = start + value, above = table[at] + right * (table[at + 2] - table[at]), below = table[at + row] + right * (table[at + row + 2] - table[at + row]);
+      found[value] += weight * (above + down * (below - above));
+    }
+  }
 }

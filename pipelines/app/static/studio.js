@@ -1,6 +1,6 @@
 // The room "Studio".
 
-import { $, ask, element, follow, post, showError } from "./jobs.js";
+import { $, ask, element, follow, own, post, showError } from "./jobs.js";
 import { LightStage } from "./light_stage.js";
 import { LightPad } from "./relight.js";
 
@@ -20,9 +20,9 @@ async function render() {
   while (shown !== wanted) {
     const number = wanted;
     try {
-      const began = performance.now(), about = await follow(await post("/studio/start/scene", asked()), $("status"), "Scene");
+      const began = performance.now(), about = await follow(await post(own("/studio/start/scene"), asked()), $("status"), "Scene");
       if (about) {
-        const [basis, truth] = await Promise.all(["basis.bin", "truth.bin"].map(async (name) => (await fetch(`/studio/files/${name}`)).arrayBuffer()));
+        const [basis, truth] = await Promise.all(["basis.bin", "truth.bin"].map(async (name) => (await fetch(own(`/studio/files/${name}`))).arrayBuffer()));
         const light = pad?.direction;
         scene = new LightStage(basis, truth, about);
         $("rate").textContent = `${about.name}: rendered in ${((performance.now() - began) / 1000).toFixed(1)} s`;
@@ -50,8 +50,8 @@ async function direct() {
   const current = scene;
   if (current && !current.direct && Number($("bounces").value) > 0) {
     try {
-      if (await follow(await post("/studio/start/scene", { ...asked(), direct: true }), $("status"), "Direct light"))
-        current.direct = new Uint8Array(await (await fetch("/studio/files/direct.bin")).arrayBuffer());
+      if (await follow(await post(own("/studio/start/scene"), { ...asked(), direct: true }), $("status"), "Direct light"))
+        current.direct = new Uint8Array(await (await fetch(own("/studio/files/direct.bin"))).arrayBuffer());
     } catch (error) { showError($("status"), error); }
   }
   pad?.show();
@@ -116,15 +116,15 @@ $("own").addEventListener("submit", (event) => { event.preventDefault(); choose(
 
 $("keep").addEventListener("click", async () => {
   try {
-    const name = await follow(await post("/studio/start/keep", asked()), $("keep-status"), "Test scene");
+    const name = await follow(await post(own("/studio/start/keep"), asked()), $("keep-status"), "Test scene");
     if (!name) return;
     $("keep-status").hidden = false;
-    $("keep-status").replaceChildren(element("a", { class: "button", href: `/studio/files/${name}`, download: true }, "Download shard, preset and command (ZIP)"));
+    $("keep-status").replaceChildren(element("a", { class: "button", href: own(`/studio/files/${name}`), download: true }, "Download shard, preset and command (ZIP)"));
   } catch (error) { showError($("keep-status"), error); }
 });
 $("preset").addEventListener("click", async () => {
   try {
-    const text = await follow(await post("/studio/start/preset", asked()), $("keep-status"), "Preset");
+    const text = await follow(await post(own("/studio/start/preset"), asked()), $("keep-status"), "Preset");
     if (!text) return;
     $("preset-text").textContent = text;
     $("preset-out").hidden = false;

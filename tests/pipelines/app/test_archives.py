@@ -14,7 +14,7 @@ import pytest
 from app_server import Client, application, contents
 from PIL import Image
 
-from pipelines.app.work import archives
+from pipelines.app.common import archives
 
 LIMITS = {"files": 20, "bytes": 4_000_000, "pixels": 200_000}
 
@@ -109,10 +109,10 @@ def test_nothing_leaves_the_folder_it_is_for(client: Client, root: Path, folder:
 @pytest.mark.parametrize("name", [*UP, *WINDOWS, "/ROOT/evil.png", "//ROOT/evil.png", "a/../../evil.png"])
 def test_nothing_is_unpacked_outside_even_for_a_moment(tmp_path: Path, name: str) -> None:
     """What is unpacked is moved later, which would hide that it was written elsewhere first."""
-    from pipelines.app.work.archives import unpack
-    from pipelines.app.work.incoming import Incoming
-    from pipelines.app.work.sessions import Session
-    from pipelines.app.work.uploads import Limits
+    from pipelines.app.common.archives import unpack
+    from pipelines.app.common.incoming import Incoming
+    from pipelines.app.common.sessions import Session
+    from pipelines.app.common.uploads import Limits
 
     deep = tmp_path.joinpath(*"abcdefghij")
     deep.mkdir(parents=True)
@@ -200,8 +200,8 @@ def test_one_that_meets_a_file_of_the_set_adds_nothing(client: Client, folder: P
 
 
 def test_a_move_that_fails_in_the_middle_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipelines.app.work import incoming
-    from pipelines.app.work.sessions import Session
+    from pipelines.app.common import incoming
+    from pipelines.app.common.sessions import Session
 
     session = Session("token", tmp_path)
     folder = tmp_path / "photos"
@@ -272,7 +272,7 @@ def test_a_password_is_said(client: Client) -> None:
 
 
 def test_a_table_of_contents_without_end_is_not_read(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipelines.app.work import archives
+    from pipelines.app.common import archives
 
     monkeypatch.setattr(archives, "_MOST_LISTING", 100_000)
     data = packed(*((f"{number}.dat", b"") for number in range(3000)), ("a.png", png()))

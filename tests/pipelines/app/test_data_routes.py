@@ -52,6 +52,24 @@ def test_a_scene_under_the_lamp(place: tuple[Path, Client]) -> None:
     assert len(client.get("/data/files/basis.bin")) == len(about["lights"]) * about["width"] * about["height"] * 3
 
 
+def test_two_tabs_have_a_scene_each_and_the_oldest_of_many_goes(place: tuple[Path, Client]) -> None:
+    _, client = place
+    scenes = json.loads(client.get("/data/scenes?folder=run/data"))[:2]
+
+    def show(tab: str, scene: dict) -> bytes:
+        job = client.wait(client.post(f"/data/start?folder=run/data&id={scene['id']}&tab={tab}"))
+        assert job["state"] == "done", job
+        return client.get(f"/data/files/basis.bin?tab={tab}")
+
+    first, second = (show(tab, scene) for tab, scene in zip("ab", scenes, strict=True))
+    assert first != second and client.get("/data/files/basis.bin?tab=a") == first
+    for number in range(8):
+        show(f"c{number}", scenes[0])
+    found = [client.send("GET", f"/data/files/basis.bin?tab={tab}")[0] for tab in ("a", "b", "c0", "c7")]
+    assert found == [404, 404, 200, 200]
+    assert client.send("GET", "/data/files/basis.bin?tab=../x")[0] == 400
+
+
 @pytest.mark.parametrize("folder", ["..", "../secret", "/etc", "run/../../secret", "none"])
 def test_nothing_outside_the_folder(place: tuple[Path, Client], folder: str) -> None:
     _, client = place

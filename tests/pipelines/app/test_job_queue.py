@@ -13,8 +13,8 @@ import pretend_worker
 import pytest
 from app_server import Client, application, eventually
 
-from pipelines.app.work import jobs as module
-from pipelines.app.work.jobs import Job, Jobs
+from pipelines.app.common import jobs as module
+from pipelines.app.common.jobs import Job, Jobs
 
 SLOW = 4.0
 AT_ONCE = 2.0

@@ -17,7 +17,7 @@ from app_server import Client, serving
 from PIL import Image
 from sdps_scenes import hemisphere_lights
 
-from pipelines.app.work import uploads
+from pipelines.app.common import uploads
 from render.shared.errors import InputError
 
 LIGHTS = hemisphere_lights(12, np.random.default_rng(0))
@@ -153,7 +153,7 @@ def test_a_damaged_mask_or_archive_ends_in_one_line(address: str, hills: Path) -
 def test_the_header_of_an_exr_is_read_without_its_library(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
     folders.write(path, np.zeros((40, 50, 3)))
-    assert uploads._size(path) == (50, 40)
+    assert uploads._read_size(path) == (50, 40)
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(InputError, match=r"a\.exr: is no picture"):
         uploads.check_pixels(path, uploads.Limits())
@@ -172,14 +172,14 @@ def test_uploads_are_what_their_bytes_say(tmp_path: Path) -> None:
     }
     for kind, suffix in kinds.items():
         for name in {f"a{suffix}", "a.png" if kind != "TGA" else "a.tga", "a.jpg" if kind != "TGA" else "a.tga"}:
-            path = tmp_path / uploads.safe_name(name)
+            path = tmp_path / uploads.clean_name(name)
             Image.fromarray(picture).save(path, kind)
-            assert uploads._size(path) == (50, 40)
+            assert uploads._read_size(path) == (50, 40)
             with pytest.raises(InputError, match="is 50x40 pixels"):
                 uploads.check_pixels(path, limits)
     folders.write(tmp_path / "a.exr", picture / 1.0)
     (tmp_path / "a.exr").rename(tmp_path / "b.png")
-    assert uploads._size(tmp_path / "b.png") == (50, 40)
+    assert uploads._read_size(tmp_path / "b.png") == (50, 40)
 
 
 def test_all_windows_of_an_exr_count(tmp_path: Path) -> None:
@@ -187,10 +187,10 @@ def test_all_windows_of_an_exr_count(tmp_path: Path) -> None:
     header = {"displayWindow": (np.array([0, 0], np.int32), np.array([4, 3], np.int32))}
     parts = [OpenEXR.Part(dict(header), {"Y": small}, "a"), OpenEXR.Part(dict(header), {"Y": large}, "b")]
     OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
-    assert uploads._size(tmp_path / "a.exr") == (50, 40)
+    assert uploads._read_size(tmp_path / "a.exr") == (50, 40)
     window = (np.array([0, 0], np.int32), np.array([999, 799], np.int32))
     OpenEXR.File({"displayWindow": window}, {"Y": small}).write(str(tmp_path / "b.exr"))
-    assert uploads._size(tmp_path / "b.exr") == (1000, 800)
+    assert uploads._read_size(tmp_path / "b.exr") == (1000, 800)
 
 
 def test_archives_do_not_explode(address: str, hills: Path) -> None:
@@ -244,7 +244,7 @@ def test_names_are_escaped(address: str) -> None:
 
 
 def test_sessions_end(tmp_path: Path) -> None:
-    from pipelines.app.work.sessions import Sessions
+    from pipelines.app.common.sessions import Sessions
 
     sessions = Sessions()
     first, second = sessions.create(), sessions.create()

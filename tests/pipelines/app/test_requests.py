@@ -18,7 +18,7 @@ from app_data import write_run
 from app_server import Client, application
 from PIL import Image
 
-from pipelines.app.work import uploads
+from pipelines.app.common import uploads
 from render.shared.errors import InputError
 from sdps.photos.picture_file import SUFFIXES
 
@@ -93,7 +93,7 @@ def test_a_full_queue_is_not_the_visitors_mistake(
 
 
 def test_runs_that_failed_leave_no_files(tmp_path: Path) -> None:
-    from pipelines.app.rooms import photo_tasks
+    from pipelines.app.pages import photo_tasks
 
     runs = tmp_path / "runs"
     for number, done in ((1, True), (2, False), (3, False), (5, False)):
@@ -112,11 +112,11 @@ def test_runs_that_failed_leave_no_files(tmp_path: Path) -> None:
 def test_what_may_be_uploaded_is_what_the_command_reads(client: Client) -> None:
     page = client.get("/photographs").decode()
     for suffix in SUFFIXES:
-        assert uploads.safe_name(f"a{suffix.upper()}") == f"a{suffix.upper()}"
+        assert uploads.clean_name(f"a{suffix.upper()}") == f"a{suffix.upper()}"
         assert f"{suffix}," in page
-    assert uploads.kinds() in page
+    assert uploads.list_kinds() in page
     with pytest.raises(InputError, match="cannot be used"):
-        uploads.safe_name("a.gif")
+        uploads.clean_name("a.gif")
 
 
 @pytest.mark.parametrize("suffix", sorted(SUFFIXES))
@@ -130,7 +130,7 @@ def test_the_size_is_that_of_the_content_whatever_the_name(tmp_path: Path, conte
     path = written.rename(tmp_path / f"b{suffix}")
     if content not in SUFFIXES:
         pytest.skip("the command does not read it")
-    assert uploads._size(path) == (50, 40)
+    assert uploads._read_size(path) == (50, 40)
     uploads.check_pixels(path, uploads.Limits(pixels=2000))
     with pytest.raises(InputError, match="50x40"):
         uploads.check_pixels(path, uploads.Limits(pixels=1999))
@@ -153,7 +153,7 @@ def test_the_largest_window_of_an_exr_counts(tmp_path: Path) -> None:
 def test_a_large_manifest_is_read_off_the_event_loop(
     client: Client, served: tuple[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipelines.app.rooms import data_routes
+    from pipelines.app.pages import data_routes
 
     read = data_routes.read_manifest
     scene = json.loads(client.get("/data/scenes?folder=run/data"))[0]["id"]
@@ -175,7 +175,7 @@ def test_a_large_manifest_is_read_off_the_event_loop(
 
 
 def test_a_scene_that_was_rendered_again_is_shown_anew(tmp_path: Path, served: tuple[str, Any], client: Client) -> None:
-    from pipelines.app.rooms import data_routes
+    from pipelines.app.pages import data_routes
 
     root = served[1].state.folder
     shutil.copytree(root / "run", root / "again")
@@ -184,9 +184,9 @@ def test_a_scene_that_was_rendered_again_is_shown_anew(tmp_path: Path, served: t
     path = next((root / "again" / "data").rglob(f"{one['id']}.exr"))
     time.sleep(0.01)
     os.utime(path)
-    before = data_routes._strip.cache_info().misses
+    before = data_routes._draw_strip.cache_info().misses
     assert client.get(f"/data/scene?folder=again/data&id={one['id']}") == shown
-    assert data_routes._strip.cache_info().misses == before + 1
+    assert data_routes._draw_strip.cache_info().misses == before + 1
     shutil.rmtree(root / "again")
 
 
@@ -203,11 +203,11 @@ def test_a_folder_whose_name_is_no_text_hides_no_other(client: Client, served: t
 
 
 def test_sessions_that_hold_nothing_end_first(tmp_path: Path) -> None:
-    from pipelines.app.work.sessions import Sessions
+    from pipelines.app.common.sessions import Sessions
 
     sessions = Sessions()
     worker = sessions.create()
-    worker.new_place()
+    worker.make_place()
     looking = [sessions.create() for _ in range(10)]
     busy = sessions.create()
     busy.under_way["x"] += 1
@@ -220,12 +220,12 @@ def test_sessions_that_hold_nothing_end_first(tmp_path: Path) -> None:
 
 
 def test_sessions_do_not_grow_without_end_between_two_looks(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipelines.app.work import sessions as module
+    from pipelines.app.common import sessions as module
 
     monkeypatch.setattr(module, "_AT_A_TIME", 20)
     sessions = module.Sessions()
     first = sessions.create()
-    first.new_place()
+    first.make_place()
     for _ in range(60):
         sessions.create()
     assert len(sessions._sessions) == 20 == len(list(sessions.folder.iterdir()))
@@ -234,7 +234,7 @@ def test_sessions_do_not_grow_without_end_between_two_looks(monkeypatch: pytest.
 
 
 def test_jobs_end_before_the_files_of_their_session_go(tmp_path: Path) -> None:
-    from pipelines.app.work.sessions import Sessions
+    from pipelines.app.common.sessions import Sessions
 
     sessions = Sessions()
     session = sessions.create()
@@ -248,7 +248,7 @@ def test_what_a_killed_server_left_is_removed_and_nothing_of_a_living_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("fcntl")
-    from pipelines.app.work import sessions as module
+    from pipelines.app.common import sessions as module
 
     monkeypatch.setattr(module.tempfile, "tempdir", str(tmp_path))
     living = module.Sessions()

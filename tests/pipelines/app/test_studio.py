@@ -13,7 +13,7 @@ import pytest
 from app_server import Client, serving
 from textures_support import write_maps
 
-from pipelines.app.rooms import studio_tasks
+from pipelines.app.pages import studio_tasks
 from pipelines.shared import presets
 from render.records.shards import read_shard
 from render.shared.errors import InputError
@@ -36,7 +36,7 @@ def test_a_folder_of_maps_is_a_material_and_no_shape(tmp_path: Path, maps: Path)
     about = studio_tasks.scene(str(place), shape="sphere", material="Test", size=128)
     assert about["name"].endswith("Test") and (place / "basis.bin").stat().st_size == 60 * 128 * 128 * 3
     with pytest.raises(InputError, match="folder of maps"):
-        studio_tasks.wanted(place, shape="Test", material="chrome")
+        studio_tasks.check_choice(place, shape="Test", material="chrome")
 
 
 @pytest.mark.parametrize("material", [pytest.param("lambertian:0.8/0.3/0.1", marks=pytest.mark.slow), "Test"])

@@ -139,7 +139,7 @@ def test_a_refusal_arrives_although_much_of_the_upload_is_still_to_come(visitor:
 
 
 def test_texts_are_not_read_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, visitor: Visitor) -> None:
-    from pipelines.app.work import uploads
+    from pipelines.app.common import uploads
 
     monkeypatch.setattr(uploads, "_MOST_TEXT", 1000)
     status, said = visitor.send("PUT", f"{visitor.new_set()}/uploads/lights.txt", bytes(1001))
@@ -171,7 +171,7 @@ def test_masks_at_the_same_time_do_not_meet(visitor: Visitor) -> None:
 def studio(visitor: Visitor) -> set[str]:
     """Leave files of the other rooms, as their jobs do; return their paths."""
     assert visitor.send("PUT", "/studio/uploads/ball.off", b"OFF")[0] == 200
-    for room in ("studio", "shard"):
+    for room in ("studio-", "data-"):
         (visitor.session.folder / room).mkdir()
         (visitor.session.folder / room / "basis.bin").write_bytes(b"")
     return set(visitor.files())
@@ -233,7 +233,7 @@ def test_sets_begun_at_the_same_time_give_back_what_is_pruned_once(visitor: Visi
     assert len(list(visitor.session.folder.iterdir())) == SETS
 
 
-@pytest.mark.parametrize("name", ["studio", "uploads", "shard", ".incoming-0", "0" * 15, "..", "%00"])
+@pytest.mark.parametrize("name", ["studio-", "uploads", "data-", ".incoming-0", "0" * 15, "..", "%00"])
 def test_what_is_no_set_cannot_be_uploaded_to(visitor: Visitor, name: str) -> None:
     studio(visitor)
     status, _ = visitor.send("PUT", f"/photographs/sets/{name}/uploads/a.png", png())
@@ -269,8 +269,8 @@ def test_a_name_may_be_used_again_when_there_are_many(visitor: Visitor) -> None:
 
 
 def test_one_who_is_cancelled_waits_for_the_thread_before_it_cleans_up(tmp_path: Path) -> None:
-    from pipelines.app.work.incoming import Incoming, incoming, off_loop
-    from pipelines.app.work.sessions import Session
+    from pipelines.app.common.incoming import Incoming, open_upload, run_in_thread
+    from pipelines.app.common.sessions import Session
 
     session = Session("token", tmp_path)
     written = []
@@ -283,8 +283,8 @@ def test_one_who_is_cancelled_waits_for_the_thread_before_it_cleans_up(tmp_path:
         written.append(coming.folder)
 
     async def upload() -> None:
-        async with incoming(session, 1000, "0" * 16) as coming:
-            await off_loop(write, coming)
+        async with open_upload(session, 1000, "0" * 16) as coming:
+            await run_in_thread(write, coming)
 
     async def cancelled() -> None:
         task = asyncio.create_task(upload())
@@ -300,9 +300,9 @@ def test_one_who_is_cancelled_waits_for_the_thread_before_it_cleans_up(tmp_path:
 
 
 def test_a_body_that_stands_still_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipelines.app.work import incoming
-    from pipelines.app.work.refusals import Refused
-    from pipelines.app.work.sessions import Session
+    from pipelines.app.common import incoming
+    from pipelines.app.common.refusals import Refused
+    from pipelines.app.common.sessions import Session
 
     monkeypatch.setattr(incoming, "_STALLED", 0.1)
     session = Session("token", tmp_path)
@@ -312,7 +312,7 @@ def test_a_body_that_stands_still_is_given_up(tmp_path: Path, monkeypatch: pytes
         await asyncio.sleep(30)
 
     async def upload() -> None:
-        async with incoming.incoming(session, 1000, "0" * 16) as coming:
+        async with incoming.open_upload(session, 1000, "0" * 16) as coming:
             await incoming.receive(body(), coming.folder / "a.png", coming)
 
     with pytest.raises(Refused, match=r"a\.png: nothing came") as refused:
@@ -321,7 +321,7 @@ def test_a_body_that_stands_still_is_given_up(tmp_path: Path, monkeypatch: pytes
 
 
 def test_a_full_disk_is_said(visitor: Visitor, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipelines.app.work import incoming
+    from pipelines.app.common import incoming
 
     def write(handle: Any, block: bytes) -> None:
         raise OSError(28, "No space left on device")

@@ -13,10 +13,10 @@ from sdps.methods import pretrained
 from sdps.methods.parse import parse
 from sdps.methods.runner import Runner
 from sdps.refinement.fused import data_term
-from sdps.refinement.image_model import LOBES, State, difference, factors
-from sdps.refinement.modes import MODES
+from sdps.refinement.image_model import State, build_model, measure_differences
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.refined import Refined
+from sdps.refinement.reflectance import LOBES, MODES
 
 QUICK = RefineConfig(coarse_pixels=700, iterations=600, bounces=0, fine_iterations=0)  # nothing here shades itself
 
@@ -87,11 +87,11 @@ def random_state(pixels: int, lights: int, seed: int = 0) -> tuple[State, torch.
 
 
 def test_the_fused_term_and_its_gradient_are_those_of_the_plain_one() -> None:
-    state, images, kept = random_state(200, 13)
+    state, images, usable = random_state(200, 13)
     plain = State(*(part.double().requires_grad_() for part in state))
     fused = State(*(part.clone().requires_grad_() for part in state))
-    slow = difference(factors(plain), images.double(), kept == 0.0).mean()
-    fast = data_term(factors(fused), images, kept)
+    slow = measure_differences(build_model(plain), images.double(), usable == 0.0).mean()
+    fast = data_term(build_model(fused), images, usable)
     slow.backward()
     fast.backward()
     assert float(fast.detach()) == pytest.approx(float(slow.detach()), rel=1e-5)

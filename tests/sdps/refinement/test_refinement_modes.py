@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from sdps.core.metrics import angle_degrees
-from sdps.refinement.image_model import LOBES, SHAPES, State, factors
-from sdps.refinement.modes import ASSET, MODES, factor, fitted, terms
+from sdps.refinement.image_model import State, build_model
+from sdps.refinement.modes import ASSET, evaluate_modes, fit_modes
 from sdps.refinement.refine import RefineConfig, refine
+from sdps.refinement.reflectance import LOBES, MODES, SHAPES
 
 FABRIC = torch.tensor([0.1, -0.5, 0.3, 0.1, -0.6, 0.2])
 """Of the size that fitted materials have."""
@@ -24,13 +25,6 @@ def sphere(side: int = 40, lights: int = 50) -> tuple[np.ndarray, np.ndarray, np
     return mask, normals.astype(np.float32), (found / np.linalg.norm(found, axis=1, keepdims=True)).astype(np.float32)
 
 
-def test_nothing_is_added_without_modes_and_where_light_and_camera_face_the_surface() -> None:
-    _, normals, lights = (torch.from_numpy(part) for part in sphere())
-    assert torch.equal(factor(normals, lights, torch.zeros(MODES)), torch.ones(len(normals), len(lights)))
-    facing = torch.tensor([[0.0, 0.0, 1.0]])
-    assert float(terms(facing, facing).abs().max()) < 1e-3
-
-
 def test_modes_that_images_were_made_with_are_found() -> None:
     _, normals, lights = (torch.from_numpy(part) for part in sphere())
     state = State(
@@ -39,11 +33,11 @@ def test_modes_that_images_were_made_with_are_found() -> None:
         directions=lights, log_intensities=torch.zeros(len(lights), 3), whiteness=torch.tensor(0.0),
         modes=torch.zeros(MODES),
     )  # fmt: skip
-    made = factors(state)
+    model = build_model(state)
     shade = (normals @ lights.T).clamp_min(0.0)
-    images = (shade * factor(normals, lights, FABRIC))[:, None].repeat(1, 3, 1)
-    found = factor(normals, lights, fitted(made, images, torch.ones_like(shade)))
-    expected = factor(normals, lights, FABRIC)
+    images = (shade * evaluate_modes(normals, lights, FABRIC))[:, None].repeat(1, 3, 1)
+    found = evaluate_modes(normals, lights, fit_modes(model, images, torch.ones_like(shade)))
+    expected = evaluate_modes(normals, lights, FABRIC)
     ratio = torch.log(found / expected)[shade > 0.1]
     # A constant is the albedo's; what is left of the logarithms' spread:
     assert float(ratio.std()) < 0.3 * float(expected.log()[shade > 0.1].std())
@@ -51,7 +45,7 @@ def test_modes_that_images_were_made_with_are_found() -> None:
 
 def test_a_sphere_that_is_neither_matte_nor_glossy_keeps_its_shape(monkeypatch: pytest.MonkeyPatch) -> None:
     mask, normals, lights = sphere()
-    bent = factor(torch.from_numpy(normals), torch.from_numpy(lights), FABRIC).numpy()
+    bent = evaluate_modes(torch.from_numpy(normals), torch.from_numpy(lights), FABRIC).numpy()
     images = np.zeros((len(lights), *mask.shape, 3), np.float32)
     images[:, mask] = (np.maximum(normals @ lights.T, 0.0) * bent).T[..., None] * [0.5, 0.4, 0.3]
     truth = np.zeros((*mask.shape, 3), np.float32)
@@ -59,7 +53,7 @@ def test_a_sphere_that_is_neither_matte_nor_glossy_keeps_its_shape(monkeypatch: 
     off = []
     for known in (False, True):
         if not known:
-            monkeypatch.setattr("sdps.refinement.descent.fitted", lambda *_: torch.zeros(MODES))
+            monkeypatch.setattr("sdps.refinement.descent.fit_modes", lambda *_: torch.zeros(MODES))
         config = RefineConfig(coarse_pixels=800, iterations=200, iterations_before=0, fine_iterations=0)
         found = refine(images, mask, truth, lights, np.ones(len(lights)), config=config)
         off.append(float(angle_degrees(found.normals[mask], normals).mean()))

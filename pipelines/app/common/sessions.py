@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipelines.app.work.refusals import GONE, Refused, spelled
+from pipelines.app.common.refusals import GONE, Refused, format_size
 from render.shared.errors import InputError
 
 try:
@@ -28,7 +28,7 @@ COOKIE = "sdps-session"
 _IDLE = 6 * 3600.0
 _MOST = 32  # sessions at once; of those that hold nothing, then of all, the one that was idle longest goes
 _AT_A_TIME = 4 * _MOST  # between two looks at which sessions ended
-_SET = re.compile(r"[0-9a-f]{16}")  # what `new_place` calls them; other folders are those of the other rooms
+_SET = re.compile(r"[0-9a-f]{16}")  # what `make_place` calls them; other folders are those of the other rooms
 
 
 @dataclass
@@ -64,7 +64,7 @@ class Session:
         """
         with self.lock:
             if self.taken + size > most:
-                raise InputError(f"{what}; all uploads together may have {spelled(max(most - self.taken, 0))} more")
+                raise InputError(f"{what}; all uploads together may have {format_size(max(most - self.taken, 0))} more")
             self.taken += size
 
     def give(self, size: int) -> None:
@@ -85,7 +85,7 @@ class Session:
             self._kept[place] = size if replace else old + size
             return old if replace else 0
 
-    def place(self, name: str) -> Path:
+    def find_place(self, name: str) -> Path:
         """Return the folder of a set of photographs.
 
         Raises:
@@ -99,7 +99,7 @@ class Session:
             self._sets[name] = None  # the one used last is last
         return path
 
-    def new_place(self) -> str:
+    def make_place(self) -> str:
         """Make an empty folder for a set and return its name."""
         name = secrets.token_hex(8)
         (self.folder / name).mkdir(parents=True)
@@ -152,9 +152,9 @@ class Sessions:
 
     def __init__(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
-        handle = _hold(self.folder)
+        handle = _lock_folder(self.folder)
         self._release = weakref.finalize(self, os.close, handle) if handle is not None else lambda: None
-        _remove_left(self.folder.parent)
+        _remove_leftovers(self.folder.parent)
         self._sessions: dict[str, Session] = {}
         self._lock = threading.Lock()
 
@@ -201,7 +201,7 @@ class Sessions:
         """
         with self._lock:
             there = list(self._sessions.values())
-        full = {item.token for item in there if _holds_something(item.folder)}
+        full = {item.token for item in there if _is_used(item.folder)}
         now = time.monotonic()
         with self._lock:
             newest = sorted(there, key=lambda item: (item.token in full, item.used), reverse=True)
@@ -220,7 +220,7 @@ class Sessions:
         self._release()
 
 
-def _holds_something(folder: Path) -> bool:
+def _is_used(folder: Path) -> bool:
     try:
         with os.scandir(folder) as found:
             return any(found)
@@ -228,7 +228,7 @@ def _holds_something(folder: Path) -> bool:
         return False
 
 
-def _hold(folder: Path) -> int | None:
+def _lock_folder(folder: Path) -> int | None:
     """Lock a folder for as long as this process lives; return the handle, None where it is locked or cannot be."""
     if fcntl is None:
         return None
@@ -243,11 +243,11 @@ def _hold(folder: Path) -> int | None:
         return None
 
 
-def _remove_left(parent: Path) -> None:
+def _remove_leftovers(parent: Path) -> None:
     """Remove folders of servers that were killed: no process holds them. One that was made just now may yet be held."""
     for folder in parent.glob(f"{_PREFIX}*"):
         with suppress(OSError):
-            handle = _hold(folder) if time.time() - folder.stat().st_mtime > _NEW else None
+            handle = _lock_folder(folder) if time.time() - folder.stat().st_mtime > _NEW else None
             if handle is not None:
                 shutil.rmtree(folder, ignore_errors=True)
                 os.close(handle)

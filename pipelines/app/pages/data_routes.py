@@ -14,8 +14,8 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from pipelines.app.rooms.handling import file_inside, queued
-from pipelines.app.work.jobs import finite
+from pipelines.app.common.jobs import replace_nonfinite
+from pipelines.app.pages.handling import find_file, find_tab_folder, make_tab_folder, queue_task
 from pipelines.report.sections import FOLDER as REPORT
 from pipelines.report.sections import read_sections
 from pipelines.shared import pictures
@@ -26,7 +26,7 @@ from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import read_whole_lines
 
-_PLACE = "shard"
+_ROOM = "data"
 _DEEP, _MOST = 4, 300
 _SIDE = 96
 _POINTS = 400  # of a learning curve
@@ -49,16 +49,16 @@ def _folder(request: Request) -> Path:
 async def listing(request: Request) -> Response:
     """Send the data folders and runs there are, newest first."""
     root = Path(request.app.state.folder).resolve()
-    rows = await asyncio.to_thread(_rows, root)
+    rows = await asyncio.to_thread(_list_rows, root)
     return JSONResponse({"root": str(request.app.state.folder), "rows": rows})
 
 
-def _rows(root: Path) -> list[dict[str, str]]:
-    found = sorted(_found(root), reverse=True)[:_MOST]
+def _list_rows(root: Path) -> list[dict[str, str]]:
+    found = sorted(_find_folders(root), reverse=True)[:_MOST]
     return [{"folder": str(path.relative_to(root)), "kind": kind} for _, kind, path in found]
 
 
-def _found(root: Path) -> Iterator[tuple[float, str, Path]]:
+def _find_folders(root: Path) -> Iterator[tuple[float, str, Path]]:
     for place, folders, files in os.walk(root):
         path = Path(place)
         # Folders may be removed while this looks at them, and names that are not valid text cannot be sent.
@@ -81,10 +81,10 @@ async def scenes(request: Request) -> Response:
 def _scenes(folder: Path) -> list[dict[str, Any]]:
     manifest = read_manifest(folder)
     failed = survey(folder, manifest).failed
-    return [_row(scene, folder, failed.get(scene.id)) for scene in manifest]
+    return [_describe_scene(scene, folder, failed.get(scene.id)) for scene in manifest]
 
 
-def _row(scene: SceneSpec, folder: Path, failures: list[dict[str, Any]] | None) -> dict[str, Any]:
+def _describe_scene(scene: SceneSpec, folder: Path, failures: list[dict[str, Any]] | None) -> dict[str, Any]:
     there = (folder / scene.file).is_file()
     return {
         "id": scene.id, "shape": scene.shape, "material": scene.material, "split": scene.split,
@@ -98,32 +98,32 @@ async def scene(request: Request) -> Response:
     """Send the strip of pictures and the mean radiance of one scene."""
     folder, name = _folder(request), request.query_params.get("id")
     async with request.app.state.reading:
-        found = await asyncio.to_thread(_shown, folder, name)
+        found = await asyncio.to_thread(_read_scene, folder, name)
     return JSONResponse(found)
 
 
-def _shown(folder: Path, name: str | None) -> dict[str, Any]:
-    chosen = _chosen(folder, name)
+def _read_scene(folder: Path, name: str | None) -> dict[str, Any]:
+    chosen = _find_scene(folder, name)
     path = folder / chosen.file
-    return _strip(path, chosen, _changed(path))
+    return _draw_strip(path, chosen, _read_time(path))
 
 
 @lru_cache(maxsize=1024)
-def _strip(path: Path, scene: SceneSpec, _time: int) -> dict[str, Any]:
+def _draw_strip(path: Path, scene: SceneSpec, _time: int) -> dict[str, Any]:
     shard = read_shard(path, scene)
     strip = pictures.fitted(pictures.preview_strip(shard, lights=3), _SIDE)
     inside = shard.images[:, shard.mask]
     mean = float(inside.mean(dtype="float64")) if inside.size else math.nan
-    return finite({"picture": pictures.data_uri(strip, quality=82), "radiance": round(mean, 5)})
+    return replace_nonfinite({"picture": pictures.data_uri(strip, quality=82), "radiance": round(mean, 5)})
 
 
-def _chosen(folder: Path, name: str | None) -> SceneSpec:
+def _find_scene(folder: Path, name: str | None) -> SceneSpec:
     """Return a scene of a data folder; of a large one this takes seconds, so not on the event loop.
 
     Raises:
         InputError: there is none of this name.
     """
-    chosen = _manifest(folder, _changed(folder / MANIFEST)).get(name or "")
+    chosen = _manifest(folder, _read_time(folder / MANIFEST)).get(name or "")
     if chosen is None:
         raise InputError("no such scene")
     return chosen
@@ -134,7 +134,7 @@ def _manifest(folder: Path, _time: int) -> dict[str, SceneSpec]:
     return {scene.id: scene for scene in read_manifest(folder)}
 
 
-def _changed(path: Path) -> int:
+def _read_time(path: Path) -> int:
     """Return when a file was changed, in nanoseconds; 0 where there is none, which its reader then says."""
     try:
         return path.stat().st_mtime_ns
@@ -145,16 +145,15 @@ def _changed(path: Path) -> int:
 async def start(request: Request) -> Response:
     """Queue the preparation of a scene for the lamp."""
     folder = _folder(request)
-    chosen = await asyncio.to_thread(_chosen, folder, request.query_params.get("id"))
-    place = request.state.session.folder / _PLACE
-    place.mkdir(exist_ok=True)
-    return queued(request, "shard", place=str(place), shard=str(folder / chosen.file))
+    chosen = await asyncio.to_thread(_find_scene, folder, request.query_params.get("id"))
+    place = make_tab_folder(request, _ROOM)
+    return queue_task(request, "shard", place=str(place), shard=str(folder / chosen.file))
 
 
 async def file(request: Request) -> Response:
     """Send what was made of the scene under the lamp."""
     name = request.path_params["name"]
-    path = request.state.session.folder / _PLACE / name
+    path = find_tab_folder(request, _ROOM) / name
     if name not in ("basis.bin", "truth.bin") or not path.is_file():
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path)
@@ -172,18 +171,18 @@ def _curves(folder: Path) -> dict[str, dict[str, list[list[float]]]]:
         series: dict[str, list[list[float]]] = {}
         for row in read_whole_lines(path):
             for key, value in row.items() if isinstance(row, dict) and "step" in row else ():
-                if (key == "loss" or key.startswith("val_")) and _drawn(value) and _drawn(row["step"]):
+                if (key == "loss" or key.startswith("val_")) and _can_be_drawn(value) and _can_be_drawn(row["step"]):
                     series.setdefault(key, []).append([row["step"], value])
-        found[path.parent.name] = {key: _thinned(values) for key, values in series.items()}
+        found[path.parent.name] = {key: _thin(values) for key, values in series.items()}
     return found
 
 
-def _drawn(value: object) -> bool:
+def _can_be_drawn(value: object) -> bool:
     """Tell whether a value has a place in a plot; those of a training that diverged have none."""
     return isinstance(value, int | float) and abs(value) < 1e300  # NaN is not below it either
 
 
-def _thinned(values: list[list[float]]) -> list[list[float]]:
+def _thin(values: list[list[float]]) -> list[list[float]]:
     step = -(-len(values) // _POINTS)
     return values[::step] + ([values[-1]] if (len(values) - 1) % step else [])
 
@@ -195,13 +194,13 @@ async def sections(request: Request) -> Response:
 
 
 def _sections(folder: Path) -> str:
-    return json.dumps(finite([to_plain(section) for _, section in read_sections(folder)]))
+    return json.dumps(replace_nonfinite([to_plain(section) for _, section in read_sections(folder)]))
 
 
 async def picture(request: Request) -> Response:
     """Send a picture of a section."""
     report = _folder(request) / REPORT
-    path = file_inside(report, f"{request.query_params.get('section', '')}/{request.query_params.get('file', '')}")
+    path = find_file(report, f"{request.query_params.get('section', '')}/{request.query_params.get('file', '')}")
     if path is None or path.suffix not in (".png", ".jpg"):
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path)

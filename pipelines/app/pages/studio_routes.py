@@ -7,17 +7,17 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from pipelines.app.rooms.handling import queued, taking_uploads
-from pipelines.app.work import uploads
-from pipelines.app.work.archives import unpack
-from pipelines.app.work.incoming import Incoming, incoming, off_loop, receive
-from pipelines.app.work.sessions import Session
-from pipelines.app.work.uploads import Limits
+from pipelines.app.common import uploads
+from pipelines.app.common.archives import unpack
+from pipelines.app.common.incoming import Incoming, open_upload, receive, run_in_thread
+from pipelines.app.common.sessions import Session
+from pipelines.app.common.uploads import Limits
+from pipelines.app.pages.handling import accept_uploads, find_tab_folder, make_tab_folder, queue_task
 from render.shared.errors import unknown
 
 UPLOADS = "uploads"
 MESHES, MATERIALS = (".ply", ".obj", ".stl", ".off", ".glb"), (".yaml", ".yml", ".binary", ".bsdf", ".zip")
-_PLACE = "studio"
+_ROOM = "studio"
 _ASKED = ("shape", "material", "yaw", "pitch", "roll", "bounces", "size", "direct")
 _TASKS = ("gallery", "scene", "keep", "preset")
 _MOST = 20
@@ -25,38 +25,36 @@ _MOST = 20
 
 async def start(request: Request) -> Response:
     """Queue a task: the gallery, a scene, its files or a preset of such scenes."""
-    session: Session = request.state.session
     task = request.path_params["task"]
     if task not in _TASKS:
         raise unknown("task", task, _TASKS)
     arguments: dict[str, Any] = {}
     if task != "gallery":
-        place = session.folder / _PLACE
-        place.mkdir(exist_ok=True)
-        asked = await uploads.settings(request.stream())
+        asked = await uploads.read_settings(request.stream())
+        place = make_tab_folder(request, _ROOM)
         arguments = {"place": str(place)} | {name: asked[name] for name in _ASKED if name in asked}
         if task != "scene":
             arguments.pop("direct", None)
-    return queued(request, task, **arguments)
+    return queue_task(request, task, **arguments)
 
 
-@taking_uploads
+@accept_uploads
 async def upload(request: Request) -> Response:
     """Take a mesh, a material file, or a ZIP of PBR maps, which becomes a folder."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
     folder = session.folder / UPLOADS
     folder.mkdir(exist_ok=True)
-    given = uploads.safe_name(request.path_params["name"], MESHES + MATERIALS)
+    given = uploads.clean_name(request.path_params["name"], MESHES + MATERIALS)
     name = Path(given).stem if given.lower().endswith(".zip") else given
-    async with incoming(session, limits.bytes, f"{UPLOADS}/{name}") as coming:
+    async with open_upload(session, limits.bytes, f"{UPLOADS}/{name}") as coming:
         path = coming.folder / given
         await receive(request.stream(), path, coming, uploads.most_bytes(given))
-        await off_loop(_take_in, coming, path, folder / name, limits)
+        await run_in_thread(_accept, coming, path, folder / name, limits)
     return JSONResponse({"name": name})
 
 
-def _take_in(coming: Incoming, path: Path, target: Path, limits: Limits) -> None:
+def _accept(coming: Incoming, path: Path, target: Path, limits: Limits) -> None:
     """Put what was uploaded where the studio looks for it, in place of what had the same name."""
     if path.suffix.lower() == ".zip":
         archive, path = path, coming.folder / "maps"
@@ -65,9 +63,9 @@ def _take_in(coming: Incoming, path: Path, target: Path, limits: Limits) -> None
 
 
 async def file(request: Request) -> Response:
-    """Send what was made of the last scene."""
+    """Send what was made of the tab's last scene."""
     name = request.path_params["name"]
-    path = request.state.session.folder / _PLACE / name
+    path = find_tab_folder(request, _ROOM) / name
     if name not in ("basis.bin", "truth.bin", "direct.bin", "scene.zip") or not path.is_file():
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path, filename=name if name.endswith(".zip") else None)

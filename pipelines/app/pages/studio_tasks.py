@@ -60,7 +60,7 @@ def scene(place: str, direct: bool = False, **asked: Any) -> dict[str, Any]:
     Args:
         place: Its folder; gets `basis.bin` and, with `direct`, `direct.bin`, the same without interreflections.
         direct: Leave interreflections out.
-        asked: What `wanted` takes.
+        asked: What `check_choice` takes.
 
     Returns:
         What the page needs to know.
@@ -70,12 +70,12 @@ def scene(place: str, direct: bool = False, **asked: Any) -> dict[str, Any]:
     """
     import render
 
-    spec = wanted(Path(place), **asked)
+    spec = check_choice(Path(place), **asked)
     stage("rendering")
-    view = render.render_view(**_arguments(spec), spp=_SPP, bounces=0 if direct else spec["bounces"])
+    view = render.render_view(**_collect_arguments(spec), spp=_SPP, bounces=0 if direct else spec["bounces"])
     if direct:
         stored = read_json(Path(place) / "view.json", "render the scene first")
-        _write(Path(place) / "direct.bin", _coded(view.images, stored["exposure"]))
+        _write(Path(place) / "direct.bin", _encode(view.images, stored["exposure"]))
         return {}
     exposure = pictures.auto_exposure(view.images, view.mask)
     about = write_basis(Path(place), view.images, view.light_directions, view.normals, view.depth, view.mask, exposure)
@@ -91,13 +91,13 @@ def write_basis(
     `basis.bin`: uint8 images (L, h, w, 3), round(255 sqrt(radiance * exposure / 4)), then `truth.bin`: int8 normals
     (h, w, 3), n * 127, and uint8 depth (h, w), 1 to 255 from far to near, 0 outside the mask.
     """
-    _write(folder / "basis.bin", _coded(images, exposure))
+    _write(folder / "basis.bin", _encode(images, exposure))
     inside = depth[mask]
     near = 1 + 254 * (depth - inside.min()) / max(float(np.ptp(inside)), 1e-9)
     parts = np.rint(normals * 127).astype(np.int8), np.where(mask, near, 0).astype(np.uint8)
     _write(folder / "truth.bin", b"".join(part.tobytes() for part in parts))
     about = {
-        "lights": np.round(lights.astype(float), 5).tolist(), "triangles": triangles(lights), "exposure": exposure,
+        "lights": np.round(lights.astype(float), 5).tolist(), "triangles": triangulate(lights), "exposure": exposure,
         "headroom": _HEADROOM, "width": mask.shape[1], "height": mask.shape[0],
     }  # fmt: skip
     write_json(folder / "view.json", about)
@@ -110,7 +110,7 @@ def _write(path: Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def triangles(lights: np.ndarray) -> list[list[int]]:
+def triangulate(lights: np.ndarray) -> list[list[int]]:
     """Return triangles of neighbouring lights (L, 3), by their numbers; none where all lie on a line."""
     try:
         return Delaunay(lights[:, :2] / (1.0 + lights[:, 2:])).simplices.tolist()
@@ -118,7 +118,7 @@ def triangles(lights: np.ndarray) -> list[list[int]]:
         return []
 
 
-def shard_scene(place: str, shard: str) -> dict[str, Any]:
+def prepare_shard(place: str, shard: str) -> dict[str, Any]:
     """Prepare a shard for the page, as `scene` does with what it renders."""
     read: Shard = read_shard(Path(shard))
     images = read.images.astype(np.float32)
@@ -134,17 +134,17 @@ def keep(place: str, **asked: Any) -> str:
     """
     import render
 
-    folder, spec = Path(place), wanted(Path(place), **asked)
+    folder, spec = Path(place), check_choice(Path(place), **asked)
     stage("rendering")
-    view = render.render_view(**_arguments(spec), spp=_FINAL_SPP, bounces=spec["bounces"])
+    view = render.render_view(**_collect_arguments(spec), spp=_FINAL_SPP, bounces=spec["bounces"])
     write_shard(folder / "scene.exr", view.shard("scene"))
     with (
         atomic_path(folder / "scene.zip") as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as opened,
     ):
         opened.write(folder / "scene.exr", "scene.exr")
-        opened.writestr("scene.yaml", _test_preset(spec))
-        opened.writestr("repeat.py", _program(spec, view.scene))
+        opened.writestr("scene.yaml", _make_test_preset(spec))
+        opened.writestr("repeat.py", _make_program(spec, view.scene))
         opened.writestr("README.txt", _ABOUT)
         for name in (Path(spec["shape"]), Path(spec["material"])):
             for file in [name] if name.is_file() else name.glob("*"):
@@ -158,24 +158,24 @@ scene.yaml  preset of test scenes of this shape and material, upright: sdps rege
 """
 
 
-def training_preset(place: str, **asked: Any) -> str:
+def make_training_preset(place: str, **asked: Any) -> str:
     """Return the YAML of a preset that trains on such scenes: many shapes of the family in this material.
 
     Raises:
         InputError: a shape that belongs to no family.
     """
-    spec = wanted(Path(place), **asked)
+    spec = check_choice(Path(place), **asked)
     family = spec["shape"].split(":")[0]
     if family not in _SEEDED:
         raise InputError("training needs many shapes; choose blobby or sculpture, or see `meshes` in the guide")
     data = {
-        "families": {family: 200}, "views": 2, "materials_per_view": 1, "materials": [_local(spec["material"])],
+        "families": {family: 200}, "views": 2, "materials_per_view": 1, "materials": [_shorten(spec["material"])],
         "bounces": spec["bounces"], "light_count": 64, "size": 128, "spp": 64,
     }  # fmt: skip
-    return to_yaml({"name": "my-scenes", "description": f"{family} in {_local(spec['material'])}", "data": data})
+    return to_yaml({"name": "my-scenes", "description": f"{family} in {_shorten(spec['material'])}", "data": data})
 
 
-def wanted(place: Path, **asked: Any) -> dict[str, Any]:
+def check_choice(place: Path, **asked: Any) -> dict[str, Any]:
     """Return the shape, material and pose that were asked for, checked; uploads are files of the scene's folder.
 
     Raises:
@@ -201,32 +201,32 @@ def wanted(place: Path, **asked: Any) -> dict[str, Any]:
     return {"shape": shape, "material": material, "rotation": rotation, "bounces": bounces, "size": size}
 
 
-def _arguments(spec: dict[str, Any]) -> dict[str, Any]:
+def _collect_arguments(spec: dict[str, Any]) -> dict[str, Any]:
     rotation = np.array(spec["rotation"])
     return {name: spec[name] for name in ("shape", "material", "size")} | {"lights": _LIGHTS, "rotation": rotation}
 
 
-def _local(name: str) -> str:
+def _shorten(name: str) -> str:
     path = Path(name)
     return name if not path.is_absolute() else f"./{path.name}" if path.is_dir() else path.name
 
 
-def _coded(images: np.ndarray, exposure: float) -> bytes:
+def _encode(images: np.ndarray, exposure: float) -> bytes:
     """Return images as uint8, the square root over the headroom."""
     return (255 * np.sqrt(np.clip(images * (exposure / _HEADROOM), 0, 1)) + 0.5).astype(np.uint8).tobytes()
 
 
-def _test_preset(spec: dict[str, Any]) -> str:
+def _make_test_preset(spec: dict[str, Any]) -> str:
     test = {
-        "shapes": [_local(spec["shape"])], "materials": [_local(spec["material"])], "lights": _LIGHTS,
+        "shapes": [_shorten(spec["shape"])], "materials": [_shorten(spec["material"])], "lights": _LIGHTS,
         "size": spec["size"], "spp": _FINAL_SPP, "bounces": spec["bounces"], "scale": 0.9,
     }  # fmt: skip
     return to_yaml({"name": "my-scene", "description": "A scene of the studio.", "test": test})
 
 
-def _program(spec: dict[str, Any], made: SceneSpec) -> str:
+def _make_program(spec: dict[str, Any], made: SceneSpec) -> str:
     """Return the Python program that writes the shard again."""
-    shape, material = repr(_local(spec["shape"])), repr(_local(spec["material"]))
+    shape, material = repr(_shorten(spec["shape"])), repr(_shorten(spec["material"]))
     return (
         f'"""Writes scene.exr; its manifest line is {made.digest()}."""\n\nimport numpy as np\n\nimport render\n\n'
         f"view = render.render_view(\n    {shape}, {material}, {_LIGHTS!r}, size={spec['size']}, spp={_FINAL_SPP}, "

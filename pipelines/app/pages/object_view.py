@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
+from pipelines.app.pages.reflectance_tables import build_tables
 from pipelines.infer import depth_picture
 from pipelines.shared import pictures
 from render.shared.progress import stage
+from sdps.refinement.reflectance import shade
 from sdps.surface.meshing import mesh, write_mesh
 
 if TYPE_CHECKING:
@@ -27,8 +29,8 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
     """Write pictures, a mesh and arrays of an inference, and return what the page has to know of them.
 
     `basis.bin` holds little-endian int16 normals (h, w, 3), n * 32767, uint16 albedo (h, w, 3) and highlight strength
-    (h, w), each over its largest value in the description; `observed.npy` (h, w, L) float16 the grey photographs and
-    `model.npy` what explains them.
+    (h, w), each over its largest value in the description; `tables.bin`, of a refined object, what `build_tables`
+    returns; `observed.npy` (h, w, L) float16 the grey photographs and `model.npy` what explains them.
     """
     mask, normals = result.photos.mask, result.normals
     step = -(-max(mask.shape) // SIDE)
@@ -42,6 +44,10 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
         np.rint(strength[few] / shine * _FULL).astype("<u2"),
     ]  # fmt: skip
     (folder / "basis.bin").write_bytes(b"".join(part.tobytes() for part in parts))
+    tables = None
+    if lobes:
+        tables, values = build_tables(lobes)
+        (folder / "tables.bin").write_bytes(values)
     height, width = mask[few].shape
     Image.fromarray(pictures.normal_map(normals, mask)).save(folder / "normals.png")
     Image.fromarray(depth_picture(result)).save(folder / "depth.png")
@@ -54,7 +60,7 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
     return {
         "verdict": result.verdict, "method": result.method, "seconds": facts["seconds"], "terms": facts["terms"],
         "width": width, "height": height, "step": step, "full": [mask.shape[1], mask.shape[0]], "albedo": peak * scale,
-        "strength": shine * scale if lobes else 0.0, "lobes": lobes, "files": list(result.photos.files),
+        "strength": shine * scale if lobes else 0.0, "tables": tables, "files": list(result.photos.files),
         "lights": np.round(result.light_directions, 5).tolist() if found else [],
         "intensities": _grey(result.gains).round(4).tolist() if found else [],
         "confidence": [confidence[name] for name in result.photos.files] if confidence else [],
@@ -63,12 +69,10 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def shading(
+def shade_object(
     normals: np.ndarray, albedo: np.ndarray, strength: np.ndarray, lobes: dict[str, list[float]], light: np.ndarray
 ) -> np.ndarray:  # (h, w, 3)
-    """Return the radiance under a light of intensity 1: Lambert's law, or the model of `sdps.refinement`.
-
-    `static/relight.js` computes the same.
+    """Return the radiance under a light of intensity 1: Lambert's law, or `sdps.refinement.reflectance`.
 
     Args:
         normals: (h, w, 3), zero outside the object.
@@ -77,25 +81,12 @@ def shading(
         lobes: `amplitudes`, `sharpness`, `body` and `modes` of a refined object; empty for Lambert's law.
         light: (3,) unit.
     """
-    cosine = np.maximum(normals @ light, 0.0)
     if not lobes:
-        return albedo * cosine[..., None]
-    half = light + np.array([0.0, 0.0, 1.0])
-    half = half / np.linalg.norm(half)
-    view = np.maximum(normals[..., 2], 0.02)
-    lit = np.maximum(cosine, 0.02)
-    x, y = 1.0 - lit, 1.0 - view
-    opposed = light[2] - lit * view
-    opposed = opposed / np.where(opposed > 0, np.maximum(lit, view), 1.0)
-    b = lobes["body"]
-    body = np.exp(b[0] * (x + y) + b[1] * x * y + b[2] * (x * x + y * y) + b[3] * opposed)
-    away = normals @ half - 1.0
-    slant, tilt = x + y, np.maximum(-away, 0.0)
-    terms = [slant * opposed, (1.0 - light[2]) * opposed, slant * x * y, slant * (x - y) ** 2, tilt**2, np.sqrt(tilt)]
-    factor = np.exp(np.clip(sum(m * term for m, term in zip(lobes["modes"], terms, strict=True)), -0.7, 0.7))
-    glints = sum(a * np.exp(k * away) for a, k in zip(lobes["amplitudes"], lobes["sharpness"], strict=True))
-    shine = strength * glints / max(float(light @ half), 1e-3) ** 2
-    return (albedo * body[..., None] + shine[..., None]) * (cosine * factor)[..., None]
+        return albedo * np.maximum(normals @ light, 0.0)[..., None]
+    numbers = {name: np.array(values) for name, values in lobes.items()}
+    shape = normals.shape
+    pixels = normals.reshape(-1, 3), light[None], albedo.reshape(-1, 3), strength.reshape(-1)
+    return shade(*pixels, **numbers).reshape(shape)
 
 
 def _reflectance(result: "Inference") -> tuple[np.ndarray, np.ndarray, dict[str, list[float]]]:
@@ -124,7 +115,7 @@ def _observations(
     gains = _grey(result.gains)
     lights = result.light_directions.astype(np.float64)
     model = np.stack(
-        [gain * _grey(shading(normals, albedo, strength, lobes, light))
+        [gain * _grey(shade_object(normals, albedo, strength, lobes, light))
          for gain, light in zip(gains, lights, strict=True)], axis=-1,
     )  # fmt: skip
     scale = float((observed * model).sum() / max(float((model**2).sum()), 1e-12))

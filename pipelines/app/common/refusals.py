@@ -22,14 +22,14 @@ class Refused(InputError):
         self.status = status
 
 
-def full(name: str, error: OSError) -> Refused | None:
+def explain_full_disk(name: str, error: OSError) -> Refused | None:
     """Return the refusal where the disk has no room for an upload, None for other errors."""
     if error.errno not in _FULL:
         return None
     return Refused(f"{name}: the disk of the server is full; free space on it and try again", 507)
 
 
-def spelled(size: int) -> str:
+def format_size(size: int) -> str:
     """Return a number of bytes in words."""
     if size < 2**20:
         return f"{size / 2**10:.0f} KiB"

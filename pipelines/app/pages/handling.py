@@ -1,8 +1,10 @@
-"""What the request handlers of all rooms share: uploads, queueing a job, files below a folder, numbers in a path."""
+"""What the request handlers of all rooms share: uploads, jobs, a tab's own folder, files below a folder, numbers."""
 
 import asyncio
 import functools
+import os
 import re
+import shutil
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
@@ -11,16 +13,18 @@ from typing import Any
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 
-from pipelines.app.work.refusals import Refused
+from pipelines.app.common.refusals import Refused
 from render.shared.errors import InputError
 
 _NUMBER = re.compile(r"[0-9]{1,9}")
+_TAB = re.compile(r"[0-9a-f]{0,16}")
+_MOST_TABS = 8
 _MOST_LEFT = 2**30
 _PATIENCE = 60.0
 Handler = Callable[[Request], Awaitable[Response]]
 
 
-def taking_uploads(handler: Handler) -> Handler:
+def accept_uploads(handler: Handler) -> Handler:
     """Return a handler that reads on to the end of a body it refuses; else the browser, which is still sending, would
     show a connection that was reset in place of the reason.
     """
@@ -46,7 +50,7 @@ async def _read_on(request: Request) -> None:
                     return
 
 
-def queued(request: Request, task: str, **arguments: Any) -> Response:
+def queue_task(request: Request, task: str, **arguments: Any) -> Response:
     """Queue a task for a request's session, and return the answer that describes it.
 
     Raises:
@@ -59,7 +63,31 @@ def queued(request: Request, task: str, **arguments: Any) -> Response:
     return JSONResponse(jobs.describe(job))
 
 
-def file_inside(folder: Path, name: str) -> Path | None:
+def find_tab_folder(request: Request, room: str) -> Path:
+    """Return a room's folder of the tab that asks, which may not exist yet: two tabs must not share a scene.
+
+    Raises:
+        InputError: the name that the tab gives itself is not one.
+    """
+    tab = request.query_params.get("tab", "")
+    if not _TAB.fullmatch(tab):
+        raise InputError("tab: must be at most 16 hexadecimal digits")
+    return request.state.session.folder / f"{room}-{tab}"
+
+
+def make_tab_folder(request: Request, room: str) -> Path:
+    """Return `find_tab_folder`, made if necessary; of too many tabs, those idle for longest lose their folders."""
+    folder = find_tab_folder(request, room)
+    folder.mkdir(exist_ok=True)
+    os.utime(folder)
+    others = sorted(folder.parent.glob(f"{room}-*"), key=lambda path: path.stat().st_mtime)
+    for old in others[:-_MOST_TABS]:
+        if not request.app.state.jobs.works_in(old):
+            shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def find_file(folder: Path, name: str) -> Path | None:
     """Return a file below a folder, None where there is none or the name leads out of it."""
     try:
         path = (folder / name).resolve()
@@ -68,7 +96,7 @@ def file_inside(folder: Path, name: str) -> Path | None:
         return None
 
 
-def number(request: Request, key: str) -> int:
+def read_number(request: Request, key: str) -> int:
     """Return a number of a request's path; -1, which nothing has, for other text and numbers without end."""
     text = request.path_params[key]
     return int(text) if _NUMBER.fullmatch(text) else -1

@@ -42,7 +42,7 @@ class Limits:
     pixels: int = 25_000_000
 
 
-def safe_name(name: str, allowed: tuple[str, ...] = PICTURES + BESIDE) -> str:
+def clean_name(name: str, allowed: tuple[str, ...] = PICTURES + BESIDE) -> str:
     """Return the last part of a name without odd characters, at most 200 bytes of it.
 
     Raises:
@@ -55,7 +55,7 @@ def safe_name(name: str, allowed: tuple[str, ...] = PICTURES + BESIDE) -> str:
     return last
 
 
-async def settings(stream: AsyncIterator[bytes]) -> dict[str, Any]:
+async def read_settings(stream: AsyncIterator[bytes]) -> dict[str, Any]:
     """Return the JSON object of a request's body.
 
     Raises:
@@ -80,7 +80,7 @@ def most_bytes(name: str) -> int | None:
     return _MOST_TEXT if Path(name).suffix.lower() in _TEXTS else None
 
 
-def kinds() -> str:
+def list_kinds() -> str:
     """Return the kinds of pictures in words: PNG, TIFF, ... or EXR."""
     *others, last = dict.fromkeys(SUFFIXES.values())
     return f"{', '.join(others)} or {last}"
@@ -95,34 +95,34 @@ def check_pixels(path: Path, limits: Limits) -> None:
     if path.suffix.lower() not in PICTURES:
         return
     try:
-        width, height = _size(path)
+        width, height = _read_size(path)
     except Image.DecompressionBombError as error:
-        raise InputError(_too_large(path, "has more pixels than a photograph", limits)) from error
+        raise InputError(_describe_excess(path, "has more pixels than a photograph", limits)) from error
     if width * height > limits.pixels or min(width, height) < 1:
-        raise InputError(_too_large(path, f"is {width}x{height} pixels", limits))
+        raise InputError(_describe_excess(path, f"is {width}x{height} pixels", limits))
 
 
-def _too_large(path: Path, what: str, limits: Limits) -> str:
+def _describe_excess(path: Path, what: str, limits: Limits) -> str:
     return (
         f"{path.name}: {what}; at most {limits.pixels / 1e6:.3g} million are allowed here, scale the pictures down or "
         "use `sdps infer`"
     )
 
 
-def _size(path: Path) -> tuple[int, int]:
+def _read_size(path: Path) -> tuple[int, int]:
     """Return (width, height) that the header tells. The kind is that of the content, whatever the name says."""
     try:
         with path.open("rb") as opened:
             head = opened.read(_EXR_HEADER)
         if head.startswith(_EXR):
-            return _exr_size(head)
+            return _read_exr_size(head)
         if head.startswith(_TIFF):
             import tifffile
 
             with tifffile.TiffFile(path) as file:
                 page = file.pages[0]
                 return int(page.imagewidth), int(page.imagelength)  # type: ignore[union-attr]
-        with Image.open(path, formats=_formats()) as image:
+        with Image.open(path, formats=_list_formats()) as image:
             return image.size
     except Image.DecompressionBombError:
         raise
@@ -131,14 +131,14 @@ def _size(path: Path) -> tuple[int, int]:
 
 
 @cache
-def _formats() -> list[str]:
+def _list_formats() -> list[str]:
     """Return what Pillow calls the kinds that are read, but TIFF; TGA last: its files begin with nothing fixed."""
     Image.init()
     known = {Image.registered_extensions().get(suffix) for suffix in PICTURES} & {*Image.OPEN} - {"TIFF"}
     return sorted(filter(None, known), key=lambda name: name == "TGA")
 
 
-def _exr_size(head: bytes) -> tuple[int, int]:
+def _read_exr_size(head: bytes) -> tuple[int, int]:
     """Return the largest (width, height) in an OpenEXR file's headers, read by hand: its library could take us down.
 
     A header is a magic number and a version, then attributes: name, type, length, value. Each part of a file has one,

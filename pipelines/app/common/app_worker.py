@@ -18,14 +18,14 @@ from render.shared.errors import InputError
 from render.shared.progress import listening
 
 TASKS = {
-    "example": "pipelines.app.rooms.photo_tasks:example",
-    "check": "pipelines.app.rooms.photo_tasks:check",
-    "infer": "pipelines.app.rooms.photo_tasks:infer",
-    "gallery": "pipelines.app.rooms.studio_tasks:gallery",
-    "scene": "pipelines.app.rooms.studio_tasks:scene",
-    "keep": "pipelines.app.rooms.studio_tasks:keep",
-    "preset": "pipelines.app.rooms.studio_tasks:training_preset",
-    "shard": "pipelines.app.rooms.studio_tasks:shard_scene",
+    "example": "pipelines.app.pages.photo_tasks:example",
+    "check": "pipelines.app.pages.photo_tasks:check",
+    "infer": "pipelines.app.pages.photo_tasks:infer",
+    "gallery": "pipelines.app.pages.studio_tasks:gallery",
+    "scene": "pipelines.app.pages.studio_tasks:scene",
+    "keep": "pipelines.app.pages.studio_tasks:keep",
+    "preset": "pipelines.app.pages.studio_tasks:make_training_preset",
+    "shard": "pipelines.app.pages.studio_tasks:prepare_shard",
 }
 """Task by name: module and function. Loaded when first asked for."""
 _STEP = 0.004  # smallest advance of a share that is told
@@ -35,7 +35,7 @@ def serve(pipe: Connection) -> None:
     """Run jobs until the other end of the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
     end_with_parent()
-    _warm()
+    _warm_up()
     while True:
         try:
             name, arguments = pipe.recv()
@@ -43,10 +43,10 @@ def serve(pipe: Connection) -> None:
             return
         answer: tuple[Any, ...]
         try:
-            with listening(_teller(pipe)):
-                result = task(name)(**arguments)
-            _tidy()
-            answer = ("done", result, memory())
+            with listening(_make_reporter(pipe)):
+                result = load_task(name)(**arguments)
+            _clean_up()
+            answer = ("done", result, measure_memory())
         except InputError as error:
             answer = ("failed", str(error))
         except MemoryError:
@@ -60,13 +60,13 @@ def serve(pipe: Connection) -> None:
             return
 
 
-def task(name: str) -> Callable[..., Any]:
+def load_task(name: str) -> Callable[..., Any]:
     """Return the function of a task."""
     module, function = TASKS[name].split(":")
     return getattr(importlib.import_module(module), function)
 
 
-def memory() -> int:
+def measure_memory() -> int:
     """Return the bytes this process holds now; where the system does not say, the most it ever held."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
@@ -74,7 +74,7 @@ def memory() -> int:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def _tidy() -> None:
+def _clean_up() -> None:
     """Give back what the libraries keep for later; a rare large scene would otherwise stay for good."""
     gc.collect()
     if "drjit" in sys.modules:
@@ -83,13 +83,13 @@ def _tidy() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _warm() -> None:
+def _warm_up() -> None:
     """Load what the first job would wait for."""
     for name in ("sdps.api", "render.api"):
         importlib.import_module(name)
 
 
-def _teller(pipe: Connection) -> Callable[[str, float], None]:
+def _make_reporter(pipe: Connection) -> Callable[[str, float], None]:
     """Return what passes stages on, but not every one of thousands."""
     last: list[Any] = ["", -1.0]
 

@@ -6,9 +6,9 @@ import stat
 import zipfile
 from pathlib import Path
 
-from pipelines.app.work.incoming import Incoming
-from pipelines.app.work.refusals import full
-from pipelines.app.work.uploads import Limits, check_pixels, kinds, most_bytes, safe_name
+from pipelines.app.common.incoming import Incoming
+from pipelines.app.common.refusals import explain_full_disk
+from pipelines.app.common.uploads import Limits, check_pixels, clean_name, list_kinds, most_bytes
 from render.shared.errors import InputError
 
 _CHUNK = 2**20
@@ -31,8 +31,8 @@ def unpack(archive: Path, folder: Path, limits: Limits, coming: Incoming) -> lis
     try:
         with _Archive(archive, "r+") as handle, zipfile.ZipFile(handle) as opened:
             left = archive.stat().st_size
-            for item in sorted(_usable(opened, archive.name, limits), key=lambda item: -item.header_offset):
-                files.append(folder / safe_name(item.filename))
+            for item in sorted(_choose_files(opened, archive.name, limits), key=lambda item: -item.header_offset):
+                files.append(folder / clean_name(item.filename))
                 _extract(opened, item, files[-1], coming)
                 check_pixels(files[-1], limits)
                 handle.truncate(item.header_offset)
@@ -43,7 +43,7 @@ def unpack(archive: Path, folder: Path, limits: Limits, coming: Incoming) -> lis
     except InputError:
         raise
     except Exception as error:  # damaged archives end in errors of many kinds: zlib.error, OSError of a seek
-        refusal = full(archive.name, error) if isinstance(error, OSError) else None
+        refusal = explain_full_disk(archive.name, error) if isinstance(error, OSError) else None
         raise refusal or InputError(f"{archive.name}: cannot be unpacked ({error}); make the ZIP again") from error
     return files
 
@@ -57,7 +57,7 @@ class _Archive(io.FileIO):
         return super().read(size if size is not None and size >= 0 else _MOST_LISTING) or b""
 
 
-def _usable(opened: zipfile.ZipFile, name: str, limits: Limits) -> list[zipfile.ZipInfo]:
+def _choose_files(opened: zipfile.ZipFile, name: str, limits: Limits) -> list[zipfile.ZipInfo]:
     """Return what is to be unpacked.
 
     Raises:
@@ -65,7 +65,7 @@ def _usable(opened: zipfile.ZipFile, name: str, limits: Limits) -> list[zipfile.
     """
     chosen: dict[str, zipfile.ZipInfo] = {}
     for item in opened.infolist():
-        last = None if item.is_dir() or _hidden(item.filename) else _name(item.filename)
+        last = None if item.is_dir() or _is_hidden(item.filename) else _name(item.filename)
         if last is None:
             continue
         if stat.S_ISLNK(item.external_attr >> 16):
@@ -80,7 +80,7 @@ def _usable(opened: zipfile.ZipFile, name: str, limits: Limits) -> list[zipfile.
         if len(chosen) > limits.files:
             raise InputError(f"{name}: more than {limits.files} files; leave some out")
     if not chosen:
-        raise InputError(f"{name}: no pictures in it; put {kinds()} files there")
+        raise InputError(f"{name}: no pictures in it; put {list_kinds()} files there")
     return list(chosen.values())
 
 
@@ -97,13 +97,13 @@ def _extract(opened: zipfile.ZipFile, item: zipfile.ZipInfo, path: Path, coming:
             target.write(chunk)
 
 
-def _hidden(name: str) -> bool:
+def _is_hidden(name: str) -> bool:
     return any(part.startswith((".", "__MACOSX")) for part in re.split(r"[/\\]", name) if part not in ("", ".", ".."))
 
 
 def _name(name: str) -> str | None:
     """Return what a file of an archive will be called, None where it is of no use."""
     try:
-        return safe_name(name)
+        return clean_name(name)
     except InputError:
         return None

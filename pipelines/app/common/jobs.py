@@ -15,7 +15,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from pipelines.app.work.app_worker import serve
+from pipelines.app.common.app_worker import serve
 
 QUEUED, RUNNING, DONE, FAILED, CANCELLED = "queued", "running", "done", "failed", "cancelled"
 _LIVE = (QUEUED, RUNNING)
@@ -66,7 +66,7 @@ class _Worker:
         other.close()
         self.condemned = False
 
-    def usable(self) -> bool:
+    def is_usable(self) -> bool:
         """Tell whether it can be given a job."""
         return not self.condemned and self.process.is_alive()
 
@@ -168,13 +168,13 @@ class Jobs:
     def _run(self) -> None:
         """Pass jobs to the worker, one after another; the worker starts before the first job, so that it is warm."""
         while True:
-            worker = self._ready()
+            worker = self._find_worker()
             with self._changed:
                 while not self._waiting and not self._closed:
                     self._changed.wait()
                 if self._closed:
                     break
-                if worker is None or not worker.usable():  # it may have died while there was nothing to do
+                if worker is None or not worker.is_usable():  # it may have died while there was nothing to do
                     continue
                 job = self._waiting.popleft()
                 job.state, job.began = RUNNING, time.monotonic()
@@ -189,10 +189,10 @@ class Jobs:
         if worker is not None:
             worker.end()
 
-    def _ready(self) -> _Worker | None:
+    def _find_worker(self) -> _Worker | None:
         """Return a worker that can be given a job: the one there is, or a new one; None where none can be started."""
         old = self._worker
-        if old is not None and old.usable():
+        if old is not None and old.is_usable():
             return old
         if old is not None:
             old.end()
@@ -223,7 +223,7 @@ class Jobs:
             elif kind == "failed":
                 self._end(job, FAILED, values[0])
             else:
-                job.result, self.worker_memory = finite(values[0]), values[1]
+                job.result, self.worker_memory = replace_nonfinite(values[0]), values[1]
                 self._end(job, DONE)
 
     def _end(self, job: Job, state: str, message: str = "") -> None:
@@ -233,10 +233,10 @@ class Jobs:
                 job.state = state
 
 
-def finite(value: Any) -> Any:
+def replace_nonfinite(value: Any) -> Any:
     """Return a result with None for numbers that JSON does not have; one of them would make all of it unreadable."""
     if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
+        return {key: replace_nonfinite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
+        return [replace_nonfinite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

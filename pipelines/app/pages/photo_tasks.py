@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pipelines.app.rooms import object_view
+from pipelines.app.pages import object_view
 from pipelines.shared import pictures
 from render.shared.errors import InputError
 from render.shared.files import write_json
@@ -80,11 +80,11 @@ def check(place: str, **options: Any) -> dict[str, Any]:
         "mask": photos.mask_origin if not (folder / PAINTED).is_file() else "painted",
         "pixels": int(photos.mask.sum()), "notes": list(photos.notes), "lit": photos.light_directions is not None,
         "findings": [{"level": item.level, "text": item.text, "images": list(item.images)} for item in findings],
-        "lights_there": _has_lights(folder / PHOTOS), "methods": methods(photos.light_directions is not None),
+        "lights_there": _has_lights(folder / PHOTOS), "methods": list_methods(photos.light_directions is not None),
     }  # fmt: skip
 
 
-def methods(lit: bool) -> list[dict[str, str]]:
+def list_methods(lit: bool) -> list[dict[str, str]]:
     """Return the methods that can be used, the recommended one first.
 
     Args:
@@ -126,7 +126,7 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
 
     folder = Path(place)
     run = folder / "runs" / str(number)
-    _sweep(run)
+    _remove_failed_runs(run)
     shares = _INFERRING | ({"refinement": 40.0} if refine or method.endswith("+refine") else {})
     with together(shares), _ShortPaths(folder):
         stage("reading")
@@ -138,19 +138,19 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
         shown = object_view.write(result, run / "view")
         result.save(run / "files")
         write_page(run / "files" / "report.html", result)
-    shown |= {"number": number, "error": _error(folder, result.normals, photos.mask)}
+    shown |= {"number": number, "error": _measure_error(folder, result.normals, photos.mask)}
     write_json(run / "view" / "view.json", shown)
     return shown
 
 
-def _sweep(run: Path) -> None:
+def _remove_failed_runs(run: Path) -> None:
     """Remove what earlier runs left that failed or were cancelled; this one's number is above theirs."""
     for old in run.parent.glob("*"):
         if int(old.name) < int(run.name) and not (old / VIEW / "view.json").is_file():
             shutil.rmtree(old, ignore_errors=True)
 
 
-def _error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float | None:
+def _measure_error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float | None:
     """Return the mean angular error in degrees where the truth is known, which it is of the example."""
     if not (folder / TRUTH).is_file():
         return None

@@ -13,14 +13,14 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from pipelines.app.rooms.handling import file_inside, number, queued, taking_uploads
-from pipelines.app.work import uploads
-from pipelines.app.work.archives import unpack
-from pipelines.app.work.incoming import Incoming, incoming, names, off_loop, receive
-from pipelines.app.work.jobs import finite
-from pipelines.app.work.refusals import Refused
-from pipelines.app.work.sessions import Session
-from pipelines.app.work.uploads import Limits
+from pipelines.app.common import uploads
+from pipelines.app.common.archives import unpack
+from pipelines.app.common.incoming import Incoming, list_names, open_upload, receive, run_in_thread
+from pipelines.app.common.jobs import replace_nonfinite
+from pipelines.app.common.refusals import Refused
+from pipelines.app.common.sessions import Session
+from pipelines.app.common.uploads import Limits
+from pipelines.app.pages.handling import accept_uploads, find_file, queue_task, read_number
 from render.shared.decoding import decoding
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_path
@@ -39,31 +39,31 @@ async def new(request: Request) -> Response:
     """Begin a set of photographs; the one unused for longest goes where there are a dozen."""
     session: Session = request.state.session
     gone = session.set_aside(_MOST_SETS - 1, request.app.state.jobs.works_in)
-    name = session.new_place()
+    name = session.make_place()
     (session.folder / name / PHOTOS).mkdir()
-    await off_loop(session.clear, gone)
+    await run_in_thread(session.clear, gone)
     return JSONResponse({"set": name})
 
 
-@taking_uploads
+@accept_uploads
 async def upload(request: Request) -> Response:
     """Take one file, or a ZIP that is unpacked at once: all of its files or none."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
     name, given = request.path_params["set"], request.path_params["name"]
-    folder = session.place(name) / PHOTOS
+    folder = session.find_place(name) / PHOTOS
     zipped = given.lower().endswith(".zip")
-    given = uploads.safe_name(given, (".zip",)) if zipped else uploads.safe_name(given)
-    if len(names(folder)) >= limits.files:
+    given = uploads.clean_name(given, (".zip",)) if zipped else uploads.clean_name(given)
+    if len(list_names(folder)) >= limits.files:
         raise InputError(f"more than {limits.files} files; leave some out")
-    async with incoming(session, limits.bytes, name) as coming:
+    async with open_upload(session, limits.bytes, name) as coming:
         path = coming.folder / given
         await receive(request.stream(), path, coming, uploads.most_bytes(given))
-        there = await off_loop(_take_in, coming, path, folder, limits)
+        there = await run_in_thread(_accept, coming, path, folder, limits)
     return JSONResponse({"files": there})
 
 
-def _take_in(coming: Incoming, path: Path, folder: Path, limits: Limits) -> int:
+def _accept(coming: Incoming, path: Path, folder: Path, limits: Limits) -> int:
     """Check what was uploaded, and move it into a set's folder; return how many files lie there then."""
     if path.suffix.lower() == ".zip":
         return coming.add(unpack(path, coming.folder / "unpacked", limits, coming), folder, limits.files)
@@ -71,23 +71,23 @@ def _take_in(coming: Incoming, path: Path, folder: Path, limits: Limits) -> int:
     return coming.add([path], folder, limits.files)
 
 
-@taking_uploads
+@accept_uploads
 async def paint(request: Request) -> Response:
     """Take a mask painted on the page, a PNG of the photographs' size; an empty body takes the painted one away."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
     name = request.path_params["set"]
-    folder = session.place(name)
-    async with incoming(session, limits.bytes, f"{name}/{PAINTED}") as coming:
+    folder = session.find_place(name)
+    async with open_upload(session, limits.bytes, f"{name}/{PAINTED}") as coming:
         path = coming.folder / "mask.png"
         if await receive(request.stream(), path, coming, _MOST_MASK):
-            await off_loop(_keep_mask, coming, path, folder / PAINTED, limits)
+            await run_in_thread(_store_mask, coming, path, folder / PAINTED, limits)
         else:
             coming.remove(folder / PAINTED)
     return JSONResponse({})
 
 
-def _keep_mask(coming: Incoming, source: Path, target: Path, limits: Limits) -> None:
+def _store_mask(coming: Incoming, source: Path, target: Path, limits: Limits) -> None:
     uploads.check_pixels(source, limits)
     with decoding(source.name, "a PNG picture", "paint it again"), Image.open(source, formats=["PNG"]) as image:
         grey = np.asarray(image.convert("L")) > 127
@@ -109,11 +109,11 @@ async def start(request: Request) -> Response:
     name, task = request.path_params["set"], request.path_params["task"]
     if task not in _TASKS:
         raise unknown("task", task, _TASKS)
-    asked = await uploads.settings(request.stream()) if task != "example" else {}
-    place = session.place(name)  # looked for after the wait: it may have gone meanwhile
+    asked = await uploads.read_settings(request.stream()) if task != "example" else {}
+    place = session.find_place(name)  # looked for after the wait: it may have gone meanwhile
     arguments: dict[str, Any] = {"place": str(place)}
     if task != "example":
-        arguments |= {"gamma": _one_of(asked, "gamma", _GAMMAS), "lights": asked.get("lights") is True}
+        arguments |= {"gamma": _read_choice(asked, "gamma", _GAMMAS), "lights": asked.get("lights") is True}
         arguments["frame"] = str(asked.get("frame", "y-up"))[:40]
     run = None
     if task == "infer":
@@ -125,16 +125,16 @@ async def start(request: Request) -> Response:
         run.mkdir(parents=True)
         arguments |= {"number": latest, "method": str(asked.get("method", "auto"))[:80]}
         arguments |= {key: asked.get(key) is True for key in ("refine", "anyway", "discontinuities")}
-        arguments["scale"] = float(_one_of(asked, "scale", _SCALES))
+        arguments["scale"] = float(_read_choice(asked, "scale", _SCALES))
     try:
-        return queued(request, task, **arguments)
+        return queue_task(request, task, **arguments)
     except Refused:
         if run is not None:
             run.rmdir()
         raise
 
 
-def _one_of(asked: dict[str, Any], key: str, known: tuple[str, ...]) -> str:
+def _read_choice(asked: dict[str, Any], key: str, known: tuple[str, ...]) -> str:
     value = str(asked.get(key, known[0]))
     if value not in known:
         raise InputError(f"{key}: must be one of {', '.join(known)}")
@@ -143,7 +143,7 @@ def _one_of(asked: dict[str, Any], key: str, known: tuple[str, ...]) -> str:
 
 async def file(request: Request) -> Response:
     """Send a file that the session's set holds, and nothing outside it."""
-    path = file_inside(request.state.session.place(request.path_params["set"]), request.path_params["path"])
+    path = find_file(request.state.session.find_place(request.path_params["set"]), request.path_params["path"])
     if path is None:
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path)
@@ -151,15 +151,15 @@ async def file(request: Request) -> Response:
 
 async def pixel(request: Request) -> Response:
     """Send what one pixel measures in every photograph, and what the model says it should."""
-    view = _run(request) / "view"
+    view = _find_run(request) / "view"
     try:
         row, column = (int(request.query_params[key]) for key in ("row", "column"))
     except (KeyError, ValueError) as error:
         raise InputError("row and column must be numbers inside the picture") from error
-    return JSONResponse(finite(await asyncio.to_thread(_measured, view, row, column)))
+    return JSONResponse(replace_nonfinite(await asyncio.to_thread(_read_pixel, view, row, column)))
 
 
-def _measured(view: Path, row: int, column: int) -> dict[str, list[float]]:
+def _read_pixel(view: Path, row: int, column: int) -> dict[str, list[float]]:
     found = {}
     for name in ("observed", "model"):
         if (view / f"{name}.npy").is_file():
@@ -172,9 +172,9 @@ def _measured(view: Path, row: int, column: int) -> dict[str, list[float]]:
 
 async def download(request: Request) -> Response:
     """Send everything `sdps infer` wrote as one ZIP."""
-    run = _run(request)
+    run = _find_run(request)
     archive = run / "sdps-infer.zip"
-    await off_loop(_pack, run / "files", archive)
+    await run_in_thread(_pack, run / "files", archive)
     return FileResponse(archive, filename=archive.name)
 
 
@@ -188,8 +188,8 @@ def _pack(folder: Path, archive: Path) -> None:
                     opened.write(path, path.relative_to(folder))
 
 
-def _run(request: Request) -> Path:
-    run = request.state.session.place(request.path_params["set"]) / "runs" / str(number(request, "run"))
+def _find_run(request: Request) -> Path:
+    run = request.state.session.find_place(request.path_params["set"]) / "runs" / str(read_number(request, "run"))
     if not (run / "view" / "view.json").is_file():
         raise InputError("that run is no longer here; start it again")
     return run

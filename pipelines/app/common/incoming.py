@@ -13,8 +13,8 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from pipelines.app.work.refusals import GONE, Refused, full, spelled
-from pipelines.app.work.sessions import Session
+from pipelines.app.common.refusals import GONE, Refused, explain_full_disk, format_size
+from pipelines.app.common.sessions import Session
 from render.shared.errors import InputError
 
 _BLOCK = 2**20  # bytes written at a time
@@ -62,7 +62,7 @@ class Incoming:
             InputError: a name that is taken, too many files, or a place that is gone.
         """
         with self._session.lock:
-            there = names(folder)
+            there = list_names(folder)
             for file in files:
                 if file.name in there:
                     raise InputError(f"{file.name}: there are two files of this name; rename one")
@@ -94,7 +94,7 @@ class Incoming:
         """
         old = self.folder / f".old-{secrets.token_hex(8)}"
         with self._session.lock:
-            there = names(path.parent)
+            there = list_names(path.parent)
             if most is not None and path.name not in there and len(there) >= most:
                 raise InputError(f"more than {most} files; reuse a name, or restart `sdps app`")
             if path.name in there:
@@ -115,7 +115,7 @@ class Incoming:
 
 
 @asynccontextmanager
-async def incoming(session: Session, most: int, place: str) -> AsyncIterator[Incoming]:
+async def open_upload(session: Session, most: int, place: str) -> AsyncIterator[Incoming]:
     """Yield an upload; what it has not put in place when it ends is removed, and its bytes are given back.
 
     Args:
@@ -134,13 +134,13 @@ async def incoming(session: Session, most: int, place: str) -> AsyncIterator[Inc
     except OSError as error:
         if not session.folder.is_dir():
             raise InputError(GONE) from error
-        refusal = full("the upload", error)
+        refusal = explain_full_disk("the upload", error)
         if refusal is None:
             raise
         raise refusal from error
     finally:
         try:
-            await off_loop(shutil.rmtree, coming.folder, True)
+            await run_in_thread(shutil.rmtree, coming.folder, True)
         finally:
             coming.give(coming.size)
             with session.lock:
@@ -168,13 +168,13 @@ async def receive(stream: AsyncIterator[bytes], path: Path, coming: Incoming, mo
                     coming.take(len(chunk), f"{path.name}: too large")
                     size += len(chunk)
                     if most is not None and size > most:
-                        raise InputError(f"{path.name}: too large; such a file may have {spelled(most)} here")
+                        raise InputError(f"{path.name}: too large; such a file may have {format_size(most)} here")
                     block += chunk
                     if len(block) >= _BLOCK:
-                        await off_loop(_write, handle, bytes(block))
+                        await run_in_thread(_write, handle, bytes(block))
                         block.clear()
                     clock.reschedule(asyncio.get_running_loop().time() + _STALLED)
-                await off_loop(_write, handle, bytes(block))
+                await run_in_thread(_write, handle, bytes(block))
     except TimeoutError as error:
         raise Refused(f"{path.name}: nothing came for {_STALLED:.0f} s; send it again", 408) from error
     return size
@@ -185,7 +185,7 @@ def _write(handle: BinaryIO, block: bytes) -> None:
     handle.flush()
 
 
-def names(folder: Path) -> set[str]:
+def list_names(folder: Path) -> set[str]:
     """Return what lies in a place's folder.
 
     Raises:
@@ -197,7 +197,7 @@ def names(folder: Path) -> set[str]:
         raise InputError(GONE) from error
 
 
-async def off_loop(function: Callable[..., T], *values: object) -> T:
+async def run_in_thread(function: Callable[..., T], *values: object) -> T:
     """Call a function in a thread. One who is cancelled meanwhile goes on once it has ended, and not before.
 
     Otherwise what is cleaned up after the call would be cleaned up under its hands.
