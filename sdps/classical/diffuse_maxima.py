@@ -26,7 +26,7 @@ from render.shared.seeds import generator
 from sdps.classical.common.factorisation import Factors
 from sdps.classical.common.front_end import Front, conclude, prepare
 from sdps.classical.common.gbr import Gbr
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, Notes
 
 _log = logging.getLogger(__name__)
 
@@ -74,9 +74,7 @@ def diffuse_maxima(
         seed: Seed of that choice.
 
     Returns:
-        Normals, light directions and intensities; diagnostics `gbr` (mu, nu, lambda), `candidates` and `intersections`
-        (numbers), `gbr_spread` (half the interquartile ranges of the crossings), `candidate_map` (H, W) int16: in which
-        image the pixel is a maximum, -1 in none.
+        Normals, light directions and intensities; notes `candidates`, `intersections` and `candidate_map`.
 
     Raises:
         InputError: degenerate input (see `prepare`), no maximum, or no two maxima that agree on any transformation.
@@ -85,16 +83,14 @@ def diffuse_maxima(
     maxima = find_maxima(prepared.cleaned, prepared.mask, smoothing=smoothing)
     crossings, lambdas = intersect(prepared.factors, maxima, limit=limit, seed=seed)
     gbr = median_gbr(crossings, lambdas)
-    spread = [np.diff(np.percentile(values, [25, 75]))[0] / 2 for values in (*crossings.T, lambdas)]
     found = np.full(int(prepared.mask.sum()), -1)
     found[maxima.pixels] = maxima.images
-    diagnostics = {
-        "gbr_spread": tuple(float(value) for value in spread),
-        "candidates": len(maxima.pixels),
-        "intersections": len(crossings),
-        "candidate_map": prepared.observations.to_map(found, -1).astype(np.int16),
-    }
-    return conclude(prepared, gbr, diagnostics)
+    notes = Notes(
+        candidates=len(maxima.pixels),
+        intersections=len(crossings),
+        candidate_map=prepared.observations.to_map(found, -1).astype(np.int16),
+    )
+    return conclude(prepared, gbr, notes)
 
 
 def find_maxima(profiles: np.ndarray, mask: np.ndarray, *, smoothing: float = 2.0) -> Maxima:

@@ -11,7 +11,6 @@ and the lights.
 """
 
 import logging
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -24,7 +23,7 @@ from sdps.classical.common.geometry import outward_gradient
 from sdps.classical.common.observations import observe
 from sdps.classical.common.weighted import normal_equations
 from sdps.classical.profile_lights import CLIP, POWER, Lights, fibonacci, find_lights
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, Notes
 
 _log = logging.getLogger(__name__)
 
@@ -63,11 +62,8 @@ def profile_distances(
         seed: Seed of the samples.
 
     Returns:
-        Normals, light directions, intensities of mean 1 (0 for black images), and diagnostics: `beta` (the slope used),
-        `beta_contour`, `beta_distribution`, `contour_correlation` (of distance and angle along the contour),
-        `trusted_pairs`, `residual` (rms of the trusted cosines), `spectrum` (of the cosines, relative), `samples`,
-        `light_mean` (length of the mean direction: 0 all around, 0.5 a hemisphere) and `curve` (brightness
-        over cosine).
+        Normals, light directions, intensities of mean 1 (0 for black images); notes `residual`, the root mean square
+        of the trusted cosines, and `light_mean`.
 
     Raises:
         InputError: fewer than 10 images, bad options, no contour, profiles that vary along one direction only
@@ -79,14 +75,14 @@ def profile_distances(
     rng, inverse = generator(seed, "profile_distances"), _first_inverse(profiles)
     for _ in progress_bar(range(rounds), desc="profile distances", unit="round", disable=rounds < 2):
         shapes = compressed(profiles * inverse)
-        rows, normals, diagnostics = _embed_samples(shapes, observations.mask, samples, slope, rng)
+        rows, normals, residual = _embed_samples(shapes, observations.mask, samples, slope, rng)
         lights = find_lights(profiles[rows], shapes[rows], normals)
         gains = lights.intensities
         inverse = np.where(gains > 0.0, 1.0 / np.maximum(gains, 1e-3), 1.0).astype(np.float32)
     mean = _mean_direction(lights)
     directions, intensities = lights.directions.astype(np.float32), lights.intensities.astype(np.float32)
     maps = observations.to_map(_spread(normalised(shapes), rows, normals))
-    return Estimate(maps, directions, intensities, diagnostics | {"light_mean": mean, "curve": lights.curve})
+    return Estimate(maps, directions, intensities, notes=Notes(residual=residual, light_mean=mean))
 
 
 def _check(images: int, samples: int, slope: str, rounds: int) -> None:
@@ -223,8 +219,8 @@ def _spread_samples(unit: np.ndarray, usable: np.ndarray, count: int, rng: np.ra
 
 def _embed_samples(
     shapes: np.ndarray, mask: np.ndarray, count: int, slope: str, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-    """Return the rows of samples (S,), their normals (S, 3) in the camera frame, and diagnostics."""
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the rows of samples (S,), their normals (S, 3) in the camera frame, and the residual of these."""
     unit = normalised(shapes)
     usable = np.flatnonzero(shapes.std(1) > 1e-3)
     edge, outward = contour(mask)
@@ -246,14 +242,13 @@ def _embed_samples(
     rows, ways = rows[joined], ways[np.ix_(joined, joined)]
     known = np.isin(edge[picked], rows)
     places, outward = np.searchsorted(rows, edge[picked][known]), outward[picked][known]
-    normals, diagnostics = _solve(ways, places, outward, distribution_slope(shapes[rows]), slope, mask)
-    return rows, normals, diagnostics
+    return rows, *_solve(ways, places, outward, distribution_slope(shapes[rows]), slope, mask)
 
 
 def _solve(
     ways: np.ndarray, places: np.ndarray, outward: np.ndarray, distribution: float, slope: str, mask: np.ndarray
-) -> tuple[np.ndarray, dict[str, Any]]:
-    """Turn geodesics (S, S) into oriented normals (S, 3)."""
+) -> tuple[np.ndarray, float]:
+    """Turn geodesics (S, S) into oriented normals (S, 3); also return how far their cosines are off."""
     along, correlation = _contour_slope(ways[np.ix_(places, places)], outward)
     if correlation < 0.5:
         raise InputError(
@@ -279,17 +274,7 @@ def _solve(
             "or its contour is no occluding one", beta, slope, distribution,
         )  # fmt: skip
     trusted = beta * ways < _TRUSTED
-    residual = float(np.sqrt(np.mean((normals @ normals.T - np.cos(beta * ways))[trusted] ** 2)))
-    return normals, {
-        "beta": beta,
-        "beta_contour": along,
-        "beta_distribution": distribution,
-        "contour_correlation": correlation,
-        "trusted_pairs": int(np.triu(trusted, 1).sum()),
-        "residual": residual,
-        "spectrum": spectrum,
-        "samples": len(ways),
-    }
+    return normals, float(np.sqrt(np.mean((normals @ normals.T - np.cos(beta * ways))[trusted] ** 2)))
 
 
 def _contour_slope(ways: np.ndarray, outward: np.ndarray) -> tuple[float, float]:

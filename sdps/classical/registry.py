@@ -79,7 +79,7 @@ def run(
         options: Options of the method's function.
 
     Returns:
-        Normals, lights and intensities, with the seconds it took in the diagnostics.
+        Normals, lights and intensities, and the seconds it took.
 
     Raises:
         InputError: an unknown name, degenerate input, or a calibrated method without lights.
@@ -90,5 +90,4 @@ def run(
     given = (lights, intensities) if entry.calibrated else ()
     start = time.perf_counter()
     estimate = entry.load()(images, mask, *given, **(entry.options | options))
-    seconds = time.perf_counter() - start
-    return replace(estimate, diagnostics=estimate.diagnostics | {"seconds": seconds})
+    return replace(estimate, seconds=time.perf_counter() - start)

@@ -80,6 +80,12 @@ class ObjectImages:
         columns_of_all = slice(left + columns.start, left + columns.stop)
         return replace(self, rows=rows_of_all, columns=columns_of_all, mask=self.mask[rows, columns])
 
+    def in_frame(self, values: np.ndarray) -> np.ndarray:
+        """Return values of the box, (h, w, ...), in the whole frame, (H, W, ...), zero elsewhere."""
+        whole = np.zeros((*self.shape, *values.shape[2:]), values.dtype)
+        whole[self.rows, self.columns] = values
+        return whole
+
     def parts(self, count: int) -> Iterator[range]:
         """Yield `count` images after `count` images, each time as the starts of what is read at once."""
         step = _images_at_once(self.shape)

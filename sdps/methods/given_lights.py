@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from render.shared.imaging.reducing import reduced
 from render.shared.seeds import generator
+from sdps.core.intensities import scale_to_mean
 from sdps.core.metrics import angle_degrees
 from sdps.inference.image_source import ImageSource
 from sdps.inference.stray_light import stray_light, without
@@ -166,7 +167,7 @@ def find_intensities(images: ReducedImages, directions: np.ndarray, start: np.nd
         start: (L,), intensities that a network finds.
     """
     images = _sampled(images)
-    start = np.asarray(start, np.float64) / np.mean(start)
+    start = scale_to_mean(np.asarray(start, np.float64))
     held = _PRIOR * (1.0 + (_residual(images, directions, start) / _MISFIT) ** 4)
     found = start.copy()
     for _ in range(_ROUNDS):
@@ -174,7 +175,7 @@ def find_intensities(images: ReducedImages, directions: np.ndarray, start: np.nd
         prior = held * (weights * shading**2).sum(axis=1).mean()
         ratio = (weights * shading * images.values).sum(axis=1) + prior * start
         found = ratio / ((weights * shading**2).sum(axis=1) + prior)
-        found /= found.mean()
+        found = scale_to_mean(found)
     return np.maximum(found, 1e-3).astype(np.float32)
 
 

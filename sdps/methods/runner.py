@@ -148,7 +148,7 @@ class Runner:
     ) -> Estimate:
         """Refine an estimate, or keep it where refinement cannot be trusted; light directions it was given stay."""
         from sdps.refinement.refine import refine
-        from sdps.refinement.trust import trust
+        from sdps.refinement.trust import choose, trust
 
         if not len(estimate.light_directions):
             raise InputError(
@@ -163,10 +163,7 @@ class Runner:
             directions_given=lit, stray=self.config.stray_light, saturation=saturation,
         )  # fmt: skip
         expected = trust(refined, mask, estimate, given=lit)
-        diagnostics = estimate.diagnostics | {"refined": refined, "start": estimate, "trust": expected}
-        if expected.doubt:
-            return replace(estimate, diagnostics=diagnostics)
-        return Estimate(refined.normals, refined.light_directions, refined.grey_intensities, diagnostics)
+        return choose(estimate, refined, expected)
 
     def score(
         self,

@@ -15,6 +15,7 @@ from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
 from sdps.core.integration import integrate
+from sdps.core.intensities import per_channel
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.inference.tiles import Tile, release_memory, tiles
 from sdps.refinement.descent import Problem, Weights, solve
@@ -157,7 +158,7 @@ def _checked(
         )
     if lights.shape != (count, 3) or len(intensities) != count:
         raise InputError(f"refinement: {count} images, but {len(lights)} lights and {len(intensities)} intensities")
-    return np.broadcast_to(np.reshape(intensities, (count, -1)), (count, 3))
+    return per_channel(intensities)
 
 
 def build_start(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> State:

@@ -16,6 +16,7 @@ import numpy as np
 from render.shared.errors import InputError
 from render.shared.progress import repeat, stage
 from sdps.core.integration import Depth, checked_normals
+from sdps.core.intensities import per_channel
 
 if TYPE_CHECKING:
     from sdps.inference.image_source import ImageSource
@@ -240,7 +241,7 @@ def _checked(
         )
     if not (count and np.isfinite(lights).all() and np.isfinite(intensities).all()):
         raise InputError("there must be images, and their lights and intensities must be finite")
-    return unit, lights, np.broadcast_to(intensities.reshape(count, -1), (count, 3))
+    return unit, lights, per_channel(intensities)
 
 
 class _Rows:

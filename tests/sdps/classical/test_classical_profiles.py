@@ -112,7 +112,7 @@ def test_clearly_better_than_factorisation_under_lights_all_around(surface, shad
     assert normal < 0.7 * rival[0]
     assert np.allclose(np.linalg.norm(ours.normals[mask], axis=1), 1.0, atol=1e-5)
     assert not ours.normals[~mask].any()
-    assert ours.diagnostics["light_mean"] < 0.3
+    assert ours.notes.light_mean < 0.3
 
 
 def test_albedo_cancels_and_the_seed_fixes_the_answer():
@@ -130,7 +130,7 @@ def test_lights_on_one_side_draw_a_warning(caplog):
     scene = lambertian(normals, mask, lights(60, 1, lowest=0.6))
     with caplog.at_level(logging.WARNING):
         estimate = profile_distances(scene.images, mask, samples=250, rounds=1)
-    assert estimate.diagnostics["light_mean"] > 0.35
+    assert estimate.notes.light_mean > 0.35
     assert "do not surround the object" in caplog.text
 
 

@@ -95,7 +95,7 @@ def test_least_squares_is_exact_without_shadows() -> None:
     mask &= (normals @ lights.T > 0.0).all(-1)
     estimate = least_squares(shade(normals, lights, 0.6) * gains[:, None, None, None], mask, lights, gains)
     assert normal_mae(estimate.normals, normals, mask) < 0.02
-    np.testing.assert_allclose(estimate.diagnostics["albedo"][mask], 0.6, rtol=1e-4)
+    np.testing.assert_allclose(estimate.notes.albedo[mask], 0.6, rtol=1e-4)
 
 
 def test_shadow_threshold_repairs_attached_shadows() -> None:
