@@ -21,6 +21,7 @@ from scipy import ndimage
 from skimage.morphology import local_maxima
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import unit
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
 from sdps.classical.common.factorisation import Factors
@@ -194,8 +195,7 @@ def _segments(factors: Factors, maxima: Maxima) -> tuple[np.ndarray, np.ndarray]
     three depends on the bas-relief transformation.
     """
     normals = factors.normals()[maxima.pixels]
-    lights = factors.lights.T[maxima.images]
-    lights = lights / np.maximum(np.linalg.norm(lights, axis=1, keepdims=True), 1e-300)
+    lights = unit(factors.lights.T[maxima.images])
     facing = (normals * lights).sum(1)
     slant = (lights[:, :2] ** 2).sum(1)
     valid = (np.abs(normals[:, 2]) > 1e-9) & (slant > 1e-18) & (facing > 0.0)

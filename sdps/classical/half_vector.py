@@ -16,6 +16,7 @@ import numpy as np
 from scipy import spatial
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import unit
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
 from sdps.classical.common.bas_relief_search import minimise_over_bas_reliefs
@@ -80,7 +81,7 @@ def half_vector(
         scene, start, notes = _uncalibrated(images, mask, seed)
     else:
         known = calibrate(images, mask, light_directions, intensities, weights=MEAN, minimum=_FEWEST)
-        lights = known.directions / np.linalg.norm(known.directions, axis=1, keepdims=True)
+        lights = unit(known.directions)
         scene = _Scene(known.observations, known.profiles, lights, np.ones(len(lights)))
         start, notes = diffuse_surface(scene.profiles, scene.lights), NO_NOTES
     normals, strengths, solved = _normals(scene, _visible(start), samples, 0 if given else updates, seed)
@@ -144,7 +145,7 @@ def _bas_relief_energy(prepared: Prepared, pixels: np.ndarray) -> Callable[[Gbr]
     def energy(gbr: Gbr) -> float:
         vectors, sources = gbr.apply(surface, prepared.factors.lights)
         strength = np.maximum(np.linalg.norm(sources, axis=0), 1e-12)
-        normals = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+        normals = unit(vectors)
         if normals[:, 2].mean() < 0.0:
             return np.inf
         found = asymmetry(log_values(profiles, strength), normals, (sources / strength).T)
@@ -185,8 +186,7 @@ def _refine(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Descend on the hemisphere: the eight neighbours at each step size (degrees), twice."""
     for step in progress_bar([size for size in steps for _ in range(2)], desc="normals", unit="step"):
-        first = np.cross(best, [0.0, 1.0, 0.0])
-        first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
+        first = unit(np.cross(best, [0.0, 1.0, 0.0]))
         second = np.cross(best, first)
         centre, size = best, np.tan(np.radians(step))
         for turn in np.arange(8) * np.pi / 4.0:
@@ -197,9 +197,8 @@ def _refine(
 
 def _visible(normals: np.ndarray) -> np.ndarray:  # (P, 3)
     """Return unit normals that do not turn away from the camera, of vectors (P, 3) of any length."""
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    normals = np.column_stack([normals[:, :2], np.maximum(normals[:, 2], 0.02)])
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(normals)
+    return unit(np.column_stack([normals[:, :2], np.maximum(normals[:, 2], 0.02)]))
 
 
 def _carry(start: np.ndarray, chosen: np.ndarray, solved: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (P, 3)

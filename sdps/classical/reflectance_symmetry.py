@@ -15,11 +15,11 @@ from dataclasses import replace
 import numpy as np
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import half_vectors, unit
 from render.shared.seeds import generator
 from sdps.classical.common.bas_relief_search import minimise_over_bas_reliefs
 from sdps.classical.common.front_end import Front, Prepared, conclude, prepare
 from sdps.classical.common.gbr import Gbr
-from sdps.classical.common.isotropy import half_vectors
 from sdps.classical.plain import equal_intensity
 from sdps.core.estimate import Estimate, Notes
 
@@ -106,7 +106,7 @@ def symmetry_energy(prepared: Prepared, pixels: np.ndarray, chosen: np.ndarray, 
 
     def energy(gbr: Gbr) -> float:
         vectors, sources = gbr.apply(surface, lights)
-        normals = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+        normals = unit(vectors)
         strength = np.maximum(np.linalg.norm(sources, axis=0), 1e-12)
         if normals[:, 2].mean() < 0.0:
             return np.inf

@@ -23,7 +23,7 @@ class ClassicalMethod:
         function: Its function.
         paper: Authors, venue and year.
         summary: One line.
-        calibrated: Whether it is told the lights; otherwise it finds them.
+        calibrated: Whether it is given the lights; otherwise it finds them.
         by_pixel: Whether what it finds of a pixel depends on no other.
         minimum: Fewest images it works with.
         options: Fixed options of the function.

@@ -81,6 +81,21 @@ class Estimate:
     notes: Notes = field(default=NO_NOTES, kw_only=True)
 
 
+def constant_estimate(count: int, mask: np.ndarray) -> Estimate:
+    """Predict a plate facing the camera under `count` equal lights at the camera: what every method has to beat.
+
+    Args:
+        count: Number of images.
+        mask: (H, W) bool.
+    """
+    front = np.array([0.0, 0.0, 1.0], np.float32)
+    return Estimate(
+        normals=mask[..., None] * front,
+        light_directions=np.tile(front, (count, 1)),
+        intensities=np.ones(count, np.float32),
+    )
+
+
 @dataclass(frozen=True)
 class Score:
     """A number with its definition.

@@ -116,7 +116,7 @@ def integrate(
     """
     started = time.perf_counter()
     large = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and int(mask.sum()) > LARGE
-    unit = None if large else checked_normals(normals, mask)
+    unit = None if large else check_normals(normals, mask)
     if not (sharpness > 0 and most >= 1):
         raise InputError(f"sharpness must be positive and most at least 1, got {sharpness} and {most}")
     stage("depth")
@@ -135,7 +135,7 @@ def integrate(
     return Depth(mask=mask, **_laid_out(graph, mask, z), **diagnostics, seconds=time.perf_counter() - started)
 
 
-def checked_normals(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def check_normals(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return the mask's unit normals (n, 3) float64 in row order, or refuse them as `integrate` says."""
     normals, mask = np.asarray(normals), np.asarray(mask)
     if mask.ndim != 2 or mask.dtype != np.bool_ or normals.shape != (*mask.shape, 3):
@@ -308,7 +308,7 @@ def _slopes(normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...]) -> tu
         inside = mask[rows, box[1]]
         if not inside.any():
             continue
-        unit = checked_normals(normals[rows, box[1]], inside)
+        unit = check_normals(normals[rows, box[1]], inside)
         flat += int((unit[:, 2] < STEEPEST).sum())
         for part, values in zip(slopes, (unit[:, 0], unit[:, 1], np.maximum(unit[:, 2], STEEPEST)), strict=True):
             part[start : start + step][inside] = values

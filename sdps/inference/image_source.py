@@ -15,7 +15,7 @@ from render.shared.errors import InputError
 from render.shared.progress import stage
 from render.shared.seeds import generator
 from sdps.data.augment import Exposure
-from sdps.inference.stray_light import stray_light, without
+from sdps.inference.stray_light import remove_stray_light, stray_light
 
 EXPOSURE_VALUES = 4_000_000
 """Values the exposure is measured on at most; of more, the same random pixels of every image are taken."""
@@ -67,8 +67,9 @@ class ObjectImages:
         step = _images_at_once(self.mask.shape)  # few copies of large images at a time
         for first in range(start, stop, step):
             last = min(first + step, stop)
-            found = _window(self.source, slice(first, last), self.rows, self.columns, self.shape)
-            images[first - start : last - start] = without(np.asarray(found, np.float32), self.stray[first:last])
+            part = slice(first, last)
+            found = np.asarray(_window(self.source, part, self.rows, self.columns, self.shape), np.float32)
+            images[first - start : last - start] = remove_stray_light(found, self.stray[part])
         # Not a product: outside the mask there may be NaN.
         images[:, ~self.mask] = 0.0
         return images
@@ -124,7 +125,7 @@ def survey(source: ImageSource, mask: np.ndarray, margin: int | None, *, stray: 
         sample[start:stop] = inside[:, chosen]
     rows, columns = (_box(np.any(mask, axis=axis), margin) for axis in (1, 0))
     level = stray_light(sample) if stray else np.zeros((len(source), 3), np.float32)
-    return ObjectImages(source, rows, columns, mask[rows, columns], shape, level, without(sample, level))
+    return ObjectImages(source, rows, columns, mask[rows, columns], shape, level, remove_stray_light(sample, level))
 
 
 @dataclass(frozen=True, eq=False)

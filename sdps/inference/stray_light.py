@@ -43,7 +43,7 @@ def stray_light(values: np.ndarray) -> np.ndarray:
     return np.minimum(level, _MOST * np.median(level, axis=0))
 
 
-def without(images: np.ndarray, level: np.ndarray) -> np.ndarray:
+def remove_stray_light(images: np.ndarray, level: np.ndarray) -> np.ndarray:
     """Return images less their stray light; up to three times its level they are black, as noise in shadow is.
 
     Args:

@@ -12,8 +12,7 @@ import numpy as np
 from render.records.shards import file_hash
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
-from sdps.core.baselines import constant_estimate
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, constant_estimate
 from sdps.core.metrics import score
 from sdps.inference.estimator import Estimator, default_device, load_model
 from sdps.inference.image_source import ImageSource

@@ -14,9 +14,9 @@ from PIL import Image
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
 from sdps.core.intensities import colour_balance
-from sdps.photos.evidence.colours import colour_casts
-from sdps.photos.evidence.fall_off import FallOff, block_means, fall_off
-from sdps.photos.evidence.motion import Shift, Tracker, second_look
+from sdps.photos.analysis.colours import colour_casts
+from sdps.photos.analysis.fall_off import FallOff, block_means, fall_off
+from sdps.photos.analysis.motion import Shift, Tracker, second_look
 from sdps.photos.reading import Photographs
 from sdps.photos.response import brightness
 

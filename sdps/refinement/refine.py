@@ -94,7 +94,7 @@ def refine(
     Raises:
         InputError: fewer than four images, shapes that do not fit, or an object that is black.
     """
-    config, gains = config or RefineConfig(), _checked(len(images), mask, normals, lights, intensities)
+    config, gains = config or RefineConfig(), _check(len(images), mask, normals, lights, intensities)
     scene = survey(images, mask, 0, stray=stray)
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
     most = TILE_BYTES // (_PIXEL_BYTES + _OBSERVATION_BYTES * len(scene)) if stride > 1 else scene.mask.size
@@ -146,7 +146,7 @@ def _advance(bar: Any) -> Callable[[], None]:
     return on_step
 
 
-def _checked(
+def _check(
     count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray
 ) -> np.ndarray:
     """Return the intensities (L, 3), if all sizes fit."""

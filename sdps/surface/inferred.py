@@ -25,7 +25,7 @@ from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
 from sdps.refinement.trust import RefinedEstimate
 from sdps.surface.meshing import mesh, step_of, write_mesh
-from sdps.surface.relight import Residuals, fit_albedo, lit, relit, residuals
+from sdps.surface.relight import Residuals, fit_albedo, relit, residuals, trace_light
 from sdps.surface.verdict import give_verdict
 
 RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
@@ -138,7 +138,7 @@ class Inference:
         """What each light of `relit` reaches, (H, W) bool."""
         found = {}
         for number, (name, light) in enumerate(RELIT.items(), start=1):
-            found[name] = lit(self.depth, np.array(light, np.float64))
+            found[name] = trace_light(self.depth, np.array(light, np.float64))
             stage("relit pictures", number, len(RELIT))
         return found
 

@@ -34,7 +34,7 @@ def give_verdict(
     if mean < UNUSABLE and not grave:
         return ""
     reasons = (*grave, *_reasons(photos, findings, trust, residual), "no network has learned objects like this one")
-    how = f"the normals are {mean:.0f} degrees off, as far as can be told" if mean >= UNUSABLE else "a check failed"
+    how = f"the normals are off by an estimated {mean:.0f} degrees" if mean >= UNUSABLE else "a check failed"
     return f"NOT TO BE USED: {how}. Likeliest reason: {reasons[0]}"
 
 

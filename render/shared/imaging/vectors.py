@@ -2,8 +2,6 @@
 
 import numpy as np
 
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-
 
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Return vectors (..., 3) at length 1, of the same type; a zero vector stays zero."""
@@ -21,5 +19,5 @@ def spiral(count: int, lowest: float = -1.0) -> np.ndarray:
     A spiral of equal steps in z and golden angles (Vogel 1979; Swinbank & Purser 2006).
     """
     z = 1.0 - (1.0 - lowest) * (np.arange(count) + 0.5) / count
-    angle, flat = GOLDEN_ANGLE * np.arange(count), np.sqrt(1.0 - z * z)
+    angle, flat = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0)), np.sqrt(1.0 - z * z)
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=-1)

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from render.shared.errors import unknown
-from sdps.classical.common.factorisation import Factors, factorise, impose_integrability, oriented
+from sdps.classical.common.factorisation import Factors, factorise, impose_integrability, orient
 from sdps.classical.common.gbr import Gbr
 from sdps.classical.common.observations import Observations, observe
 from sdps.classical.common.rpca import robust_low_rank
@@ -85,7 +85,7 @@ def prepare(
         factors = diffuse_factors(profiles, seed=seed)
         cleaned = np.maximum(factors.surface.astype(np.float32) @ factors.lights.astype(np.float32), 0.0)
     factors = impose_integrability(replace(factors, singular=singular), observations.mask, smoothing=smoothing)
-    return Prepared(observations, profiles, cleaned, oriented(factors, observations.mask))
+    return Prepared(observations, profiles, cleaned, orient(factors, observations.mask))
 
 
 def conclude(prepared: Prepared, gbr: Gbr, notes: Notes = NO_NOTES) -> Estimate:
@@ -96,7 +96,7 @@ def conclude(prepared: Prepared, gbr: Gbr, notes: Notes = NO_NOTES) -> Estimate:
         gbr: The method's bas-relief transformation of the prepared factors.
         notes: What the method notes besides `albedo` and `gbr`.
     """
-    factors = oriented(prepared.factors.transformed(gbr), prepared.mask)
+    factors = orient(prepared.factors.transformed(gbr), prepared.mask)
     strength = np.linalg.norm(factors.lights, axis=0)
     directions = (factors.lights / np.maximum(strength, 1e-12)).T
     directions[strength <= 0.0] = (0.0, 0.0, 1.0)

@@ -11,7 +11,7 @@ SRGB_EXPONENT = 2.224
 """log f(1/2) / log(1/2) of sRGB's decoding curve f, by which colour profiles with that curve are recognised."""
 
 _EXPONENTS = (0.3, 4.0)
-"""Exponents that are believed to be a display curve."""
+"""Exponents that are taken for a display curve."""
 
 
 def resolve_gamma(gamma: str | float, coding: Coding, folders: Sequence[Path]) -> tuple[str | float, str]:

@@ -6,8 +6,7 @@ from sdps_scenes import hemisphere_lights, shade, sphere_normals
 
 from render.shared.errors import InputError
 from sdps.classical.least_squares import least_squares
-from sdps.core.baselines import constant_estimate
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, constant_estimate
 from sdps.core.metrics import angle_degrees, direction_mae, intensity_error, normal_error_map, normal_mae, score
 
 
