@@ -92,8 +92,8 @@ def automatic_mask(variation: Variation) -> tuple[np.ndarray, str]:
     doubt = _doubt(changes, mask, float(threshold)) or _ground_is_lit(variation, mask, changes > threshold)
     if doubt:
         return np.ones_like(mask), (
-            f"the object cannot be told apart from the background ({doubt}), so the whole frame is taken for the object; draw "
-            "a mask.png (white object on black), or photograph against black cloth"
+            f"the object cannot be told apart from the background ({doubt}), so the whole frame is taken for the "
+            "object; draw a mask.png (white object on black), or photograph against black cloth"
         )
     return (
         mask,
