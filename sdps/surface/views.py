@@ -35,7 +35,7 @@ def depth_normals(depth: Depth) -> np.ndarray:
     return np.where(mask[..., None], normals, 0.0).astype(np.float32)
 
 
-def draw_turned(depth: Depth, degrees: float, height: int, *, colour: np.ndarray | None = None) -> np.ndarray:
+def turned(depth: Depth, degrees: float, height: int, *, colour: np.ndarray | None = None) -> np.ndarray:
     """Draw the surface as seen by a viewer who has walked `degrees` to the right around it.
 
     The picture is orthographic, shaded by the normals of the depth itself, so that it shows what was integrated. Since
@@ -85,8 +85,8 @@ def _of_the_box(depth: Depth, colour: np.ndarray | None, side: int) -> tuple[Dep
 def strip(
     depth: Depth, height: int = 256, degrees: Sequence[float] = (-40.0, 0.0, 40.0), *, colour: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the pictures of `draw_turned` side by side, (height, height x n, 3) uint8."""
-    return np.concatenate([draw_turned(depth, angle, height, colour=colour) for angle in degrees], axis=1)
+    """Return the pictures of `turned` side by side, (height, height x n, 3) uint8."""
+    return np.concatenate([turned(depth, angle, height, colour=colour) for angle in degrees], axis=1)
 
 
 def _neighbours(array: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
