@@ -161,7 +161,7 @@ def available_methods(models: str | Path | None = None) -> dict[str, str]:
     Two of them may be joined, lights before normals, as in `lcnet+psfcn`.
 
     Args:
-        models: Folder of trained runs (`out` of `train`) whose weights count beside the pretrained ones.
+        models: Folder of trained runs (`out` of `train`) whose weights count as well as the pretrained ones.
     """
     about = {name: item.summary for items in (COMBINATIONS, MODELS) for name, item in items.items()}
     about |= {name: f"{entry.summary} ({entry.paper})" for name, entry in classical.METHODS.items()}
@@ -237,7 +237,7 @@ def _finder(models: str | Path | None) -> Callable[[str], Path]:
 
 
 def _stop(photos: Photographs, findings: tuple[Finding, ...], anyway: bool) -> None:
-    """Stop at the first grave finding, unless told to go on."""
+    """Stop at the first grave finding, unless asked to go on."""
     grave = next((finding for finding in findings if finding.level == "error"), None)
     if grave is not None and not anyway:
         raise InputError(f"{photos.folder}: {grave.text} ({ANYWAY})")

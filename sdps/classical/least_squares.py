@@ -13,7 +13,7 @@ from sdps.core.estimate import NO_NOTES, Estimate, Notes
 from sdps.core.intensities import grey
 
 _CHUNK_VALUES = 2_000_000
-"""Observations solved at a time: 16 MB per float64 array of them, whatever the size of the object."""
+"""Observations solved at a time: 16 MB per float64 array of them, however large the object."""
 
 
 def least_squares(
@@ -117,7 +117,7 @@ def calibrate(
     if intensities.shape not in ((count, 1), (count, channels)):
         raise InputError(f"intensities of shape {intensities.shape} do not fit images of {channels} channel(s)")
     if not (np.isfinite(directions).all() and np.isfinite(intensities).all()):
-        raise InputError("light directions or intensities hold NaN or infinite values; repair them first")
+        raise InputError("light directions or intensities contain NaN or infinite values; repair them first")
     if (intensities <= 0.0).any():
         raise InputError("light intensities must be positive")
     if not directions.any(axis=1).all():

@@ -267,7 +267,7 @@ def _solve(
     if not 1 / 1.6 < beta / distribution < 1.6:
         _log.warning(
             "slope %.2f (%s) against %.2f by the distribution of intensities: the lights do not surround the object "
-            "or its contour is no occluding one", beta, slope, distribution,
+            "or its contour is not an occluding one", beta, slope, distribution,
         )  # fmt: skip
     trusted = beta * ways < _TRUSTED
     return normals, float(np.sqrt(np.mean((normals @ normals.T - np.cos(beta * ways))[trusted] ** 2)))

@@ -24,7 +24,7 @@ n_z is sqrt(1 / R), so this is the rim of R = 1100."""
 _TOLERANCE = 1e-7  # of the linear system
 _ROUGH = 1e-4  # the same while weights still change
 _SETTLED = 1e-3
-_OUTWORN = 12  # steps of a solve after which the preconditioner is built anew for the changed weights
+_OUTWORN = 12  # steps of a solve after which the preconditioner is rebuilt for the changed weights
 _WEAKEST = 1e-6  # weight of an edge that both of its equations have left
 LARGE = 1_000_000
 """Pixels above which the grid is solved in place (`sdps.core.large_depth`); a graph of so many takes 0.7 GiB."""
@@ -101,7 +101,7 @@ def integrate(
     With `discontinuities` each pixel has a one-sided equation per neighbour, n_z (z' - z) + n_x = 0, and of the two
     neighbours left and right, or above and below, the one across the smaller step counts more. These are the bilateral
     weights of Cao et al., Bilateral Normal Integration (ECCV 2022), for an orthographic camera:
-    sigmoid(k ((n_z dz of the other side)^2 - (n_z dz of this side)^2)), found anew until the energy settles.
+    sigmoid(k ((n_z dz of the other side)^2 - (n_z dz of this side)^2)), found again until the energy settles.
 
     Args:
         normals: (H, W, 3) camera frame (x right, y up, z to the camera), of any length and real type; not read

@@ -44,10 +44,10 @@ class Estimator(InferenceConfig):
     """Trained networks that work together: any lighting model with any normal model; its options are those of its base.
 
     Attributes:
-        lighting: Trained lighting model, or None when lights are always given or `normals` is told none.
+        lighting: Trained lighting model, or None when lights are always given or `normals` needs none.
         normals: Trained model that gives normals, by convolution or pixel by pixel; None for lights alone.
         device: Where all networks are.
-        chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images. None: what
+        chunk_pixels: Image pixels a network encodes at once; bounds memory for any number of images. None: what
             suits the device.
 
     Raises:
@@ -97,7 +97,7 @@ class Estimator(InferenceConfig):
         """Estimate normals, and whichever of light directions and intensities are not given.
 
         Without a lighting model, given directions alone stand for lights of equal intensity. Normal models that are
-        told no lights see the images as they are, whatever is given.
+        given no lights see the images as they are, even where lights are given.
 
         Args:
             images: (L, H, W, 3), linear radiance of any overall scale, L >= 1, any size; an array, or anything that

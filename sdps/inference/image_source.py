@@ -121,7 +121,7 @@ def survey(source: ImageSource, mask: np.ndarray, margin: int | None, *, stray: 
         inside = _read(source, start, stop, shape)[:, mask]  # (n, P, 3)
         stage("survey", stop, len(source))
         if not np.isfinite(inside).all():
-            raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
+            raise InputError("the images contain NaN or infinite values inside the mask; repair them first")
         sample[start:stop] = inside[:, chosen]
     rows, columns = (_box(np.any(mask, axis=axis), margin) for axis in (1, 0))
     level = stray_light(sample) if stray else np.zeros((len(source), 3), np.float32)

@@ -131,16 +131,16 @@ class Runner:
     def _classical(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
         """Run a classical method, which holds the object's box of all images at once."""
         name = self.method.normals
-        told: tuple[Any, ...] = ()
+        arguments: tuple[Any, ...] = ()
         if classical.METHODS[name].calibrated:
             if self.method.lights == TRUE_LIGHTS:
-                told = given["lights"], given.get("intensities")
+                arguments = given["lights"], given.get("intensities")
             else:
                 lit = self._lights(images, mask, given, found)
-                told = lit.light_directions, lit.intensities
+                arguments = lit.light_directions, lit.intensities
         if isinstance(images, np.ndarray):
-            return classical.run(name, images, mask, *told)
-        return run_on_box(name, images, mask, told)
+            return classical.run(name, images, mask, *arguments)
+        return run_on_box(name, images, mask, arguments)
 
     def _refine(
         self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any], saturation: float

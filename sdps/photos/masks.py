@@ -1,6 +1,6 @@
 """Which pixels belong to the object: from a mask file, or from how much each pixel changes with the light.
 
-Under a moving lamp the object changes and a dark, distant background does not, whatever steady light the room adds.
+Under a moving lamp the object changes and a dark, distant background does not, under any steady light of the room.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""One picture file, decoded at its own depth, whatever its name says it is."""
+"""One picture file, decoded at its own depth, by content and not by name."""
 
 import logging
 from collections.abc import Iterator

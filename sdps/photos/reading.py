@@ -24,7 +24,7 @@ from sdps.photos.survey import survey
 class Photographs:
     """A folder of photographs; an `ImageSource` (sdps/inference/image_source.py) that holds no pixel in memory.
 
-    `len(photos)` is L; `photos[2:5]` reads three files anew and returns (3, H, W, 3) float32, linear radiance with 1
+    `len(photos)` is L; `photos[2:5]` reads three files again and returns (3, H, W, 3) float32, linear radiance with 1
     for full scale (floating-point files: as they are), 0 for what is negative or not finite.
 
     Attributes:

@@ -199,7 +199,7 @@ class _Masks:
 def _given_masks(folder: Path, listing: Listing) -> _Masks:
     """Choose the folder's mask.
 
-    `mask.*` is one whatever it holds; others, such as `cat_mask.png`, must have about two values, and several must
+    `mask.*` is always one; others, such as `cat_mask.png`, must have about two values, and several must
     hold the same.
 
     Raises:

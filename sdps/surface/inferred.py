@@ -98,7 +98,7 @@ class Inference:
     @property
     def expected_error(self) -> np.ndarray | None:
         """Angle to the true normals to expect, (H, W) float32 in degrees; None where neither network nor refinement
-        tells it. Where refinement was not kept it is the network's, if that one tells.
+        predicts it. Where refinement was not kept it is the network's, if there is one.
         """
         found, own = self.refinement, self.estimate.expected_error
         return own if found is None or (found.trust.doubt and own is not None) else found.trust.normals

@@ -149,7 +149,7 @@ def _check(
     if isinstance(depth, Depth):
         z, mask = depth.z, depth.mask if mask is None else mask
     elif mask is None:
-        raise InputError("a depth array needs a mask beside it")
+        raise InputError("a depth array needs a mask as well")
     else:
         z = np.asarray(depth)
     if mask.dtype != np.bool_ or z.shape != mask.shape or z.ndim != 2:

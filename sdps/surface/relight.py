@@ -294,5 +294,5 @@ def _read(images: "ImageSource", mask: np.ndarray) -> Iterator[tuple[slice, np.n
             raise InputError(f"images must be (L, {mask.shape[0]}, {mask.shape[1]}, 3), got {observed.shape}")
         observed = observed[:, mask].astype(np.float32, copy=False)
         if not np.isfinite(observed).all():
-            raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
+            raise InputError("the images contain NaN or infinite values inside the mask; repair them first")
         yield part, observed

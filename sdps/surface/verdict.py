@@ -24,7 +24,7 @@ def give_verdict(
 
     Args:
         photos: What was photographed.
-        expected: (H, W) degrees, angle to the true normals to expect; None where nothing tells it.
+        expected: (H, W) degrees, angle to the true normals to expect; None where nothing predicts it.
         findings: What the checks said.
         trust: What refinement says of itself, where it ran.
         residual: Mean residual of refinement.

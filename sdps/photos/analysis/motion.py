@@ -38,7 +38,7 @@ WHOLE = (5, 0.35, 3.0)
 against."""
 
 SURE = (12, 0.5, 3.0)
-"""Votes by which a shift is believed before a background, whatever edges and silhouette say."""
+"""Votes by which a shift is believed before a background, against edges and silhouette."""
 
 WHOLE_OF_FEW = (6, 0.6, 4.0)
 """The same where there are few other images, which may not explain a new light."""

@@ -53,7 +53,7 @@ def _given_gamma(gamma: str | float) -> str | float:
     except ValueError as error:
         raise InputError(f"gamma {gamma!r} is none of auto, linear, srgb and no exponent like 2.2") from error
     if not _EXPONENTS[0] <= value <= _EXPONENTS[1]:
-        raise InputError(f"gamma {value:g} is no display curve; give an exponent like 2.2, linear, srgb or auto")
+        raise InputError(f"gamma {value:g} is not a display curve; give an exponent like 2.2, linear, srgb or auto")
     return value
 
 

@@ -297,7 +297,7 @@ def test_meshroom_s_own_numbers_need_its_list_of_views(tmp_path: Path) -> None:
     """It writes views by hash, so in no order of the pictures."""
     hashes = sorted(int(k * 7919 + 13) ** 3 for k in range(COUNT))
     path = tmp_path / "lights.json"
-    assert "put its cameraInit.sfm, which names them, beside the file" in refusal(path, meshroom(hashes))
+    assert "put its cameraInit.sfm, which names them, next to the file" in refusal(path, meshroom(hashes))
     faults = Faults(anyway=True)
     np.testing.assert_allclose(read_lights(path, FILES, faults=faults).directions, LIGHTS, atol=1e-5)
     assert len(faults.overridden) == 1
