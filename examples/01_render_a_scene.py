@@ -1,4 +1,4 @@
-"""Render an object of one's own, in materials of one's own: images, ground truth and shards.
+"""Render an object of your own, in materials of your own: images, ground truth and shards.
 
 python examples/01_render_a_scene.py --out out/example-1
 """

@@ -1,4 +1,4 @@
-"""From photographs under unknown lights to normals, a mesh and a picture under a light of one's choice.
+"""From photographs under unknown lights to normals, a mesh and a picture under a light you choose.
 
 python examples/03_photographs_to_mesh.py my-photographs --out out/example-3
 python examples/03_photographs_to_mesh.py --out out/example-3      (makes photographs with the renderer first)

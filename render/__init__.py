@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from render.planning.plan import plan
     from render.records.manifest import SceneSpec, read_manifest
     from render.records.shards import read_shard, write_shard
-    from render.running.rendered import RenderedView
+    from render.running.rendered_view import RenderedView
     from render.shared.errors import InputError
 else:
     __getattr__, __dir__ = lazy_names(
@@ -32,7 +32,7 @@ else:
             "render.planning.plan": ("plan",),
             "render.records.manifest": ("SceneSpec", "read_manifest"),
             "render.records.shards": ("read_shard", "write_shard"),
-            "render.running.rendered": ("RenderedView",),
+            "render.running.rendered_view": ("RenderedView",),
             "render.shared.errors": ("InputError",),
         },
     )  # fmt: skip

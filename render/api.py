@@ -1,4 +1,4 @@
-"""Rendering from Python: images of one's own mesh, material and lights, or a whole plan of scenes.
+"""Rendering from Python: images of your own mesh, material and lights, or a whole plan of scenes.
 
 ```python
 import render
@@ -26,7 +26,7 @@ from render.materials.model import Material
 from render.materials.surfaces import Surface
 from render.planning import light_sets
 from render.records.manifest import SceneSpec, View, claim
-from render.running.rendered import RenderedView, rendered_views
+from render.running.rendered_view import RenderedView, rendered_views
 from render.shapes import TriangleMesh, registry
 from render.shapes.files.mesh_file import from_trimesh
 from render.shared.errors import InputError
@@ -71,7 +71,7 @@ def material(source: MaterialLike) -> Surface:
             (`procedural:wood:7`, a folder of maps; `render.materials.textures.textured`), or a loaded material.
 
     Raises:
-        InputError: an unknown name (with the nearest), a malformed pattern, or a file that is no material.
+        InputError: an unknown name (with the nearest), a malformed pattern, or a file that is not a material.
     """
     if isinstance(source, Surface):
         return source
@@ -94,7 +94,7 @@ def lights(source: LightsLike) -> np.ndarray:  # (L, 3)
     """
     if isinstance(source, str | Path):
         return light_sets.load(str(source))
-    return light_sets.checked(np.atleast_2d(np.asarray(source)).tolist(), "lights")
+    return light_sets.check(np.atleast_2d(np.asarray(source)).tolist(), "lights")
 
 
 _shape, _material, _lights = shape, material, lights  # for functions whose parameters have these names
@@ -169,7 +169,7 @@ def render_views(
         material=covers[0].name, view=_view(rotation, scale, offset, camera_distance), size=size, spp=spp,
         bounces=bounces, seed=seed, **_lit(_lights(lights), light_distance),
     )  # fmt: skip
-    return _rendered(_shape(shape), covers, first)
+    return _render(_shape(shape), covers, first)
 
 
 def _check_options(size: int, spp: int, bounces: int, seed: int) -> None:
@@ -180,7 +180,7 @@ def _check_options(size: int, spp: int, bounces: int, seed: int) -> None:
         )
 
 
-def _rendered(mesh: TriangleMesh, covers: Sequence[Surface], first: SceneSpec) -> Iterator[RenderedView]:
+def _render(mesh: TriangleMesh, covers: Sequence[Surface], first: SceneSpec) -> Iterator[RenderedView]:
     """Render scenes that differ from the first in their material only."""
     from render.kernel.scene import build
     from render.materials.kernels.packed import PackedSurfaces
@@ -224,7 +224,7 @@ def render_plan(scenes: Sequence[SceneSpec], folder: str | Path, *, workers: int
         scenes: Of `plan`; of a shape or material that is a file, the name is its path.
         folder: Data folder: gets `manifest.jsonl` and a shard `shards/<id>.exr` per scene.
         workers: 1 renders in this process. More render in as many processes, which start this program's main module
-            anew: call it below `if __name__ == "__main__":`. 0 takes what cores and memory allow.
+            again: call it below `if __name__ == "__main__":`. 0 takes what cores and memory allow.
 
     Returns:
         The shards' paths, in the order of the plan.
@@ -237,7 +237,7 @@ def render_plan(scenes: Sequence[SceneSpec], folder: str | Path, *, workers: int
         raise InputError("the plan is empty; there is nothing to render")
     claim(folder, scenes)
     if workers == 1:
-        from render.running.worker import render_scenes
+        from render.running.scene_rendering import render_scenes
 
         render_scenes(scenes, folder)
     else:
@@ -246,7 +246,8 @@ def render_plan(scenes: Sequence[SceneSpec], folder: str | Path, *, workers: int
         failed = render_supervised(scenes, folder, RunOptions(workers=workers, retry_failed=True)).failed
         if failed:
             raise InputError(
-                f"{folder}: {len(failed)} of {len(scenes)} scenes failed, {failed[0]['id']} thus: {failed[0]['reason']}"
+                f"{folder}: {len(failed)} of {len(scenes)} scenes failed, the first was {failed[0]['id']}: "
+                f"{failed[0]['reason']}"
             )
     return [folder / scene.file for scene in scenes]
 
@@ -254,7 +255,7 @@ def render_plan(scenes: Sequence[SceneSpec], folder: str | Path, *, workers: int
 def fit_material(
     file: str | Path, brdf: Callable[[np.ndarray, np.ndarray], np.ndarray], *, source: str = "", terms: str = ""
 ) -> Material:
-    """Fit the built-in reflectance model to a BRDF of one's own, and write it as a material file.
+    """Fit the built-in reflectance model to your own BRDF, and write it as a material file.
 
     The model is isotropic and reciprocal, tabulated over half and difference angle; `fit_error` of the result is the
     relative RMS error of a sphere under 20 lights. Where the BRDF reflects more light than it receives, it is lowered.
@@ -267,7 +268,7 @@ def fit_material(
         terms: Terms of use, for the file.
 
     Raises:
-        InputError: another suffix, values that are no BRDF, or a file that cannot be written.
+        InputError: another suffix, values that are not a BRDF, or a file that cannot be written.
     """
     from render.materials.fit.fitting import Fitter, to_yaml
     from render.shared.files import write_text

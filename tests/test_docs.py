@@ -4,7 +4,7 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib import util
 from pathlib import Path
@@ -23,6 +23,8 @@ TOPS = (*PACKAGES, "assets", "tests", "docs")
 NAMES = {path.name for top in (*PACKAGES, "tests") for path in (ROOT / top).rglob("*.py")} | {"run_model.py"}
 """Python files of the project, and one of SDPS-Net's code."""
 README_WORDS = 900
+GUIDE_WORDS = 25_000
+STUDY_WORDS = 8_000
 ENTRIES = 12
 
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
@@ -152,8 +154,23 @@ def test_commands_shown_are_there(page):
             assert name in targets, f"{page.name}: make {name}"
 
 
-def test_the_readme_is_short():
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= README_WORDS
+def word_count(pages: Iterable[Path]) -> int:
+    """Count what stands between blanks in these pages, tables and commands included."""
+    return sum(len(page.read_text(encoding="utf-8").split()) for page in pages)
+
+
+def test_the_docs_stay_small():
+    readme = ROOT / "README.md"
+    studies = set((DOCS / "studies").glob("*.md"))
+    assert word_count([readme]) <= README_WORDS
+    assert word_count([readme, *set(DOCS.rglob("*.md")) - studies]) <= GUIDE_WORDS
+    assert word_count(studies) <= STUDY_WORDS
+
+
+def test_every_picture_is_shown():
+    shown = "".join(page.read_text(encoding="utf-8") for page in [ROOT / "README.md", *DOCS.rglob("*.md")])
+    pictures = [path.name for path in (DOCS / "images").iterdir() if path.suffix in (".jpg", ".png", ".svg")]
+    assert [name for name in pictures if f"images/{name})" not in shown] == []
 
 
 def test_every_page_is_in_the_navigation_and_no_folder_is_crowded():

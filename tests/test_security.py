@@ -151,7 +151,7 @@ def test_a_manifest_names_no_file_outside_its_folder(name: str, tmp_path: Path) 
     line = (tmp_path / "manifest.jsonl").read_text()
     assert line.count('"id": "a"') == 1
     (tmp_path / "manifest.jsonl").write_text(line.replace('"id": "a"', f'"id": {json.dumps(name)}'))
-    with pytest.raises(InputError, match=r"manifest.jsonl: line 1.*id: .* is no name of a file"):
+    with pytest.raises(InputError, match=r"manifest.jsonl: line 1.*id: .* cannot name a file"):
         read_manifest(tmp_path)
 
 

@@ -1,6 +1,6 @@
 r"""Draws docs/images/mixed_light.jpg and cameras.jpg from two scenes under a light stage.
 
-sdps regenerate --shapes bunny --materials white-paint,gold-metallic-paint --lights stage:256 \
+sdps regenerate --shapes bunny --materials white-paint,gold-metallic-paint --light-set stage:256 \
     --set test.size=160 --set test.spp=64 --out out/stage
 python docs/images/recorded.py out/stage
 """

@@ -82,7 +82,7 @@ def steady_state(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
 
 def memory(scenes: int, out: Path | None) -> tuple[dict[str, Any], str]:
     """Render many small scenes in this process and follow its memory."""
-    from render.running import worker
+    from render.running.scene_rendering import render_scenes
 
     if resident_bytes() is None:
         raise InputError("bench: the memory part reads /proc, so it needs Linux; choose others by --only")
@@ -101,7 +101,7 @@ def memory(scenes: int, out: Path | None) -> tuple[dict[str, Any], str]:
             sizes.append(resident_bytes())
             (Path(folder) / scene.file).unlink()
 
-        worker.render_scenes(planned, folder, on_shard=record)
+        render_scenes(planned, folder, on_shard=record)
     megabytes = np.array(sizes) / 1e6
     quarter = max(1, len(megabytes) // 4)
     growth = 1000 * np.polyfit(np.arange(len(megabytes))[quarter:], megabytes[quarter:], 1)[0]

@@ -27,7 +27,7 @@ from pipelines.shared.flags import add_models, add_out, split_list
 from pipelines.shared.text_tables import render_text
 from render.shared.errors import InputError
 from render.shared.files import write_json
-from render.shared.progress import listening, progress_bar
+from render.shared.progress import progress_bar, report_to
 from sdps.api import infer, load, plan
 from sdps.inference.inference_config import InferenceConfig, inference_config
 from sdps.photos import check
@@ -98,7 +98,7 @@ def _large_work(folder: Path, models: Path | None, config: InferenceConfig) -> d
         now = time.perf_counter()
         stages[name], last = stages.get(name, 0.0) + now - last, now
 
-    with listening(tell), tempfile.TemporaryDirectory() as out:
+    with report_to(tell), tempfile.TemporaryDirectory() as out:
         photos = load(folder)
         findings = tuple(check(photos))
         expected = plan(photos, models=models, config=config)

@@ -26,7 +26,7 @@ def relight(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
 
     Loading Mitsuba's scenes and compiling are left out of its time; reading the shard is part of ours.
     """
-    from render.running.worker import render_scenes
+    from render.running.scene_rendering import render_scenes
 
     lights = tuple(tuple(row) for row in light_sets.load(f"stage:{_LIGHTS}").round(6).tolist())
     scene = SceneSpec(id="stage", seed=0, split="train", shape=_SHAPE, material=_MATERIAL, view=View(scale=0.8),

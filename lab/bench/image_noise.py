@@ -21,7 +21,7 @@ from pipelines.shared.flags import add_fields, split_list
 from render.planning import light_sets
 from render.planning.chunks import GROUP_SIZE
 from render.records.manifest import View
-from render.running.station import needed
+from render.running.cluster_worker import requirements
 from render.shared.config import build
 from render.shared.errors import InputError
 from render.shared.files import write_json, write_text
@@ -102,7 +102,7 @@ def measure(config: NoiseConfig, cluster: ClusterChoice | None = None) -> list[R
     ]
     with progress_bar(total=len(names) * len(config.shapes), unit="material", desc="noise") as bar:
         found: dict[Part, list[Row]] = {}
-        needs = partial(needed, config.shapes, tuple(names))
+        needs = partial(requirements, config.shapes, tuple(names))
         for part, rows in mapped(cluster, measure_part, parts, needs) if cluster else map(measure_part, parts):
             found[part] = rows
             bar.update(len(rows))

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `python -m lab eval-figures`."""
     presets.add_common_arguments(parser, default="paper")
     parser.add_argument("--figures", action="append", help=f"{', '.join(FIGURES)} (default: all)")
-    parser.add_argument("--methods", action="append", metavar="[LIGHTS+[SECOND+]]NORMALS",
+    parser.add_argument("--methods", action="append", metavar="[LIGHTS+]NORMALS",
                         help="models, combinations, classical methods; commas or repeat "
                              "(default: sdps and psfcn where there are weights, pf14, least-squares)")  # fmt: skip
     parser.add_argument("--draws", type=int, default=3, metavar="N",

@@ -1,4 +1,4 @@
-"""Take the pictures of docs/app: every room of `sdps app` in Chromium, and the viewer of a preview.html.
+"""Take the pictures of docs/app.md: every room of `sdps app` in Chromium, and the viewer of a preview.html.
 
     pip install 'sdps[app,browser]'          # and Debian's chromium
     python -m lab.studies.app_pictures RUN docs/images

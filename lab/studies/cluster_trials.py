@@ -34,15 +34,15 @@ import distributed
 from lab.shared.memory import resident_bytes
 from pipelines.rendering.render_data import planned_scenes
 from pipelines.shared import presets
-from pipelines.shared.cluster import dask_crew
+from pipelines.shared.cluster import dask_pool
 from pipelines.shared.cluster.cluster_config import ClusterChoice
 from render.planning.chunks import Chunk
 from render.records import manifest
 from render.records.ledger import now, read_runs
 from render.records.manifest import SceneSpec, View
 from render.records.shards import file_hash
-from render.running.messages import Done
-from render.running.station import Rendered, Task
+from render.running.cluster_worker import Task, TaskResult
+from render.running.protocol import Result
 from render.running.supervisor import render_supervised
 
 TINY = ["data.size=32", "data.spp=16", "data.light_count=8", "data.materials_per_view=4", "data.views=1"]
@@ -85,8 +85,8 @@ def killed_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
 
         killer = threading.Thread(target=kill)
         killer.start()
-        with dask_crew.crew_on(ClusterChoice(name=address), folder) as crew:
-            summary = render_supervised(scenes, folder, crew=crew)
+        with dask_pool.open_pool(ClusterChoice(name=address), folder) as pool:
+            summary = render_supervised(scenes, folder, pool=pool)
         assert moments, "the run ended before a worker was killed; give it more scenes"
         killer.join()
     return summary.done
@@ -114,8 +114,8 @@ def restarted_run(preset: presets.Preset, folder: Path, rng: random.Random) -> i
 
         killer = threading.Thread(target=kill)
         killer.start()
-        with dask_crew.crew_on(ClusterChoice(name=address), folder) as crew:
-            summary = render_supervised(scenes, folder, crew=crew)
+        with dask_pool.open_pool(ClusterChoice(name=address), folder) as pool:
+            summary = render_supervised(scenes, folder, pool=pool)
         assert moments, "the run ended before the scheduler was killed; give it more scenes"
         killer.join()
     return summary.done
@@ -159,14 +159,14 @@ def listed_once(folder: Path, scenes: list[SceneSpec]) -> bool:
     return sorted(ids) == sorted(scene.id for scene in scenes)
 
 
-def sleeping(task: Task) -> tuple[str, Rendered]:
+def sleeping(task: Task) -> tuple[str, TaskResult]:
     """Sleep instead of rendering: the shape's name is `SECONDS:BYTES` of the chunk's only scene."""
     seconds, size = task.chunk.shape.split(":")
     time.sleep(float(seconds))
     (scene,) = task.chunk.scenes()
     line = {"id": scene.id, "spec": scene.digest(), "bytes": int(size), "seconds": float(seconds), "stages": {},
             "time": now(), "worker": 0}  # fmt: skip
-    return distributed.get_worker().address, Rendered([Done(line)], {scene.id: os.urandom(int(size))})
+    return distributed.get_worker().address, TaskResult([Result(line)], {scene.id: os.urandom(int(size))})
 
 
 def load(slots: int, chunks: int, seconds: float, size: int, workers: int) -> int:
@@ -177,18 +177,18 @@ def load(slots: int, chunks: int, seconds: float, size: int, workers: int) -> in
         for number in range(chunks)
     ]  # fmt: skip
     parts = [Chunk(scene.shape, ((scene,),), frozenset([scene.id])) for scene in scenes]
-    dask_crew.render_task = sleeping
+    dask_pool.render_task = sleeping
     processes = workers or max(2, min(4, slots // 250))
     with tempfile.TemporaryDirectory() as folder, cluster(processes, slots // processes, not workers) as (address, _):
         before, idle = resident_bytes() or 0, idle_share()
-        with dask_crew.crew_on(ClusterChoice(name=address), Path(folder)) as crew:
-            assert crew is not None
+        with dask_pool.open_pool(ClusterChoice(name=address), Path(folder)) as pool:
+            assert pool is not None
             start, processor, done = time.monotonic(), time.process_time(), 0
-            crew.give(parts)
-            while crew.busy():
-                done += len(crew.step())
+            pool.submit(parts)
+            while pool.busy():
+                done += len(pool.poll())
             passed, processor = time.monotonic() - start, time.process_time() - processor
-            crew.close()
+            pool.close()
         after = resident_bytes("VmHWM") or 0
     ideal = chunks * seconds / slots
     who = "client, scheduler and workers" if workers else "client and scheduler"

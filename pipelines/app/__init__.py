@@ -1,1 +1,1 @@
-"""`sdps app`: a local page for photographs, scenes and data."""
+"""`sdps app`: local web pages for photographs, scenes and data."""

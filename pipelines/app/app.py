@@ -1,4 +1,4 @@
-"""`sdps app`: a local page for photographs, scenes to play with, and data."""
+"""`sdps app`: local web pages for photographs, scenes to play with, and data."""
 
 import argparse
 import importlib.util
@@ -19,21 +19,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps app`."""
     limits = Limits()
     parser.add_argument("folder", type=Path, nargs="?", default=Path("out"),
-                        help="what the room Data and runs shows, nothing else (default: %(default)s)")  # fmt: skip
+                        help="folder that the page Data and runs shows (default: %(default)s)")  # fmt: skip
     parser.add_argument("--port", type=int, default=7870, help="port (default: %(default)s; 0 for any free one)")
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine alone)")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: only this machine)")
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     parser.add_argument(
-        "--max-files", type=int, default=limits.files, help="files of one upload (default: %(default)s)"
+        "--max-files", type=int, default=limits.files, help="files in one upload (default: %(default)s)"
     )
     parser.add_argument("--max-megabytes", type=int, default=limits.bytes // 2**20,
-                        help="uploads of one visitor together, unpacked (default: %(default)s)")  # fmt: skip
+                        help="total size of one visitor's uploads, unpacked (default: %(default)s)")  # fmt: skip
     parser.add_argument("--max-megapixels", type=float, default=limits.pixels / 1e6,
                         help="pixels of one picture, in millions (default: %(default)s)")  # fmt: skip
 
 
 def main(args: argparse.Namespace) -> int:
-    """Serve the page until Ctrl-C."""
+    """Serve the pages until Ctrl-C."""
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(f"{' and '.join(missing)} missing: pip install sdps[app]")
@@ -50,13 +50,13 @@ def main(args: argparse.Namespace) -> int:
         app.state.close()
         raise InputError(f"--host {args.host} --port {args.port}: cannot be used; choose another --port") from error
     address = f"http://{args.host if ':' not in args.host else f'[{args.host}]'}:{socket.getsockname()[1]}/"
-    sys.stdout.write(f"{address}   (Ctrl-C ends it)\n")
+    sys.stdout.write(f"{address}   (Ctrl-C stops it)\n")
     if args.host not in _LOCAL:
-        sys.stdout.write("anybody who reaches this address can use it, and see what lies in the folder\n")
+        sys.stdout.write("anyone who can reach this address can use the app and see what is in the folder\n")
     sys.stdout.flush()
     if not args.no_browser:
         threading.Timer(1.0, webbrowser.open, [address]).start()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that what follows is also done then
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the clean-up below also happens then
     try:
         uvicorn.Server(config).run(sockets=[socket])
     except KeyboardInterrupt:

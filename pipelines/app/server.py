@@ -1,7 +1,7 @@
-"""The server of `sdps app`: middleware, what all rooms share, and the rooms' routes.
+"""The server of `sdps app`: middleware, jobs, and the routes of all pages.
 
-Nothing is fetched from elsewhere, which the content security policy also forbids. Requests that change something must
-come from our own pages, and a foreign name for this machine is refused (DNS rebinding).
+Nothing is loaded from other servers, which the content security policy also forbids. Requests that change something
+must come from our own pages, and foreign names for this machine are refused (DNS rebinding).
 """
 
 import asyncio
@@ -20,14 +20,14 @@ from starlette.staticfiles import StaticFiles
 from pipelines.app.common.jobs import Jobs
 from pipelines.app.common.refusals import Refused
 from pipelines.app.common.sessions import COOKIE, Sessions
-from pipelines.app.common.uploads import BESIDE, PICTURES, Limits, list_kinds
+from pipelines.app.common.uploads import LIGHT_FILES, PICTURES, Limits, list_kinds
 from pipelines.app.pages import data_routes, photo_routes, studio_routes
 from pipelines.app.pages.handling import read_number
 from render.shared.errors import InputError
 from render.shared.templates import fill
 
 HERE = Path(__file__).parent
-ROOMS = {"photographs": "Photographs", "studio": "Studio", "data": "Data and runs"}
+PAGES = {"photographs": "Photographs", "studio": "Studio", "data": "Data and runs"}
 _POLICY = (
     "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; connect-src 'self' blob:; "
     "object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
@@ -38,7 +38,7 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-_TIDY = 60.0  # seconds between two looks for sessions that ended
+_TIDY = 60.0  # seconds between two clean-ups of sessions
 _ANY = ("0.0.0.0", "::")
 
 
@@ -46,9 +46,9 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
     """Return the application; `app.state.close()` ends its worker and removes its temporary folder.
 
     Args:
-        folder: What the room "Data and runs" shows.
+        folder: What the page "Data and runs" shows.
         limits: Of uploads.
-        host: Address it listens on; requests must name it, unless it stands for all addresses.
+        host: Address it listens on; requests must name it, unless it means all addresses.
     """
     jobs, sessions = Jobs(), Sessions()
 
@@ -60,9 +60,9 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
 
     routes = [
         Route("/", lambda _: RedirectResponse("/photographs")),
-        Route("/{room:str}", _page),
-        Route("/jobs/{number}", _job),
-        Route("/jobs/{number}/cancel", _cancel, methods=["POST"]),
+        Route("/{page:str}", _send_page),
+        Route("/jobs/{number}", _send_job),
+        Route("/jobs/{number}/cancel", _cancel_job, methods=["POST"]),
         Mount("/photographs", routes=photo_routes.ROUTES),
         Mount("/studio", routes=studio_routes.ROUTES),
         Mount("/data", routes=data_routes.ROUTES),
@@ -88,28 +88,28 @@ def build(folder: Path, limits: Limits, host: str = "127.0.0.1") -> Starlette:
 
 
 async def _clean_up(sessions: Sessions, jobs: Jobs) -> None:
-    """Remove sessions that nobody uses any more. Their jobs end first, or would write into folders that are gone."""
+    """Remove sessions that are no longer used. Their jobs end first, or they would write into removed folders."""
     while True:
         await asyncio.sleep(_TIDY)
         await asyncio.to_thread(sessions.expire, ended=jobs.forget)
 
 
 def _make_guard(host: str) -> Callable[[Request, Callable[[Request], Awaitable[Response]]], Awaitable[Response]]:
-    """Return what refuses foreign requests, finds the session, and sets the headers of every answer."""
+    """Return the middleware that refuses foreign requests, finds the session and sets the headers of every answer."""
     known = {host, "127.0.0.1", "localhost", "[::1]"}
 
     async def guard(request: Request, proceed: Callable[[Request], Awaitable[Response]]) -> Response:
         named = request.headers.get("host", "")
         name = named.rsplit(":", 1)[0] if not named.endswith("]") else named
         if name not in known and host not in _ANY:
-            return JSONResponse({"message": "this name does not belong to this page"}, 403)
+            return JSONResponse({"message": "unknown host name; open the address that `sdps app` printed"}, 403)
         if request.method not in ("GET", "HEAD") and request.headers.get("origin") != f"{request.url.scheme}://{named}":
-            return JSONResponse({"message": "requests must come from this page"}, 403)
+            return JSONResponse({"message": "requests must come from the app's own pages"}, 403)
         sessions: Sessions = request.app.state.sessions
         session = sessions.find(request.cookies.get(COOKIE))
         page, static = request.url.path.count("/") == 1, request.url.path.startswith("/static/")
         if session is None and not (page or static):
-            return JSONResponse({"message": "this page is too old; load it again"}, 410)
+            return JSONResponse({"message": "this page is out of date; load it again"}, 410)
         fresh = sessions.create() if session is None and page else None
         request.state.session = session or fresh
         response = await proceed(request)
@@ -122,26 +122,26 @@ def _make_guard(host: str) -> Callable[[Request, Callable[[Request], Awaitable[R
     return guard
 
 
-async def _page(request: Request) -> Response:
-    """Return the page of a room."""
-    room = request.path_params["room"]
-    if room not in ROOMS:
-        return HTMLResponse(fill(HERE / "templates" / "missing.html.j2", rooms=ROOMS, room=""), 404)
+async def _send_page(request: Request) -> Response:
+    """Send a page."""
+    name = request.path_params["page"]
+    if name not in PAGES:
+        return HTMLResponse(fill(HERE / "templates" / "missing.html.j2", pages=PAGES, page=""), 404)
     limits: Limits = request.app.state.limits
-    accepted = ",".join((*PICTURES, *BESIDE, ".zip"))
-    template = HERE / "templates" / f"{room}.html.j2"
+    accepted = ",".join((*PICTURES, *LIGHT_FILES, ".zip"))
+    template = HERE / "templates" / f"{name}.html.j2"
     return HTMLResponse(
-        fill(template, rooms=ROOMS, room=room, limits=limits, accepted=accepted, kinds=list_kinds()),
+        fill(template, pages=PAGES, page=name, limits=limits, accepted=accepted, kinds=list_kinds()),
     )  # fmt: skip
 
 
-async def _job(request: Request) -> Response:
+async def _send_job(request: Request) -> Response:
     jobs: Jobs = request.app.state.jobs
     job = jobs.get(request.state.session.token, read_number(request, "number"))
     return JSONResponse({"message": "no such job"}, 404) if job is None else JSONResponse(jobs.describe(job))
 
 
-async def _cancel(request: Request) -> Response:
+async def _cancel_job(request: Request) -> Response:
     jobs: Jobs = request.app.state.jobs
     job = jobs.get(request.state.session.token, read_number(request, "number"))
     if job is None:
@@ -151,10 +151,10 @@ async def _cancel(request: Request) -> Response:
 
 
 async def _answer_refusal(_: Request, error: Exception) -> Response:
-    """Answer a mistake of the user, or what the server refuses, with its one line."""
+    """Send the one line of a user's mistake or of a refusal."""
     return JSONResponse({"message": str(error)}, error.status if isinstance(error, Refused) else 400)
 
 
 async def _end_request(_: Request, error: Exception) -> Response:
-    """End the request of somebody who went away in the middle of it; nobody reads the answer."""
+    """End the request of a client that disconnected; nobody reads the answer."""
     return Response(status_code=400)

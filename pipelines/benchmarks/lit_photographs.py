@@ -30,9 +30,9 @@ GOURD_APPLE = ("apple", "gourd1", "gourd2")
 LIGHT_STAGE = (
     "helmet_side_left", "plant_left", "knight_fighting", "knight_kneeling", "knight_standing", "helmet_front_left",
 )  # fmt: skip
-_GOURD_APPLE_WANT = "give the folder of apple, gourd1 and gourd2, or one of them; see docs/guides/benchmarks.md"
+_GOURD_APPLE_WANT = "give the folder of apple, gourd1 and gourd2, or one of them; see docs/guides/evaluate.md"
 _LIGHT_STAGE_WANT = (
-    "give the folder of light_directions.txt and the objects' folders, or one; see docs/guides/benchmarks.md"
+    "give the folder of light_directions.txt and the objects' folders, or one; see docs/guides/evaluate.md"
 )
 _LIGHTS, _FRONT = 253, 133
 

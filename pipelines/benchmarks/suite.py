@@ -179,7 +179,7 @@ def _lights_of(method: Method) -> tuple[str, str | None, int | None]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags every benchmark has."""
-    parser.add_argument("data", type=Path, help="folder of the benchmark, see docs/guides/benchmarks.md")
+    parser.add_argument("data", type=Path, help="folder of the benchmark, see docs/guides/evaluate.md")
     parser.add_argument("--methods", action="append", metavar="METHOD,LIGHTS+NORMALS,...",
                         help="commas or repeat, e.g. lcnet+psfcn,learned,classical (default: all)")  # fmt: skip
     parser.add_argument("--models", type=Path, metavar="DIR",

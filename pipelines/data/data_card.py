@@ -7,10 +7,10 @@ from pathlib import Path
 
 from pipelines.shared.flags import add_cache_argument
 from render.checks.folder_checks import CHECKSUMS
-from render.planning.composition import Composition, compose
+from render.planning.plan_counts import PlanCounts, count_plan
 from render.publishing import croissant, dataset_card
 from render.records.manifest import MANIFEST, read_manifest
-from render.records.mirror import finished, opened, shown
+from render.records.mirror import display_name, open_folder, select_rendered
 from render.shared.config import read_yaml
 from render.shared.errors import InputError
 from render.shared.files import write_json, write_text
@@ -36,10 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Write the files, say where they are and what is missing before publishing."""
     texts = (args.name, args.license, args.url, args.creator, args.cite)
-    with opened(args.folder, args.cache_gb) as folder:
+    with open_folder(args.folder, args.cache_gb) as folder:
         _, missing = write_card(folder, *(text.strip() for text in texts))
     names = (dataset_card.CARD, croissant.FILE, CHECKSUMS)
-    sys.stdout.write("".join(f"{shown(folder, written=True)}/{name}\n" for name in names))
+    sys.stdout.write("".join(f"{display_name(folder, written=True)}/{name}\n" for name in names))
     if missing:
         sys.stdout.write(f"before publishing, give {', '.join(missing)}\n")
     return 0
@@ -70,10 +70,10 @@ def write_card(
     if not license:
         raise InputError("--license is empty; give an identifier such as cc-by-4.0, or a URL")
     scenes = read_manifest(folder)
-    there = finished(folder, scenes)
+    there = select_rendered(folder, scenes)
     if not there:
         raise InputError(f"{folder}: no shard is there yet; run `sdps render-data` first")
-    counts = compose(scenes)
+    counts = count_plan(scenes)
     text = croissant.Description(
         name=name or _name(folder),
         about=_about(counts),
@@ -101,7 +101,7 @@ def _name(folder: Path) -> str:
     return f"Photometric stereo, {name or (resolved.parent if resolved.name == 'data' else resolved).name}"
 
 
-def _about(counts: Composition) -> str:
+def _about(counts: PlanCounts) -> str:
     """Say in two sentences what the data are."""
     sizes = ", ".join(counts.sizes)
     families = ", ".join(counts.families)

@@ -11,7 +11,7 @@ from render.exchange.layouts import LAYOUTS
 from render.exchange.rules import RuleReport, check_tree
 from render.exchange.samples import ExportOptions
 from render.records.manifest import SceneSpec, read_manifest
-from render.records.mirror import finished, opened
+from render.records.mirror import open_folder, select_rendered
 from render.shared.errors import InputError
 
 _SHOWN = 20
@@ -47,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
         if not args.check:
             raise InputError("--out is missing; give the folder to export to, or --check to check FOLDER itself")
         return report(check_tree(args.folder, args.layout, limit=args.limit), args.folder)
-    with opened(args.folder, args.cache_gb) as folder:
+    with open_folder(args.folder, args.cache_gb) as folder:
         return _export(args, str(folder), options)
 
 
@@ -96,7 +96,7 @@ def planned(folder: str, *, skip_missing: bool) -> list[SceneSpec]:
     """
     scenes = read_manifest(folder)
     if skip_missing:
-        scenes = finished(folder, scenes)
+        scenes = select_rendered(folder, scenes)
         if not scenes:
             raise InputError(f"{folder}: no shard yet; render some with `sdps render-data`")
     return scenes

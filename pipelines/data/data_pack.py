@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pipelines.shared.flags import add_cache_argument
 from render.records.manifest import MANIFEST, SceneSpec, manifest_text, read_manifest
-from render.records.mirror import opened, shard_path, shown, stored_size
-from render.records.packs import PACK, TARS, packed, plan_tars, plan_text
+from render.records.mirror import display_name, open_folder, shard_path, stored_size
+from render.records.packs import PACK, TARS, pack_tar, plan_tars, plan_text
 from render.records.shards import is_sealed
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
@@ -30,7 +30,7 @@ def main(args: argparse.Namespace) -> int:
     """Write the manifest and the plan, or make sure that they are those there; then the tars that are not there yet."""
     if not args.tar_mb > 0 or args.seed < 0:
         raise InputError(f"--tar-mb must be above 0 and --seed from 0 up, got {args.tar_mb:g} and {args.seed}")
-    with opened(args.folder, args.cache_gb) as folder:
+    with open_folder(args.folder, args.cache_gb) as folder:
         scenes = rendered(folder, skip_missing=args.skip_missing)
         by_id = {scene.id: scene for scene in scenes}
         sizes = [stored_size(folder, scene)[0] for scene in scenes]
@@ -45,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
                 raise InputError(f"{store.url}/{name}: {about}")
         left = [name for name in plan if name not in there]
         for name in progress_bar(left, desc="pack", unit="tar", disable=None if left else True):
-            store.write(name, packed(_shards(folder, [by_id[id] for id in plan[name]])))
+            store.write(name, pack_tar(_shards(folder, [by_id[id] for id in plan[name]])))
     sys.stdout.write(
         f"{args.out}: {len(scenes)} scenes ({sum(sizes) / 1e9:.3g} GB) in {len(plan)} tars, {len(left)} written now, "
         f"{len(plan) - len(left)} kept; train on it with `sdps train --data {args.out}`\n"
@@ -73,6 +73,7 @@ def _shards(folder: Path, scenes: list[SceneSpec]) -> Iterator[tuple[SceneSpec, 
         data = shard_path(folder, scene).read_bytes()
         if not is_sealed(data):
             raise InputError(
-                f"{shown(folder)}/{scene.file}: truncated or altered; `sdps render-data --verify` renders it again"
+                f"{display_name(folder)}/{scene.file}: truncated or altered; "
+                "`sdps render-data --verify` renders it again"
             )
         yield scene, data

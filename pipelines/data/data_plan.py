@@ -56,11 +56,11 @@ def main(args: argparse.Namespace) -> int:
     """
     preset, out = presets.from_arguments(args)
     options = RunOptions(workers=args.workers, keep_free=round(args.keep_free * 1e9))
-    with mirror.opened(out / "data", purpose="run") as folder:
+    with mirror.open_folder(out / "data", purpose="run") as folder:
         scenes = planned_scenes(preset, folder)
         found = survey(folder, scenes)
         left = [scene for scene in scenes if scene.id not in found.done]
-        sys.stdout.write(f"{mirror.shown(folder)}: {composition(scenes)}\n")
+        sys.stdout.write(f"{mirror.display_name(folder)}: {composition(scenes)}\n")
         sample = None if args.no_sample or not left else render_sample(left, options)
         needed = budget.disk_bytes(left, sample.measured if sample else ())
         sys.stdout.write(describe(left, needed, folder, sample))

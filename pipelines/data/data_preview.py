@@ -11,9 +11,9 @@ from pipelines.data.preview import preview_page
 from pipelines.data.preview.preview_sample import Sample, caption, read_sample
 from pipelines.shared import pictures
 from pipelines.shared.flags import add_cache_argument
-from render.planning.composition import compose
+from render.planning.plan_counts import count_plan
 from render.records.manifest import SceneSpec, read_manifest
-from render.records.mirror import finished, opened, shown
+from render.records.mirror import display_name, open_folder, select_rendered
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, write_text
 
@@ -30,9 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Write the sheets and the page, and say where they are."""
-    with opened(args.folder, args.cache_gb) as folder:
+    with open_folder(args.folder, args.cache_gb) as folder:
         written = preview(folder, args.count)
-    sys.stdout.write("".join(f"{shown(folder, written=True)}/{path.name}\n" for path in written))
+    sys.stdout.write("".join(f"{display_name(folder, written=True)}/{path.name}\n" for path in written))
     return 0
 
 
@@ -52,14 +52,16 @@ def preview(folder: str | Path, count: int = PER_SHEET) -> list[Path]:
     if count < 1:
         raise InputError(f"--count must be at least 1, got {count}")
     scenes = read_manifest(folder)
-    there = finished(folder, scenes)
+    there = select_rendered(folder, scenes)
     if not there:
         raise InputError(f"{folder}: no shard is there yet; run `sdps render-data` first")
     sample = read_sample(folder, there, count)
     if not sample.tiles:
         raise InputError(f"{folder}: none of the {len(sample.damaged)} shards read is whole; run `sdps data validate`")
     written = write_sheets(folder, sample.tiles)
-    page = preview_page.render(folder, scenes, there, compose(scenes), sample, shown=sample.tiles[:: _stride(sample)])
+    page = preview_page.render(
+        folder, scenes, there, count_plan(scenes), sample, shown=sample.tiles[:: _stride(sample)]
+    )
     write_text(folder / "preview.html", page)
     return [*written, folder / "preview.html"]
 

@@ -13,7 +13,7 @@ from typing import Any
 from render.planning import budget
 from render.records import ledger
 from render.records.manifest import MANIFEST, no_manifest, read_failed, read_manifest
-from render.records.mirror import mirror_of, opened, shown
+from render.records.mirror import display_name, mirror_of, open_folder
 
 REASONS = 5  # most frequent reasons of failure that are shown
 QUIET = 300.0  # seconds without a finished scene after which a run is taken for stopped
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print the state of the folder."""
-    with opened(args.folder) as folder:
+    with open_folder(args.folder) as folder:
         state = status(folder, verify=args.verify)
     sys.stdout.write(json.dumps(state, indent=2) + "\n" if args.json else render_text(state))
     return 0
@@ -61,7 +61,7 @@ def status(folder: Path, *, verify: bool = False) -> dict[str, Any]:
     age = (datetime.now(UTC) - datetime.fromisoformat(newest)).total_seconds() if newest else None
     rate = rates["recent_per_hour"] if age is not None and age < QUIET else rates["overall_per_hour"]
     return {
-        "folder": shown(folder),
+        "folder": display_name(folder),
         "scenes": len(ids),
         "done": len(done),
         "damaged": sum(id in sizes and id not in done for id in ids),

@@ -10,7 +10,7 @@ from pipelines.shared.flags import add_cache_argument
 from render.checks.known_checks import CHECKS, ERROR, NOTE, WARNING
 from render.checks.shard_checks import Limits
 from render.checks.validate import REPORT, Validation, to_report, validate, write_report
-from render.records.mirror import opened, shown
+from render.records.mirror import display_name, open_folder
 from render.shared.config import build, parse_yaml
 from render.shared.errors import InputError
 
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Check, write `validation.json`, and return 0 when sound, 1 when there are findings of level error."""
     limits = build(Limits, dict(map(_override, args.overrides)))
-    with opened(args.folder, args.cache_gb) as folder:
+    with open_folder(args.folder, args.cache_gb) as folder:
         result = validate(folder, limits=limits, workers=args.workers, limit=args.limit)
         write_report(result)
     if args.json:
@@ -51,7 +51,7 @@ def _override(text: str) -> tuple[str, object]:
 
 def summary(result: Validation) -> Iterator[str]:
     """Yield the lines of the readable summary."""
-    where = shown(result.folder)
+    where = display_name(result.folder)
     yield f"{where}: {result.checked} shards checked, {result.planned} planned, {result.left} left to render"
     yield ""
     width = max(map(len, CHECKS))

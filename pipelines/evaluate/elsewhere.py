@@ -14,7 +14,7 @@ import numpy as np
 from pipelines.evaluate.evaluation import Entry, Evaluation, TestObject, code_identity
 from pipelines.shared.cluster.cluster_config import ClusterChoice
 from pipelines.shared.cluster.mapped import mapped
-from render.running.station import Mismatch
+from render.running.cluster_worker import Mismatch
 from render.shared.files import atomic_path
 from render.shared.progress import progress_bar
 from sdps.inference.inference_config import InferenceConfig

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipelines.shared import pictures, presets
 from pipelines.shared.cluster import cluster_config
-from pipelines.shared.cluster.dask_crew import crew_on
+from pipelines.shared.cluster.dask_pool import open_pool
 from render.planning import budget
 from render.records import manifest, mirror
 from render.records.manifest import FAILED, MANIFEST, SceneSpec, read_manifest
@@ -65,15 +65,15 @@ def main(args: argparse.Namespace) -> int:
     preset, out = presets.from_arguments(args)
     options, cluster = run_options(args), cluster_config.from_arguments(args)
     with (
-        mirror.opened(out / "data", purpose="run") as folder,
-        crew_on(cluster, folder, timeout=options.timeout) as crew,
+        mirror.open_folder(out / "data", purpose="run") as folder,
+        open_pool(cluster, folder, timeout=options.timeout) as pool,
     ):
         scenes = planned_scenes(preset, folder)
         mirror.publish(folder)  # other machines, and `sdps data status`, see the plan
-        summary = render_supervised(scenes, folder, options, crew=crew)
+        summary = render_supervised(scenes, folder, options, pool=pool)
         if summary.lines:
             write_preview(scenes, folder)
-    sys.stdout.write(report(summary, mirror.shown(folder), len(scenes[0].lights)))
+    sys.stdout.write(report(summary, mirror.display_name(folder), len(scenes[0].lights)))
     return 1 if summary.failed or summary.skipped else 0
 
 
@@ -134,16 +134,18 @@ def render_planned(
     """
     claim(scenes, folder, preset)
     if cluster is None:
-        from render.running.worker import render_scenes
+        from render.running.scene_rendering import render_scenes
 
         rendered = render_scenes(scenes, folder)
     else:
-        with crew_on(cluster, folder) as crew:
-            summary = render_supervised(scenes, folder, RunOptions(retry_failed=True), crew=crew)
+        with open_pool(cluster, folder) as pool:
+            summary = render_supervised(scenes, folder, RunOptions(retry_failed=True), pool=pool)
         rendered = len(summary.lines)
         if summary.failed:
             first = summary.failed[0]
-            raise InputError(f"{folder}: {len(summary.failed)} scenes failed, {first['id']} thus: {first['reason']}")
+            raise InputError(
+                f"{folder}: {len(summary.failed)} scenes failed, the first was {first['id']}: {first['reason']}"
+            )
     if rendered:
         write_preview(scenes, folder)
     return rendered
@@ -155,7 +157,7 @@ def write_preview(scenes: list[SceneSpec], folder: Path) -> None:
     Raises:
         InputError: none is there any more.
     """
-    finished = mirror.finished(folder, scenes)
+    finished = mirror.select_rendered(folder, scenes)
     if not finished:
         raise InputError(
             f"{folder}: the shards that were rendered are gone; was the folder moved? run the command again"

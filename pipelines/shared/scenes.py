@@ -11,7 +11,7 @@ from render.planning.plan import material_pool
 from render.records.manifest import SceneSpec, View
 from render.shapes import load as load_shape
 from render.shared.errors import InputError
-from render.shared.seeds import derived_seed, generator
+from render.shared.seeds import derive_seed, generator
 
 _MEASURED = (".binary", ".bsdf")
 
@@ -23,7 +23,7 @@ def test_scenes(config: TestConfig) -> list[SceneSpec]:
         InputError: an unknown shape, material or light set, or two scenes of one name.
     """
     open_names = material_pool(config.materials)
-    pool = [textured.drawn(name, generator(config.seed, "test", "texture", name)) for name in open_names]
+    pool = [textured.complete(name, generator(config.seed, "test", "texture", name)) for name in open_names]
     for name in pool:
         surfaces.load(name)
     for shape in config.shapes:
@@ -34,7 +34,7 @@ def test_scenes(config: TestConfig) -> list[SceneSpec]:
     scenes = [
         SceneSpec(
             id=f"{slug(shape)}-{slug(material)}",
-            seed=derived_seed(config.seed, "test", shape),
+            seed=derive_seed(config.seed, "test", shape),
             split="test",
             shape=shape,
             material=material,

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from render.records.mirror import mirrored, opened
+from render.records.mirror import mirror_address, open_folder
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
 from render.shared.storage import Store, address, local_copy
@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 
 def _first_of_machine() -> bool:
-    """Tell whether this process is the one of its machine that fetches for the others."""
+    """Return whether this process is the one of its machine that fetches for the others."""
     return os.environ.get("LOCAL_RANK", "0") == "0"
 
 
@@ -33,9 +33,9 @@ def data_folder(place: Path, cache_gb: float, here: "Team") -> Iterator[Path]:
     Raises:
         InputError: the store cannot be read.
     """
-    url = mirrored(place)
+    url = mirror_address(place)
     if url is None or _first_of_machine():
-        with opened(place, cache_gb) as folder:
+        with open_folder(place, cache_gb) as folder:
             here.wait()
             yield folder
     else:
@@ -65,7 +65,7 @@ class StoredRuns:
         self._sending: Future[None] | None = None
 
     def fetch(self, names: Sequence[str]) -> None:
-        """Bring runs here as the store has them, on every machine, before one of them is gone on with.
+        """Bring runs here as the store has them, on every machine, before one of them resumes.
 
         Raises:
             InputError: the store cannot be read.

@@ -101,22 +101,19 @@ def train_run(
         presets.save_resolved(preset, folder)
         write_text(folder / "training.yaml", to_yaml({"model": run.model, "training": run.config}))
         if result.weights is not None:
-            document(folder, data, result)
+            document(folder, data, result.weights[name])
         runs.send(name, wait=True)
     return result
 
 
-def document(folder: Path, data: Path, result: "TrainingResult") -> None:
-    """Write the learning curves and the model cards of a finished run."""
+def document(folder: Path, data: Path, weights: Path) -> None:
+    """Write the learning curves and the model card of a finished run."""
     from sdps.publishing.learning_curves import write_curves
     from sdps.publishing.model_card import write_model_card
     from sdps.training.trainer import METRICS
 
     write_curves(folder / METRICS, folder / "curves.png")
-    files = result.weights or {}
-    for name, weights in files.items():
-        card = "MODEL_CARD.md" if len(files) == 1 else f"MODEL_CARD-{name}.md"
-        write_model_card(folder / card, weights, data)
+    write_model_card(folder / "MODEL_CARD.md", weights, data)
 
 
 def required(out: Path, name: str) -> "TrainedModel":

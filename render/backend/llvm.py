@@ -7,7 +7,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from render.backend.variant import KNOWN_GOOD, OLDEST, REMEDY, find_llvm, unpacked, works
+from render.backend.variant import KNOWN_GOOD, OLDEST, REMEDY, find_llvm, unpacked_folders, works
 from render.shared.errors import InputError
 from render.shared.files import atomic_folder
 
@@ -29,7 +29,7 @@ def fetch() -> str:
     """
     if shutil.which("apt-get") is None or shutil.which("dpkg-deb") is None:
         raise InputError(f"libLLVM cannot be fetched (this machine has no apt-get); {REMEDY}")
-    target = unpacked()[0]
+    target = unpacked_folders()[0]
     with tempfile.TemporaryDirectory() as folder:
         settings = _prepare(Path(folder))
         said = _run(["apt-get", *settings, "update"], fail=False)
@@ -48,7 +48,7 @@ def fetch() -> str:
 def _prepare(folder: Path) -> list[str]:
     """Return the options of an apt that has its lists and packages below a folder, and no package installed.
 
-    So it downloads all that a package needs, whatever the system has, and takes no lock of the system's.
+    So it downloads all that a package needs, even what the system has, and takes no lock of the system's.
     """
     for place in ("state/lists/partial", "cache/archives/partial"):
         (folder / place).mkdir(parents=True)

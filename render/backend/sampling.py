@@ -19,7 +19,7 @@ def stream(seed: int, stage: int) -> "mi.UInt32":
     return opaque(mi.UInt32(int(np.random.SeedSequence([seed, stage]).generate_state(1)[0])))
 
 
-def scrambled(first: "mi.UInt32", second: "mi.UInt32") -> tuple:
+def scramble(first: "mi.UInt32", second: "mi.UInt32") -> tuple:
     """Return two words for each pair of words, independent of those of any other pair (TEA: Zafar et al. 2010)."""
     return mi.sample_tea_32(first, second, _ROUNDS)
 
@@ -29,14 +29,14 @@ def pixel_position(pixel: "mi.UInt32", number: "mi.UInt32", seed: "mi.UInt32") -
 
     Every run of 2^k samples that starts at a multiple of 2^k is stratified in itself.
     """
-    scramble = scrambled(pixel, seed)
-    return mi.Point2f(mi.radical_inverse_2(number, scramble[0]), mi.sobol_2(number, scramble[1]))
+    words = scramble(pixel, seed)
+    return mi.Point2f(mi.radical_inverse_2(number, words[0]), mi.sobol_2(number, words[1]))
 
 
 def bounce_variates(pixel: "mi.UInt32", number: "mi.UInt32", seed: "mi.UInt32") -> tuple:
     """Return three variates for the bounce of sample `number` of a pixel: a Kronecker sequence, rotated by pixel."""
-    first, second = scrambled(pixel, seed)
-    third, _ = scrambled(first, second)
+    first, second = scramble(pixel, seed)
+    third, _ = scramble(first, second)
     return tuple(
         uniform(shift + number * mi.UInt32(step)) for shift, step in zip((first, second, third), _STEPS, strict=True)
     )
@@ -44,8 +44,8 @@ def bounce_variates(pixel: "mi.UInt32", number: "mi.UInt32", seed: "mi.UInt32") 
 
 def random_variates(sample: "mi.UInt32", seed: "mi.UInt32") -> tuple:
     """Return three independent variates per lane, for bounces beyond the first."""
-    first, second = scrambled(sample, seed)
-    third, _ = scrambled(first, second)
+    first, second = scramble(sample, seed)
+    third, _ = scramble(first, second)
     return uniform(first), uniform(second), uniform(third)
 
 

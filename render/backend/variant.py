@@ -63,7 +63,7 @@ def llvm_version(path: Path) -> int | None:
     return None
 
 
-def unpacked() -> list[Path]:
+def unpacked_folders() -> list[Path]:
     """Return the folders that may hold a libLLVM unpacked by `render.backend.llvm`, the one it unpacks into first.
 
     A run with a cache of its own uses what was fetched into the user's.
@@ -73,7 +73,7 @@ def unpacked() -> list[Path]:
 
 def find_llvm() -> list[tuple[int, Path]]:
     """Return the (major version, path) of every libLLVM found, each library once, best candidate first."""
-    places = [(root, pattern.lstrip("/")) for root in (*unpacked(), Path("/")) for pattern in _SEARCH]
+    places = [(root, pattern.lstrip("/")) for root in (*unpacked_folders(), Path("/")) for pattern in _SEARCH]
     found: dict[Path, tuple[int, Path]] = {}
     for root, pattern in places:
         for path in sorted(root.glob(pattern)):
@@ -101,7 +101,7 @@ def load_companions(llvm: Path) -> list[Path]:
 
     The system looks for them in its own folders only, but takes those that are loaded. Any other libLLVM has none.
     """
-    root = next((root for root in unpacked() if llvm.resolve().is_relative_to(root.resolve())), None)
+    root = next((root for root in unpacked_folders() if llvm.resolve().is_relative_to(root.resolve())), None)
     if root is None:
         return []
     loaded, wanted = [], [llvm]
@@ -113,7 +113,7 @@ def load_companions(llvm: Path) -> list[Path]:
             files = sorted(root.rglob(missing[1])) if missing else []
             found = next((path for path in files if path.is_file()), None)
             if found is None or found in wanted:
-                break  # Dr.Jit tells
+                break  # Dr.Jit says so
             wanted.append(found)
         else:
             loaded.append(wanted.pop())
@@ -121,7 +121,7 @@ def load_companions(llvm: Path) -> list[Path]:
 
 
 def has_cuda_driver() -> bool:
-    """Tell whether the CUDA driver library can be loaded and sees at least one device."""
+    """Return whether the CUDA driver library can be loaded and sees at least one device."""
     try:
         driver = ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -153,7 +153,7 @@ def choose() -> Choice:
 
 
 def _choose_llvm(why: str) -> Choice:
-    """Pick the libLLVM for `llvm_ad_rgb`; `why` tells why the GPU is not used."""
+    """Pick the libLLVM for `llvm_ad_rgb`; `why` says why the GPU is not used."""
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         path = Path(given)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from render.checks.known_checks import Finding
-from render.planning.composition import IMPORTED, family
+from render.planning.plan_counts import IMPORTED, family
 from render.records.ledger import SHARDS
 from render.records.manifest import MANIFEST, SceneSpec
 from render.records.mirror import CHECKSUMS
@@ -75,7 +75,7 @@ def _groups(items: Sequence[Any]) -> dict[Any, list[int]]:
 
 
 def find_duplicates(pixels: dict[str, list[str]]) -> list[Finding]:
-    """Tell scenes of different ids whose images are the same bytes."""
+    """Find scenes of different ids whose images are the same bytes."""
     return [
         Finding("duplicates", first, f"same pixels as {', '.join(others[:5])}", len(others))
         for first, *others in pixels.values()

@@ -69,7 +69,7 @@ FILES = (
     Check("file", ERROR, "sealed digest, named parts, types and shapes", _AGAIN),
     Check("manifest", ERROR, "id, lights, size and digest of the manifest line", _AGAIN),
     Check("checksum", ERROR, "SHA-256 as in checksums.txt",
-          "fetch the file again, or write the card anew if the change was meant"),
+          "fetch the file again, or write the card again if the change was meant"),
 )  # fmt: skip
 FOLDER = (
     Check("ids", ERROR, "no id twice in the manifest", "plan the data again"),
@@ -82,7 +82,7 @@ CHECKS = {check.name: check for check in (*FILES, VALUES, *CONTENT, *FOLDER)}
 
 
 def check_shard(shard: Shard, limits: Limits) -> list[Finding]:
-    """Run every check of one shard; with non-finite values only that is told, since nothing else can be measured.
+    """Run every check of one shard; with non-finite values only that is reported, since nothing else can be measured.
 
     Args:
         shard: The scene.

@@ -2,7 +2,7 @@
 
 A check is a generator `check(shard, limits)` that yields `(message, severity)` for each thing wrong: the message says
 what was measured and against which limit, severity ranks the findings of one check (larger is worse). Checks assume
-finite arrays, but for `values`, which tells whether they are. Frame as everywhere: x right, y up, z to the camera.
+finite arrays, but for `values`, which checks that they are. Frame as everywhere: x right, y up, z to the camera.
 """
 
 from collections.abc import Iterator
@@ -132,7 +132,7 @@ def mask_area(shard: Shard, limits: Limits) -> Complaints:
 
 
 def has_depth(shard: Shard) -> bool:
-    """Tell whether a shard holds depth; imported data sets without it have zeros."""
+    """Return whether a shard holds depth; imported data sets without it have zeros."""
     return bool(shard.depth[shard.mask].any())
 
 
@@ -142,7 +142,7 @@ def depth_slopes(shard: Shard) -> tuple[np.ndarray, np.ndarray]:  # (N,), (N,)
     A surface z(x, y) has the normal (-dz/dx, -dz/dy, 1) up to scale, so the prediction is -n.x/n.z and -n.y/n.z. Under
     perspective (`render.records.view_geometry`), x and y shrink by s = 1 - z/D, and it is -n.x s / (n.z - (x n.x +
     y n.y)/D) with the image point (x, y).
-    Neighbours are 2/W half image widths apart. Left out are pixels beside the silhouette or nearly edge-on, and steps:
+    Neighbours are 2/W half image widths apart. Left out are pixels next to the silhouette or nearly edge-on, and steps:
     where one part hides another, the slopes to both sides differ widely.
 
     Returns:

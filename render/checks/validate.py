@@ -32,7 +32,7 @@ from render.shared.files import write_json
 from render.shared.progress import progress_bar
 
 REPORT = "validation.json"
-LISTED = 200  # findings per check in the report; their number is always told
+LISTED = 200  # findings per check in the report; their number is always given
 
 
 @dataclass(frozen=True)

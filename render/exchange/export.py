@@ -15,7 +15,7 @@ from render.exchange.layouts import LAYOUTS, Layout
 from render.exchange.names import Place
 from render.exchange.samples import ExportOptions, prepare
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
-from render.records.mirror import finished, shard_path
+from render.records.mirror import select_rendered, shard_path
 from render.records.shards import file_hash, read_shard
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_folder, write_json
@@ -100,7 +100,7 @@ def select(
 
 def _check_shards(folder: Path, scenes: Sequence[SceneSpec]) -> None:
     """Refuse scenes without a shard before anything is written."""
-    there = {scene.id for scene in finished(folder, scenes)}
+    there = {scene.id for scene in select_rendered(folder, scenes)}
     missing = [scene.id for scene in scenes if scene.id not in there]
     if missing:
         raise InputError(

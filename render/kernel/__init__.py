@@ -1,1 +1,1 @@
-"""From rays to images: all lights of a view in one kernel, and the slow reference beside it."""
+"""From rays to images: all lights of a view in one kernel, and the slow reference."""

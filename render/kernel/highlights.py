@@ -9,7 +9,7 @@ triangle is small, as seen from light and camera, h hardly turns on it; the larg
 
 Both strategies, samples over the pixel's area and normals around h, are combined by the balance heuristic (Veach 1997,
 eq. 9.8): with p the density of the second over image area, every sample of either counts f V / (spp + A p), A the area
-of the pixel. So nothing is biased, whatever the material.
+of the pixel. So nothing is biased, for any material.
 """
 
 import math
@@ -20,7 +20,7 @@ import numpy as np
 
 from render.backend.arrays import opaque, upload
 from render.backend.jit import dr, mi
-from render.backend.sampling import scrambled, stream, uniform
+from render.backend.sampling import scramble, stream, uniform
 
 _NORMALS_PER_SAMPLE, _FEWEST, _MOST = 8, 256, 2048
 # s = 1 - cos(theta) around h is drawn with density ~ (1 + s / _CORE)^(-3/2) up to _RIM, which falls with the cube of
@@ -89,7 +89,7 @@ def centroid(corners: Any) -> Any:
 
 
 def normals(spp: int) -> int:
-    """Return how many normals are drawn for a light, per point of the surface that mirrors it, beside `spp` samples."""
+    """Return how many normals are drawn for a light, per point that mirrors it, in addition to `spp` samples."""
     return min(max(_NORMALS_PER_SAMPLE * spp, _FEWEST), _MOST)
 
 
@@ -158,8 +158,8 @@ def find(
         return None
     found = []
     for chosen in _chunks(candidates):
-        drawn = _drawn(scene, camera, halves, candidates, chosen, normals(spp), stream(seed, 77 + first))
-        seen = drawn and _unhidden(scene, camera, emitters, drawn, spp)
+        drawn = _draw(scene, camera, halves, candidates, chosen, normals(spp), stream(seed, 77 + first))
+        seen = drawn and _keep_visible(scene, camera, emitters, drawn, spp)
         if seen:
             found.append(seen)
     if not found:
@@ -179,7 +179,7 @@ def find(
     return Glints(normal, light, target, factor, surfaces.weights(point, prim), towards, wo, strength)
 
 
-def _unhidden(scene: Any, camera: Any, emitters: Any, drawn: tuple, spp: int) -> list | None:
+def _keep_visible(scene: Any, camera: Any, emitters: Any, drawn: tuple, spp: int) -> list | None:
     """Keep the points inside the frame that the camera and their light see.
 
     Returns:
@@ -282,7 +282,7 @@ def _chunks(candidates: _Candidates) -> Iterator[tuple]:
             yield tuple(upload(mi.UInt32, values.astype(np.uint32)) for values in (pairs, numbers))
 
 
-def _drawn(
+def _draw(
     scene: Any, camera: Any, halves: Any, candidates: _Candidates, chosen: tuple, count: int, seed: Any
 ) -> tuple | None:
     """Draw normals around half vectors; return those that their triangle has, and where.
@@ -292,7 +292,7 @@ def _drawn(
     pair, number = chosen
     prim, light = dr.gather(mi.UInt32, candidates.triangle, pair), dr.gather(mi.UInt32, candidates.light, pair)
     half = halves.of(light, centroid(scene.triangles(prim)))
-    turn = scrambled(prim * mi.UInt32(0x9E3779B1) + light, seed)
+    turn = scramble(prim * mi.UInt32(0x9E3779B1) + light, seed)
     u = (mi.Float(number) + uniform(turn[0])) * opaque(mi.Float(1 / count))
     s = _CORE * (dr.rcp(dr.square(1 - u * _TAIL)) - 1)
     sine = dr.sqrt(dr.maximum(s * (2 - s), 0))

@@ -88,14 +88,14 @@ def render(
     )  # fmt: skip
     if per_pass >= spp:  # shaded one by one as they are asked for, so that a hundred materials need no more memory
         (only_pass,) = passes
-        images = ((index, _averaged(stack, spp)) for index, stack in shade(only_pass, surfaces, wanted))
+        images = ((index, _average(stack, spp)) for index, stack in shade(only_pass, surfaces, wanted))
         return _ground_truth([only_pass], size, spp), images
-    truths, stacks = _summed(passes, surfaces, wanted)
-    images = ((index, _averaged(stacks.pop(index), spp)) for index in wanted)
+    truths, stacks = _sum_passes(passes, surfaces, wanted)
+    images = ((index, _average(stacks.pop(index), spp)) for index in wanted)
     return _ground_truth(truths, size, spp), images
 
 
-def _summed(
+def _sum_passes(
     passes: Iterable[Paths], surfaces: PackedSurfaces, wanted: Sequence[int]
 ) -> tuple[list[Paths], dict[int, np.ndarray]]:
     """Return the passes without their vertices, whose memory is freed one by one, and the sums of their images."""
@@ -111,7 +111,7 @@ def _summed(
     return truths, stacks
 
 
-def _averaged(image: np.ndarray, spp: int) -> np.ndarray:
+def _average(image: np.ndarray, spp: int) -> np.ndarray:
     """Divide by the samples in place: the stack is the largest array there is."""
     image /= spp
     return image

@@ -1,4 +1,4 @@
-"""Camera paths and their shadow rays: all of a view's rays, whatever its lights and materials reflect."""
+"""Camera paths and their shadow rays: all of a view's rays, which do not depend on its lights and materials."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -159,7 +159,7 @@ def _segments(sample: Any, spp: int, pixel_count: int) -> tuple:
     dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), sample // opaque(mi.UInt32(spp)))
     starts = dr.prefix_sum(counts)
     pixels = dr.compress(counts > 0)
-    if len(pixels) == 1:  # for the reason given in `trace`: beside it, another pixel without vertices
+    if len(pixels) == 1:  # for the reason given in `trace`: next to it, another pixel without vertices
         only = int(pixels[0])
         return (
             mi.UInt32([only, (only + 1) % pixel_count]), mi.UInt32([0, 0]), mi.UInt32([dr.width(sample), 0])

@@ -34,7 +34,7 @@ class Scene:
         return hit.compute_surface_interaction(ray, +mi.RayFlags.ShadingFrame), hit.prim_uv
 
     def ray_test(self, ray: Any, coherent: bool, active: Any = True) -> "mi.Bool":
-        """Tell which rays meet the object."""
+        """Return which rays meet the object."""
         return self._scene.ray_test(ray, coherent, active)
 
     def triangles(self, prim: "mi.UInt32") -> Triangles:

@@ -141,7 +141,7 @@ def _add_vertices(image: Any, paths: Paths, vertices: Vertices, surfaces: Packed
 
 
 def _carrier_faces(vertices: Vertices, number: int, at: Any, direction: Any) -> Any:
-    """Tell whether the surface that carries a relief faces the light.
+    """Return whether the surface that carries a relief faces the light.
 
     The bitmask does not: a sample that follows its pixel's probes may face away (`probed_visibility`). Without a
     relief the material is black there by itself.

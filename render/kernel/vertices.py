@@ -10,7 +10,7 @@ from render.backend.jit import dr
 class Vertices:
     """Path vertices of one depth, sorted by pixel; all arrays are Dr.Jit, in the object frame.
 
-    `bitmask` is the visibility bitmask: bit b of entry `w * N + i` tells whether vertex i sees light 32 w + b.
+    `bitmask` is the visibility bitmask: bit b of entry `w * N + i` says whether vertex i sees light 32 w + b.
     It is None until it is asked for, as those of a composition are after all paths have ended.
     """
 

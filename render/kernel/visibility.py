@@ -41,7 +41,7 @@ def visibility(scene: Any, position: Any, normal: Any, facet: Any, emitters: Any
         coherent: Whether neighbouring vertices are close to each other.
 
     Returns:
-        The visibility bitmask, UInt32 (ceil(L / 32) * N): bit b of entry `w * N + i` tells whether vertex i sees light
+        The visibility bitmask, UInt32 (ceil(L / 32) * N): bit b of entry `w * N + i` says whether vertex i sees light
         32 w + b.
     """
     return _cast(scene, position, normal, facet, emitters, lights, coherent)[0]

@@ -57,7 +57,7 @@ def load(name_or_path: str | Path) -> AnyMaterial:
     Args:
         name_or_path: A name from `names()`; `lambertian:0.5` or `lambertian:0.8/0.3/0.1` (linear RGB albedo); or the
             path of a file: `.yaml` or `.yml` of the same form as the built-in ones, `.binary` of the MERL database, or
-            `.bsdf` of the RGL database. Measured files are taken as they are, whatever their albedo. A textured
+            `.bsdf` of the RGL database. Measured files are taken as they are, even with an albedo above 1. A textured
             material (see `textured.load`): `procedural:wood:7`, or a folder of maps.
 
     Raises:
@@ -71,7 +71,7 @@ def load(name_or_path: str | Path) -> AnyMaterial:
     if suffix in (".yaml", ".yml"):
         return _user_material(text)
     if suffix in (merl.SUFFIX, ".bsdf"):
-        return _measured(text, _changed(text))
+        return _load_measured(text, _change_time(text))
     if text not in _names() and (Path(text).is_file() or (os.sep in text and ":" not in text)):
         raise InputError(f"{text}: a material file must end in {FILES}; a folder of maps must exist")
     return _builtin(text)
@@ -85,7 +85,7 @@ def own_file(name: str) -> Path | None:
 
 
 @lru_cache(maxsize=16)
-def _measured(path: str, changed: int) -> "MerlTable | RglMaterial":
+def _load_measured(path: str, changed: int) -> "MerlTable | RglMaterial":
     """Read a measured file; `changed` is the time of its last change, so that a rewritten one is read again."""
     if path.lower().endswith(merl.SUFFIX):
         return merl.read(path)
@@ -94,11 +94,11 @@ def _measured(path: str, changed: int) -> "MerlTable | RglMaterial":
     return rgl.load(path)
 
 
-def _changed(path: str) -> int:
+def _change_time(path: str) -> int:
     try:
         return os.stat(path).st_mtime_ns
     except OSError:
-        return 0  # reading it tells why
+        return 0  # reading it raises an error that says why
 
 
 @lru_cache(maxsize=256)

@@ -53,7 +53,7 @@ class MerlTable:
     category: str = "measured"
 
     def __post_init__(self) -> None:
-        values = _checked(self.values, self.name, np.float32)
+        values = _check(self.values, self.name, np.float32)
         if values.min() < 0:
             raise InputError(f"{self.name}: values must be >= 0, got {values.min():g}; see merl.build")
         if self.valid.shape != SHAPE:
@@ -102,11 +102,11 @@ def build(values: np.ndarray, name: str, path: str = "") -> MerlTable:
     Raises:
         InputError: wrong shape, a value that is not finite, or no valid entry.
     """
-    values = _checked(values, path or name, np.float32)
+    values = _check(values, path or name, np.float32)
     valid = np.all(values >= 0, axis=0)
     if not valid.any():
         raise InputError(f"{path or name}: every entry is negative, which means not measured; fetch the file again")
-    return MerlTable(name=name, values=_filled(values, valid), valid=valid, path=path)
+    return MerlTable(name=name, values=_fill(values, valid), valid=valid, path=path)
 
 
 def write(path: str | Path, values: np.ndarray) -> None:
@@ -119,7 +119,7 @@ def write(path: str | Path, values: np.ndarray) -> None:
     Raises:
         InputError: wrong shape, a value that is not finite, or a file that cannot be written.
     """
-    values = _checked(values, str(path), np.float64)
+    values = _check(values, str(path), np.float64)
     with atomic_path(path) as temporary, open(temporary, "wb") as handle:
         handle.write(_HEADER.tobytes())
         for plane, scale in zip(values, SCALES, strict=True):
@@ -192,8 +192,8 @@ def evaluate(table: MerlTable, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     return np.where(((wi[:, 2] > 0) & (wo[:, 2] > 0))[:, None], value.T, 0.0)
 
 
-def measured(table: MerlTable, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
-    """Tell for (N, 3) `wi` and `wo` whether `evaluate` there rests on measured entries alone; (N,) bool."""
+def is_measured(table: MerlTable, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
+    """Return for (N, 3) `wi` and `wo` whether `evaluate` there rests on measured entries alone; (N,) bool."""
     wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
     holes = knots((~table.valid).astype(np.float32)) > 0
     touched = sum(
@@ -206,7 +206,7 @@ def as_brdf(table: MerlTable) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Return a function of (N, 3) `wi`, `wo` giving the (N, 3) BRDF, NaN where it was not measured, for fitting."""
 
     def brdf(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
-        return np.where(measured(table, wi, wo)[:, None], evaluate(table, wi, wo), np.nan)
+        return np.where(is_measured(table, wi, wo)[:, None], evaluate(table, wi, wo), np.nan)
 
     return brdf
 
@@ -255,7 +255,7 @@ def _cell(coordinate: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
     return index, position - index
 
 
-def _filled(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def _fill(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Fill the invalid entries from the nearest valid ones along each axis in turn, from smaller angles first."""
     for axis in range(3):
         if valid.all():
@@ -269,7 +269,7 @@ def _filled(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return values
 
 
-def _checked(values: np.ndarray, where: str, dtype: type) -> np.ndarray:
+def _check(values: np.ndarray, where: str, dtype: type) -> np.ndarray:
     """Convert to a new array of `dtype`, or raise an InputError naming the first entry that is not a number."""
     values = np.asarray(values)
     if values.shape != (3, *SHAPE):

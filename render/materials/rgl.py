@@ -165,22 +165,22 @@ def write_fields(path: str | Path, fields: Mapping[str, np.ndarray]) -> None:
     kinds = {dtype: number for number, dtype in _TYPES.items()}
     arrays = {name: np.ascontiguousarray(array).reshape(np.shape(array)) for name, array in fields.items()}
     head = len(_MAGIC) + 6 + sum(13 + len(name.encode()) + 8 * array.ndim for name, array in arrays.items())
-    table, offset = [], _aligned(head)
+    table, offset = [], _align(head)
     for name, array in arrays.items():
         text = name.encode()
         kind = kinds[array.dtype.newbyteorder("<")]
         table.append(
             struct.pack(f"<H{len(text)}sHBQ{array.ndim}Q", len(text), text, array.ndim, kind, offset, *array.shape)
         )
-        offset = _aligned(offset + array.nbytes)
+        offset = _align(offset + array.nbytes)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(_MAGIC + struct.pack("<BBI", *_VERSION, len(arrays)) + b"".join(table))
         for array in arrays.values():
-            file.write(bytes(_aligned(file.tell()) - file.tell()))
+            file.write(bytes(_align(file.tell()) - file.tell()))
             file.write(array.astype(array.dtype.newbyteorder("<")).tobytes())
 
 
-def _aligned(offset: int) -> int:
+def _align(offset: int) -> int:
     return -(-offset // _ALIGNMENT) * _ALIGNMENT
 
 

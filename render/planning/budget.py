@@ -12,7 +12,7 @@ from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 
 GIBIBYTE = 1 << 30
-KEEP_FREE = 2 * GIBIBYTE  # left free on the disk whatever happens
+KEEP_FREE = 2 * GIBIBYTE  # always left free on the disk
 HALF_RATIO = 0.33  # ZIP-compressed shard over raw half-float images, before anything of the run is measured
 TRUTH_BYTES = 12  # compressed ground truth per pixel
 WORKER_MEMORY = 2 * GIBIBYTE  # one pass over many samples, images of a view, kernels, libraries
@@ -134,7 +134,7 @@ def cores() -> int:
 
 
 def available_memory() -> int:
-    """Return the bytes of memory free for new processes, caches included; a guess where the system does not tell."""
+    """Return the bytes of memory free for new processes, caches included; a guess where they are not known."""
     try:
         text = Path("/proc/meminfo").read_text(encoding="ascii")
         return next(1024 * int(line.split()[1]) for line in text.splitlines() if line.startswith("MemAvailable"))

@@ -31,7 +31,7 @@ class DataConfig:
         views: Random views per shape.
         materials_per_view: Different random materials per view (each is a sample of its own; they share rays).
         materials: Names, categories, or `all`; `lambertian:<albedo>`, material files and folders of maps are allowed;
-            `procedural` and `procedural:<kind>` are drawn anew for every scene.
+            `procedural` and `procedural:<kind>` are drawn again for every scene.
         material_weights: How often a material is drawn relative to the others, which count 1, by name or category; of
             a material that both name, the name counts.
         validation_materials: Materials, as in `materials`, that every second validation scene has in place of its own,
@@ -42,7 +42,7 @@ class DataConfig:
         mixture: Fewest and most materials of a mixed surface.
         validation: Share of the shapes of each family kept for validation, in [0, 0.5], at least one when above 0.
             Raising a count moves no shape from one split to the other.
-        lights: Distribution of the light directions, drawn anew for each view.
+        lights: Distribution of the light directions, drawn again for each view.
         light_count: Lights per view.
         near_lights: Share of the views, in [0, 1], whose lights are near: points at distances drawn from
             `near_light_distance`, in the directions that `lights` gives from the object's centre, where their
@@ -61,9 +61,9 @@ class DataConfig:
         offset: Largest image-plane offset of the object, in half image widths, per unit of scale above 0.5.
         tiles: Standing shapes are framed in an image of tiles x tiles frames (whose half width `upright_scale` counts
             in), and one of these tiles, drawn at random, is the view. The published recipe has 4.
-        min_foreground: Least share of the frame the shape must cover, by family; other views are drawn anew.
+        min_foreground: Least share of the frame the shape must cover, by family; other views are drawn again.
         min_normal_spread: Least degrees between the normals of a view and their mean (`render.planning.framing`), by
-            family; views of flat facets are drawn anew.
+            family; views of flat facets are drawn again.
     """
 
     seed: int = 0
@@ -101,7 +101,7 @@ class DataConfig:
         check_fields(self, "at least 1", "views", "materials_per_view", "light_count", "spp", "tiles")
         check_fields(self, "not negative", "seed")
         if self.prefix and not is_plain_name(self.prefix):
-            raise InputError(f"prefix: {self.prefix!r} is no name of a file; use letters, digits, '-', '_' and '.'")
+            raise InputError(f"prefix: {self.prefix!r} cannot name a file; use letters, digits, '-', '_' and '.'")
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 from 16 up, got {self.size}")
         for name in ("bounces", "composition_bounces"):
@@ -179,7 +179,7 @@ class DataConfig:
                 )
 
     def stands(self, family: str) -> bool:
-        """Tell whether the shapes of a family have an up and stand."""
+        """Return whether the shapes of a family have an up and stand."""
         return family in UPRIGHT or (family == OWN_MESHES and self.meshes is not None and self.meshes.upright)
 
     def tiles_of(self, family: str) -> int:
@@ -187,6 +187,6 @@ class DataConfig:
         return self.tiles if self.stands(family) else 1
 
     def is_framed(self, family: str) -> bool:
-        """Tell whether the views of a family depend on how the mesh fills them."""
+        """Return whether the views of a family depend on how the mesh fills them."""
         limits = (self.min_foreground.get(family, 0), self.min_normal_spread.get(family, 0))
         return self.tiles_of(family) > 1 or max(limits) > 0

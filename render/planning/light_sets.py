@@ -111,7 +111,7 @@ def load(name: str) -> np.ndarray:  # (L, 3)
         InputError: unknown name, malformed file, no light, or a light below the horizon (named by its line).
     """
     if name in names():
-        return checked(read_yaml(str(resources.files("assets") / "lights" / f"{name}.yaml")).get("directions"), name)
+        return check(read_yaml(str(resources.files("assets") / "lights" / f"{name}.yaml")).get("directions"), name)
     distribution, colon, count = name.partition(":")
     if colon and distribution in DISTRIBUTIONS:
         if not (count.isascii() and count.isdecimal() and int(count) > 0):
@@ -122,13 +122,13 @@ def load(name: str) -> np.ndarray:  # (L, 3)
         known = [*names(), *(f"{name}:64" for name in DISTRIBUTIONS)]
         raise unknown("light set", name, known, "or give a file of directions")
     if path.suffix in (".yaml", ".yml"):
-        return checked(read_yaml(path).get("directions"), name)
+        return check(read_yaml(path).get("directions"), name)
     lines = [(number, line.partition("#")[0].strip()) for number, line in numbered_lines(read_text(path))]
     lines = [(number, line) for number, line in lines if line]
-    return checked([line.replace(",", " ").split() for _, line in lines], name, [number for number, _ in lines])
+    return check([line.replace(",", " ").split() for _, line in lines], name, [number for number, _ in lines])
 
 
-def checked(rows: object, name: str, lines: Sequence[int] = ()) -> np.ndarray:  # (L, 3)
+def check(rows: object, name: str, lines: Sequence[int] = ()) -> np.ndarray:  # (L, 3)
     """Return rows of three numbers as unit vectors.
 
     Args:
@@ -137,7 +137,7 @@ def checked(rows: object, name: str, lines: Sequence[int] = ()) -> np.ndarray:  
         lines: The rows' lines in a text.
 
     Raises:
-        InputError: no list, no row, or a row that is no light above the horizon (named by its number).
+        InputError: not a list, an empty list, or a row that is not a light above the horizon (named by its number).
     """
     if not isinstance(rows, list) or not rows:
         raise InputError(f"{name}: directions: expected a list of [x, y, z] rows")

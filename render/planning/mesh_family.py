@@ -1,4 +1,4 @@
-"""The family `meshes`: mesh files of one's own, drawn in a seeded order."""
+"""The family `meshes`: mesh files of the user's own, drawn in a seeded order."""
 
 import logging
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class MeshFamily:
-    """Mesh files of one's own, the shapes of the family `meshes`.
+    """Mesh files of the user's own, the shapes of the family `meshes`.
 
     Attributes:
         path: Files, and folders whose mesh files are taken, those of folders inside included. Relative to the folder
@@ -103,7 +103,7 @@ def mesh_files(family: MeshFamily) -> list[Path]:
 
 
 def _in_folder(folder: Path) -> Iterator[Path]:
-    """Yield the files of a folder whose endings are those of meshes; what stands beside them, as textures, is left."""
+    """Yield the files of a folder whose endings are those of meshes; other files, such as textures, are left out."""
     from trimesh.exchange.load import mesh_formats
 
     formats = mesh_formats() - {"xyz"}  # points alone

@@ -20,7 +20,7 @@ from render.planning.mesh_family import choose
 from render.records.manifest import COMPOSITION, OWN_MESHES, SceneSpec, View
 from render.shared.errors import InputError, unknown
 from render.shared.progress import progress_bar
-from render.shared.seeds import derived_seed, generator
+from render.shared.seeds import derive_seed, generator
 
 __all__ = ["DataConfig", "is_validation", "material_pool", "plan", "random_view"]
 
@@ -136,7 +136,7 @@ def _mapping(processes: int) -> Iterator[Any]:
 
 
 def is_validation(number: int, share: float) -> bool:
-    """Tell whether shape `number` of a family is held out for validation.
+    """Return whether shape `number` of a family is held out for validation.
 
     Every 1/share-th shape is, the first one included, so of the first N shapes exactly ceil(share N), and whether a
     shape is does not depend on how many there are.
@@ -177,7 +177,7 @@ def _plan_shape(config: DataConfig, materials: _Materials, meshes: list[str], ke
     held_out = is_validation(number % len(meshes) if own else number, config.validation)
     for attempt in range(1 if own else SHAPES_TRIED):
         replaced = ("instead", attempt) if attempt else ()
-        shape = own[0] if own else f"{family}:{derived_seed(config.seed, family, number, *replaced)}"
+        shape = own[0] if own else f"{family}:{derive_seed(config.seed, family, number, *replaced)}"
         views = _views(config, family, number, shape)
         if views is not None:
             return [
@@ -263,9 +263,9 @@ def _plan_view(
         drawn = generator(config.seed, *keys, "unseen").permutation(len(materials.unseen))
         surface[1::2] = [materials.unseen[index] for index in np.resize(drawn, len(surface[1::2]))]
     streams = (generator(config.seed, *keys, "texture", slot) for slot in range(len(surface)))
-    surface = [textured.drawn(name, rng) for name, rng in zip(surface, streams, strict=True)]
+    surface = [textured.complete(name, rng) for name, rng in zip(surface, streams, strict=True)]
     common: dict[str, Any] = {
-        "seed": derived_seed(config.seed, *keys, "sampler"),
+        "seed": derive_seed(config.seed, *keys, "sampler"),
         "split": "val" if held_out else "train",
         "shape": shape,
         "view": pose,

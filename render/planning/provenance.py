@@ -12,7 +12,7 @@ import numpy as np
 
 from render.materials import library
 from render.materials.textures import textured
-from render.planning.composition import IMPORTED, Composition, components
+from render.planning.plan_counts import IMPORTED, PlanCounts, components
 from render.records.manifest import OWN_MESHES, SceneSpec
 from render.records.mirror import shard_path
 from render.records.shards import read_shard
@@ -87,7 +87,7 @@ def _git(git: str, folder: Path, *arguments: str) -> str | None:
 def headers(folder: Path, there: Sequence[SceneSpec]) -> dict[str, str]:
     """Read provenance from the headers of some shards, spread evenly; differing values are listed.
 
-    Shards that cannot be read are passed over; `sdps data validate` tells them.
+    Shards that cannot be read are skipped; `sdps data validate` lists them.
     """
     found: dict[str, dict[str, None]] = {key: {} for key in HEADERS}
     for place in np.unique(np.linspace(0, len(there) - 1, min(READ, len(there))).round().astype(int)):
@@ -105,7 +105,7 @@ def material_terms(materials: Sequence[str]) -> list[Terms]:
     """Group materials by source and terms of use, the largest group first; spatially-varying names are taken apart."""
     groups: dict[tuple[str, str], dict[str, None]] = {}
     for name in dict.fromkeys(part for material in materials for part in components(material)):
-        groups.setdefault(_terms_of(name), {})[textured.unseeded(name)] = None
+        groups.setdefault(_terms_of(name), {})[textured.without_seed(name)] = None
     ordered = sorted(groups.items(), key=lambda item: -len(item[1]))
     return [Terms(source, terms, tuple(names)) for (source, terms), names in ordered]
 
@@ -124,7 +124,7 @@ def _terms_of(name: str) -> tuple[str, str]:
     return source, terms or ("none needed" if source == "analytic" else UNSTATED)
 
 
-def mesh_terms(counts: Composition, own: str = "") -> dict[str, str]:
-    """Return {shape family or mesh file: terms of use} of a composition; `own` are those of the family `meshes`."""
+def mesh_terms(counts: PlanCounts, own: str = "") -> dict[str, str]:
+    """Return {shape family or mesh file: terms of use} of a plan; `own` are those of the family `meshes`."""
     known = MESHES | {IMPORTED: ORIGINAL} | ({OWN_MESHES: own} if own else {})
     return {name: known.get(name, UNSTATED) for name in counts.families}

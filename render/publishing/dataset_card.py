@@ -7,7 +7,7 @@ from typing import Any
 
 from render.checks.folder_checks import CHECKSUMS
 from render.planning import provenance
-from render.planning.composition import Composition
+from render.planning.plan_counts import PlanCounts
 from render.publishing import croissant
 from render.publishing.croissant import Description
 from render.records.manifest import MANIFEST, SceneSpec
@@ -55,7 +55,7 @@ def write_checksums(folder: Path, there: Sequence[SceneSpec]) -> dict[str, str]:
 
 
 def render_card(
-    folder: Path, scenes: Sequence[SceneSpec], there: Sequence[SceneSpec], counts: Composition, text: Description
+    folder: Path, scenes: Sequence[SceneSpec], there: Sequence[SceneSpec], counts: PlanCounts, text: Description
 ) -> str:
     """Compose the card.
 
@@ -63,7 +63,7 @@ def render_card(
         folder: Data folder.
         scenes: The manifest.
         there: Its scenes that have a shard.
-        counts: Composition of the manifest.
+        counts: What the manifest holds.
         text: What the maker of the data says.
     """
     rendered = provenance.headers(folder, there)
@@ -89,7 +89,7 @@ def render_card(
     )  # fmt: skip
 
 
-def _front_matter(text: Description, counts: Composition) -> dict[str, Any]:
+def _front_matter(text: Description, counts: PlanCounts) -> dict[str, Any]:
     """Return what Hugging Face reads; a licence that is no short identifier is given by name or link."""
     licence = {"license": text.license.lower()}
     if text.license.startswith(("http://", "https://")):

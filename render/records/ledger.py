@@ -43,9 +43,8 @@ class Ledger:
         self.path = folder / LOG / f"done-{host() or 'host'}-{os.getpid()}-{start}.jsonl"
         self._handle: TextIO | None = None
 
-    @property
-    def crowded(self) -> bool:
-        """Whether no further work should be handed out for now."""
+    def is_crowded(self) -> bool:
+        """Return whether no further work should be handed out for now."""
         return False
 
     def __enter__(self) -> Self:
@@ -53,7 +52,7 @@ class Ledger:
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._handle is not None:
-            with suppress(OSError):  # of a line that `add` could not write, and told
+            with suppress(OSError):  # of a line that `add` could not write and raised
                 self._handle.close()
 
     def add(self, line: dict[str, Any]) -> None:
@@ -74,7 +73,7 @@ class Ledger:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Make the folder of a file, and tell in one line that it cannot be written."""
+    """Make the folder of a file; if it cannot be written, say so in one line."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
@@ -90,7 +89,7 @@ def read_runs(folder: Path) -> list[list[dict[str, Any]]]:
 
 
 def is_finished(line: dict[str, Any]) -> bool:
-    """Tell whether a finished shard's line has a time of a known zone, and numbers where it must."""
+    """Return whether a finished shard's line has a time of a known zone, and numbers where it must."""
     try:
         zone = datetime.fromisoformat(line["time"]).tzinfo
     except ValueError:

@@ -93,7 +93,7 @@ class SceneSpec:
 
     def __post_init__(self) -> None:
         if not is_plain_name(self.id):
-            raise InputError(f"id: {self.id!r} is no name of a file; use letters, digits, '-', '_' and '.'")
+            raise InputError(f"id: {self.id!r} cannot name a file; use letters, digits, '-', '_' and '.'")
         if min(self.seed, self.bounces, self.spp) < 0 or min(self.resolution) < 1 or max(self.resolution) > LARGEST:
             raise InputError(
                 f"scene {self.id}: wants seed, bounces and spp from 0 and a size from 1 to {LARGEST}, "
@@ -238,15 +238,15 @@ def _scene(row: Any, where: str) -> SceneSpec:
     """Build a scene from a line; its lights, which are most of it, are not read number by number if all are sound."""
     lights: Any = row.get("lights") if isinstance(row, dict) else None
     if _is_vectors(lights):
-        scene = replace(_built(row | {"lights": ()}, where), lights=tuple(map(tuple, lights)))
+        scene = replace(_build(row | {"lights": ()}, where), lights=tuple(map(tuple, lights)))
     else:
-        scene = _built(row, where)
+        scene = _build(row, where)
     if not all(map(math.isfinite, chain.from_iterable(scene.lights))):
         raise InputError(f"{where}.lights: a direction is not finite; plan the data again")
     return scene
 
 
-def _built(row: Any, where: str) -> SceneSpec:
+def _build(row: Any, where: str) -> SceneSpec:
     """Build a scene; complaints name the line."""
     try:
         return build(SceneSpec, row, where)
@@ -255,7 +255,7 @@ def _built(row: Any, where: str) -> SceneSpec:
 
 
 def _is_vectors(value: Any) -> bool:
-    """Tell whether a JSON value is a list of lists of three floats, which needs no conversion but to tuples."""
+    """Return whether a JSON value is a list of lists of three floats, which needs no conversion but to tuples."""
     return (
         isinstance(value, list)
         and {type(row) for row in value} == {list}

@@ -2,7 +2,7 @@
 
 The folder, the mirror, holds the small files (manifest, ledger, reports), a listing of the shards, and as many of the
 shards as `--cache-gb` allows, fetched when they are asked for; of a packed set whole tars are, and unpacked. All that
-reads a data folder reads a mirror: it asks `shard_path` for a shard's file, and `finished` for which there are.
+reads a data folder reads a mirror: it asks `shard_path` for a shard's file, and `select_rendered` for which there are.
 """
 
 import json
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from render.records.manifest import FAILED, MANIFEST, SceneSpec
-from render.records.packs import PACK, Plan, read_plan, unpacked
+from render.records.packs import PACK, Plan, read_plan, unpack_tar
 from render.records.shards import file_hash, is_sealed
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, parse_json, read_bytes, write_text
@@ -28,7 +28,7 @@ LOG = "log"
 SHARDS = "shards"
 CHECKSUMS = "checksums.txt"
 _STATE = ".storage.json"
-_IN_USE = 60.0  # seconds for which a file of the cache is kept after it was asked for, whatever the limit
+_IN_USE = 60.0  # seconds for which a file of the cache is kept after it was asked for, even over the limit
 _FAILURES = f"{LOG}/failed-"
 
 
@@ -59,7 +59,7 @@ class Mirror:
             return path
         name = self.holder(scene)
         assert name is not None, scene.file
-        with _one_process(self.folder / f".{name.replace('/', '-')}.lock", only=name != scene.file):
+        with _lock(self.folder / f".{name.replace('/', '-')}.lock", only=name != scene.file):
             if path.is_file():  # unpacked by another process meanwhile
                 return path
             for id, data in self._shards(name, scene).items():
@@ -73,7 +73,7 @@ class Mirror:
         for _ in range(2):  # damaged on the way: once more
             data = self.store.read(name)
             if name != scene.file:
-                found = unpacked(data, self.plan[name])
+                found = unpack_tar(data, self.plan[name])
                 if found is not None:
                     return found
             elif is_sealed(data):
@@ -123,7 +123,7 @@ class Mirror:
             total -= status.st_size
 
     def refresh(self) -> None:
-        """Bring listing and small files up to date; forget what was written anew since."""
+        """Bring listing and small files up to date; forget what has been written again since."""
         before = self.objects
         self.objects = self._listing()
         stale = [name for name, what in before.items() if self.objects.get(name) != what]
@@ -221,22 +221,22 @@ def _mirror_at(folder: Path, _: int, __: int) -> Mirror:
 
 
 @contextmanager
-def opened(place: str | Path, cache_gb: float = CACHE_GB, purpose: str = "read") -> Iterator[Path]:
+def open_folder(place: str | Path, cache_gb: float = CACHE_GB, purpose: str = "read") -> Iterator[Path]:
     """Yield a folder of this disk that stands for a data folder: itself, or a mirror of one in a store, or packed.
 
-    What a command writes into the mirror beside shards (a report, a card) is sent when it ends well.
+    What a command writes into the mirror apart from shards (a report, a card) is sent when it ends well.
 
     Raises:
         InputError: the store cannot be read; a cache of no size.
     """
-    url = mirrored(place)
+    url = mirror_address(place)
     if url is None:
         yield Path(place)
         return
     if not cache_gb > 0:
         raise InputError(f"--cache-gb must be above 0, got {cache_gb:g}")
     folder = local_copy(url, purpose)
-    with _alone(folder, url) if purpose == "run" else nullcontext():
+    with _lock_run(folder, url) if purpose == "run" else nullcontext():
         known = mirror_of(folder)
         mirror = Mirror(folder, url, round(cache_gb * 1e9), known.objects if known else {})
         mirror.refresh()
@@ -248,7 +248,7 @@ def opened(place: str | Path, cache_gb: float = CACHE_GB, purpose: str = "read")
         publish(folder)
 
 
-def mirrored(place: str | Path) -> str | None:
+def mirror_address(place: str | Path) -> str | None:
     """Return the address of a data folder that is read through a mirror, which a packed one on this disk is, too."""
     return address(place) or (f"file://{Path(place).resolve()}" if (Path(place) / PACK).is_file() else None)
 
@@ -261,11 +261,11 @@ def publish(folder: Path) -> None:
 
 
 @contextmanager
-def _alone(folder: Path, url: str) -> Iterator[None]:
+def _lock_run(folder: Path, url: str) -> Iterator[None]:
     """Hold a mirror that shards are rendered into; a second run on this machine would send the first one's shards."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with _one_process(folder / ".lock", wait=False):
+        with _lock(folder / ".lock", wait=False):
             yield
     except BlockingIOError as error:
         raise InputError(
@@ -275,7 +275,7 @@ def _alone(folder: Path, url: str) -> Iterator[None]:
 
 
 @contextmanager
-def _one_process(path: Path, *, wait: bool = True, only: bool = True) -> Iterator[None]:
+def _lock(path: Path, *, wait: bool = True, only: bool = True) -> Iterator[None]:
     """Hold a lock among the processes of this machine; with `only` false, or on Windows, hold none.
 
     Raises:
@@ -293,7 +293,7 @@ def _one_process(path: Path, *, wait: bool = True, only: bool = True) -> Iterato
         yield
 
 
-def shown(folder: Path, *, written: bool = False) -> str:
+def display_name(folder: Path, *, written: bool = False) -> str:
     """Return what to call a data folder: its path, or its address unless what is meant is written where none can be."""
     mirror = mirror_of(folder)
     return mirror.store.url if mirror and not (written and mirror.store.read_only) else str(folder)
@@ -309,8 +309,8 @@ def shard_path(folder: Path, scene: SceneSpec) -> Path:
     return mirror.fetch(scene) if mirror and mirror.holder(scene) else folder / scene.file
 
 
-def kept(folder: Path, *paths: Path) -> bool:
-    """Tell whether files made of shards are all there; in a mirror they are then kept for another minute at least."""
+def touch_files(folder: Path, *paths: Path) -> bool:
+    """Return whether files made of shards are all there; in a mirror they are then kept for another minute at least."""
     if mirror_of(folder) is None:
         return all(path.is_file() for path in paths)
     try:
@@ -321,7 +321,7 @@ def kept(folder: Path, *paths: Path) -> bool:
     return True
 
 
-def finished(folder: str | Path, scenes: Iterable[SceneSpec]) -> list[SceneSpec]:
+def select_rendered(folder: str | Path, scenes: Iterable[SceneSpec]) -> list[SceneSpec]:
     """Return the scenes that have a shard."""
     folder = Path(folder)
     mirror = mirror_of(folder)
@@ -331,7 +331,7 @@ def finished(folder: str | Path, scenes: Iterable[SceneSpec]) -> list[SceneSpec]
 
 
 def stored_size(folder: Path, scene: SceneSpec) -> tuple[int, str]:
-    """Return a shard's bytes and what tells it from one written later.
+    """Return a shard's bytes and what distinguishes it from one written later.
 
     Raises:
         FileNotFoundError: there is no such shard.
@@ -352,7 +352,7 @@ class Packed(NamedTuple):
     limit: int
 
 
-def packed_as(folder: Path, scenes: Sequence[SceneSpec]) -> Packed | None:
+def describe_packing(folder: Path, scenes: Sequence[SceneSpec]) -> Packed | None:
     """Return how finished scenes are packed; None where they are files or objects of their own."""
     mirror = mirror_of(folder)
     if mirror is None or not mirror.tars:

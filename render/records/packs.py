@@ -41,7 +41,7 @@ def plan_tars(scenes: Sequence[SceneSpec], sizes: Sequence[int], limit: int, see
         filled, number, name = limit, -1, ""
         for place in generator(seed, "pack", split).permutation(places):
             scene, size = scenes[place], sizes[place]
-            needed = _padded(size) + _padded(len(scene.line()))
+            needed = _padded_size(size) + _padded_size(len(scene.line()))
             if filled + needed > limit:
                 filled, number = 0, number + 1
                 name = f"{TARS}/{split}-{number:06d}.tar"
@@ -51,7 +51,7 @@ def plan_tars(scenes: Sequence[SceneSpec], sizes: Sequence[int], limit: int, see
     return plan
 
 
-def _padded(size: int) -> int:
+def _padded_size(size: int) -> int:
     """Return what a member takes in a tar, header included."""
     return _BLOCK * (1 + -(-size // _BLOCK))
 
@@ -71,11 +71,11 @@ def read_plan(folder: Path) -> Plan:
     found = read_json(folder / PACK, remedy)
     tars = found.get("tars") if isinstance(found, dict) and found.get("schema") == 1 else None
     if not isinstance(tars, dict) or not all(isinstance(scenes, dict) for scenes in tars.values()):
-        raise InputError(f"{folder / PACK}: is no list of tars of this version; {remedy}")
+        raise InputError(f"{folder / PACK}: not a list of tars of this version; {remedy}")
     return tars
 
 
-def packed(samples: Iterable[tuple[SceneSpec, bytes]]) -> bytes:
+def pack_tar(samples: Iterable[tuple[SceneSpec, bytes]]) -> bytes:
     """Return the tar of some scenes and their shards, the same bytes for the same scenes."""
     stream = io.BytesIO()
     with _library().TarWriter(stream, encoder=False, mtime=0) as tar:
@@ -84,7 +84,7 @@ def packed(samples: Iterable[tuple[SceneSpec, bytes]]) -> bytes:
     return stream.getvalue()
 
 
-def unpacked(data: bytes, ids: Iterable[str]) -> dict[str, bytes] | None:
+def unpack_tar(data: bytes, ids: Iterable[str]) -> dict[str, bytes] | None:
     """Return the shards of a tar by scene; None if one of those that should be in it is not, or not whole."""
     from_tar = _library().tariterators.tar_file_iterator
     try:

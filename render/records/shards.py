@@ -8,8 +8,8 @@ weights `w0`, `w1`, ... of the materials its header names; parts `L000`, `L001`,
 RGB radiance under one light of irradiance pi, with its direction, and the position of a near one, in the part's header.
 
 OpenEXR's binding silently corrupts non-contiguous arrays (openexr #1929) and arrays of unusual channel
-counts, and opens damaged files with fewer parts; hence one checked writer, a digest of the whole file, and
-a reader that refuses whatever differs from the digest or the manifest.
+counts, and opens damaged files with fewer parts; so there is one checked writer, a digest of the whole file, and
+a reader that refuses anything that differs from the digest or the manifest.
 """
 
 import hashlib
@@ -120,7 +120,7 @@ def write_exr(path: str | Path, parts: list[tuple[str, dict[str, Any], dict[str,
     checked = []
     for name, attributes, channels in parts:
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
-        checked.append(OpenEXR.Part(header, {key: _checked(value, f"{name}.{key}") for key, value in channels.items()},
+        checked.append(OpenEXR.Part(header, {key: _check(value, f"{name}.{key}") for key, value in channels.items()},
                                     name))  # fmt: skip
     with atomic_path(path) as temporary:
         try:
@@ -131,7 +131,7 @@ def write_exr(path: str | Path, parts: list[tuple[str, dict[str, Any], dict[str,
             raise OSError(f"OpenEXR could not write it: {error}") from error
 
 
-def _checked(array: np.ndarray, name: str) -> np.ndarray:
+def _check(array: np.ndarray, name: str) -> np.ndarray:
     """Return a contiguous copy of an array OpenEXR writes correctly, or refuse it."""
     assert array.dtype in _DTYPES, f"{name}: {array.dtype}"
     assert array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3), f"{name}: {array.shape}"
@@ -243,7 +243,7 @@ def read_shard(path: str | Path, scene: SceneSpec | None = None) -> Shard:
 
 
 def is_whole(path: str | Path, scene: SceneSpec) -> bool:
-    """Tell, without decoding a pixel, whether the shard is there, unaltered, and of this manifest line."""
+    """Return, without decoding a pixel, whether the shard is there, unaltered, and of this manifest line."""
     try:
         data = _read_sealed(path)
     except InputError:
@@ -253,7 +253,7 @@ def is_whole(path: str | Path, scene: SceneSpec) -> bool:
 
 
 def is_sealed(data: bytes) -> bool:
-    """Tell whether the bytes are those of a whole, unaltered shard."""
+    """Return whether the bytes are those of a whole, unaltered shard."""
     match = _DIGEST.search(data)
     return match is not None and _digest(data, match) == match.group(1).decode()
 
@@ -261,7 +261,7 @@ def is_sealed(data: bytes) -> bool:
 def _read_sealed(path: str | Path) -> bytes:
     """Read the file and check its digest.
 
-    This comes before OpenEXR opens a file, because OpenEXR skips over what is damaged, telling so only on stderr.
+    This comes before OpenEXR opens a file, because OpenEXR skips over what is damaged and reports it on stderr only.
     """
     data = read_bytes(path, "no such shard; run `sdps render-data` to finish the folder")
     if _DIGEST.search(data) is None:

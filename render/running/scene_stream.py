@@ -3,149 +3,123 @@
 The scenes come shape by shape, since making a shape and its acceleration structure takes more than half as long as
 rendering the eight scenes that a preset has of it. Shapes, and the views of a shape, come in a new seeded order in
 every pass over the plan. The number of a scene in this order determines the scene, and its arrays are those its shard
-would hold, to the bit; so a reader may start anywhere, and a renderer may be replaced by another.
-
-`serve` is what a process of its own runs; `pipelines.train.streaming` is its parent. The pipe between them carries
-tuples: `("scene", id, RenderedScene)`, `("failed", reason)`, and `("end",)` after as many scenes as were asked for.
+would hold, to the bit; so a reader may start anywhere, and a process may be replaced by another.
 """
 
-import os
-import queue
-import signal
+import tempfile
 import threading
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import groupby, islice
-from multiprocessing.connection import Connection
-from typing import NamedTuple
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
 
-import numpy as np
-
-from render.backend.orphans import end_with_parent
-from render.planning.chunks import view_groups
+from render.planning import budget
+from render.planning.chunks import Chunk, view_groups
 from render.records.manifest import SceneSpec
+from render.running.protocol import Failure, Fatal, Result, SceneArrays
+from render.running.worker_pool import LocalPool
+from render.running.worker_process import serve
 from render.shared.errors import InputError
 from render.shared.seeds import generator
 
 
-class RenderedScene(NamedTuple):
-    """What training needs of a scene, as in `render.records.shards.Shard`."""
-
-    images: np.ndarray  # (L, H, W, 3) float16, linear radiance under irradiance pi
-    normals: np.ndarray  # (H, W, 3) float32, unit, camera frame, zero outside the mask
-    mask: np.ndarray  # (H, W) bool
-
-
-_Message = tuple[str] | tuple[str, str] | tuple[str, str, RenderedScene]
-
-
-@dataclass(frozen=True)
-class StreamWorkerConfig:
-    """What a streaming process is told at its start.
-
-    Attributes:
-        scenes: The plan, views whole.
-        seed: Seed of the order.
-        start: Number of the first scene.
-        count: Scenes after which to end.
-        depth: Finished scenes kept ready; rendering pauses while nobody takes them.
-        threads: Threads that render.
-    """
-
-    scenes: Sequence[SceneSpec]
-    seed: int
-    start: int
-    count: int
-    depth: int
-    threads: int
-
-
-def stream_order(scenes: Sequence[SceneSpec], *, seed: int, start: int = 0) -> Iterator[tuple[list[SceneSpec], int]]:
-    """Yield the views of a plan endlessly, in the order of the stream, from scene number `start` on.
+def stream_chunks(scenes: Sequence[SceneSpec], *, seed: int, start: int = 0) -> Iterator[Chunk]:
+    """Yield a plan endlessly, a chunk for each shape, from scene number `start` on.
 
     Args:
         scenes: The plan, views whole and the views of a shape together.
         seed: Seed of the order.
         start: Number of the first scene; a pass has `len(scenes)`.
-
-    Yields:
-        The scenes of a view, and how many of them lie before `start` (0 but for the first view).
     """
-    groups = view_groups(scenes)
-    shapes = [list(run) for _, run in groupby(groups, key=lambda group: group[0].shape)]
+    shapes = [list(run) for _, run in groupby(view_groups(scenes), key=lambda group: group[0].shape)]
     number, skip = divmod(start, len(scenes))
     while True:
         rng = generator(seed, "stream", "order", number)
         for shape in rng.permutation(len(shapes)):
-            for view in rng.permutation(len(shapes[shape])):
-                group = shapes[shape][view]
-                if skip < len(group):
-                    yield group, skip
-                skip = max(skip - len(group), 0)
+            views = [tuple(shapes[shape][view]) for view in rng.permutation(len(shapes[shape]))]
+            ids = [scene.id for view in views for scene in view]
+            if chunk := Chunk(views[0][0].shape, tuple(views), frozenset(ids)).without(ids[:skip]):
+                yield chunk
+            skip = max(skip - len(ids), 0)
         number += 1
 
 
-def rendered_scenes(
-    scenes: Sequence[SceneSpec], *, seed: int, start: int = 0
-) -> Iterator[tuple[SceneSpec, RenderedScene]]:
-    """Render the scenes of `stream_order` in this process, one by one as they are asked for.
+class RenderedStream:
+    """The scenes of a plan from number `start` on, endlessly, rendered by a process of their own.
 
     Args:
         scenes: The plan, views whole and the views of a shape together.
         seed: Seed of the order.
         start: Number of the first scene.
+        depth: Finished scenes kept ready; rendering pauses while nobody takes them.
+        threads: Threads that render; 0 takes half of the cores.
+        recycle: Scenes after which the process is replaced.
+        timeout: Seconds to wait for a scene before giving up; 0 waits for ever.
+        serve: What the rendering process runs, a module-level function.
 
     Raises:
-        InputError: an unusable shape or material, an object outside the frame, or images that are not finite.
+        InputError: from `next`: a scene cannot be rendered, the process died or hangs, or the stream is closed.
     """
-    from render.backend.jit import dr
-    from render.running import worker
 
-    order = stream_order(scenes, seed=seed, start=start)
-    for shape, run in groupby(order, key=lambda item: item[0][0].shape):
-        built, stages = worker.build(worker.load_shape(shape)), worker.Stages()
-        for group, skip in run:
-            wanted = {scene.id for scene in group[skip:]}
-            for scene, shard in worker.group_shards(built, group, wanted, stages):
-                if not np.isfinite(shard.images).all():
-                    raise InputError(f"scene {scene.id}: the images have infinite or NaN values")
-                yield scene, RenderedScene(shard.images, shard.normals, shard.mask)
-        dr.flush_malloc_cache()
+    def __init__(
+        self,
+        scenes: Sequence[SceneSpec],
+        *,
+        seed: int,
+        start: int = 0,
+        depth: int = 4,
+        threads: int = 0,
+        recycle: int = 500,
+        timeout: float = 600.0,
+        serve: Callable[..., None] = serve,
+    ) -> None:
+        self._by_id = {scene.id: scene for scene in scenes}
+        self._chunks = stream_chunks(scenes, seed=seed, start=start)
+        self._lock, self._closed = threading.Lock(), False
+        self._results: deque[Result] = deque()
+        self._errors = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        self._pool = LocalPool(
+            None, Path(self._errors.name), workers=1, timeout=timeout, recycle=recycle, serve=serve, ahead=depth,
+            threads=threads or max(1, budget.cores() // 2),
+        )  # fmt: skip
 
+    def __iter__(self) -> "RenderedStream":
+        return self
 
-def serve(connection: Connection, config: StreamWorkerConfig) -> None:
-    """Render as configured, sending each scene through `connection`; end with the parent, whatever it ends by."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    end_with_parent()  # whatever the renderer is doing
-    outbox: queue.Queue[_Message | None] = queue.Queue(config.depth)
-    sender = threading.Thread(target=_send, args=(connection, outbox), daemon=True)
-    sender.start()
-    outbox.put(_render(config, outbox))
-    outbox.put(None)
-    sender.join()
+    def __next__(self) -> tuple[SceneSpec, SceneArrays]:
+        """Wait for the next scene."""
+        self._pool.restart_clock()
+        while not self._results:
+            self._poll()
+        line, arrays = self._results.popleft()
+        assert arrays is not None
+        return self._by_id[line["id"]], arrays
 
+    def _poll(self) -> None:
+        """Keep the process at work, and take in what it has finished."""
+        with self._lock:
+            if self._closed:
+                raise InputError("the stream of rendered scenes is closed")
+            if not self._pool.queue:
+                self._pool.submit([next(self._chunks)])
+            outcomes = self._pool.poll()
+        for outcome in outcomes:
+            match outcome:
+                case Result():
+                    self._results.append(outcome)
+                case Failure(ids, reason):
+                    self.close()
+                    remedy = "raise stream.timeout or lower data.spp" if "timed out" in reason else (
+                        "`sdps render-data` with the same preset shows where"
+                    )  # fmt: skip
+                    raise InputError(f"rendering while training: scene {ids[0]}: {reason}; {remedy}")
+                case Fatal(reason):
+                    self.close()
+                    raise InputError(f"rendering while training: {reason}")
 
-def _render(config: StreamWorkerConfig, outbox: queue.Queue[_Message | None]) -> _Message:
-    """Put the scenes into the outbox; return the last message."""
-    try:
-        from render.backend.jit import dr
-
-        dr.set_thread_count(config.threads)
-        rendered = rendered_scenes(config.scenes, seed=config.seed, start=config.start)
-        for scene, arrays in islice(rendered, config.count):
-            outbox.put(("scene", scene.id, arrays))
-    except InputError as error:
-        return "failed", str(error)
-    except Exception as error:
-        reason = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
-        return "failed", f"the renderer failed ({reason}); `sdps render-data` of the same plan tells where"
-    return ("end",)
-
-
-def _send(connection: Connection, outbox: queue.Queue[_Message | None]) -> None:
-    while (message := outbox.get()) is not None:
-        try:
-            connection.send(message)
-        except OSError:
-            os._exit(1)  # nobody listens any more
+    def close(self) -> None:
+        """End the process at once; may be called from another thread than waits for a scene."""
+        self._closed = True  # first: a waiting thread gives up when its poll ends, within about a second
+        with self._lock:
+            self._pool.close()
+            self._errors.cleanup()

@@ -1,8 +1,8 @@
 """Rendering a plan with several processes, so that no scene can stop the run: the parent's side.
 
-The parent gives chunks of consecutive views of a shape to a crew (`render.running.crew`), writes the ledger and the
-failures, and watches the disk. It never imports mitsuba. The bytes of a shard depend on the manifest alone, not on how
-the work was shared.
+The parent gives chunks of consecutive views of a shape to a pool (`render.running.worker_pool`), writes the ledger and
+the failures, and watches the disk. It never imports mitsuba. The bytes of a shard depend on the manifest alone, not on
+how the work was shared.
 """
 
 import signal
@@ -21,9 +21,9 @@ from render.records.ledger import Ledger, Survey, now, survey, sweep
 from render.records.manifest import SceneSpec
 from render.records.mirror import mirror_of
 from render.records.sending import open_ledger, send_leftovers
-from render.running.crew import Crew, LocalCrew, News
-from render.running.isolation import serve
-from render.running.messages import Done, Failed, Fatal
+from render.running.protocol import Failure, Fatal, Outcome, Result
+from render.running.worker_pool import LocalPool, WorkerPool
+from render.running.worker_process import serve
 from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
@@ -98,7 +98,7 @@ def render_supervised(
     options: RunOptions | None = None,
     *,
     serve: Callable[..., None] = serve,
-    crew: Crew | None = None,
+    pool: WorkerPool | None = None,
 ) -> RunSummary:
     """Render every scene that has no whole shard yet and did not fail before; go on after failures.
 
@@ -107,7 +107,7 @@ def render_supervised(
         folder: Data folder; its `shards/`, `log/` and `failed.jsonl` are written.
         options: How to run it.
         serve: What a rendering process runs, a module-level function.
-        crew: Who renders, closed at the end; processes of this machine when omitted.
+        pool: Who renders, closed at the end; processes of this machine when omitted.
 
     Raises:
         InputError: a mistake that concerns the whole run: the disk, or a process that cannot start. Shards stay.
@@ -130,8 +130,8 @@ def render_supervised(
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as errors, open_ledger(folder) as ledger, _sigterm_as_interrupt():
         run = _Run(scenes, wanted, found, folder, options, ledger)
-        if wanted or crew:
-            run.go(crew or LocalCrew(
+        if wanted or pool:
+            run.render(pool or LocalPool(
                 folder, Path(errors), workers=options.workers, timeout=options.timeout, recycle=options.recycle,
                 serve=serve,
             ))  # fmt: skip
@@ -142,7 +142,7 @@ def render_supervised(
 
 
 class _Run:
-    """The books of one run: what has come of its scenes."""
+    """The records of one run: what has come of its scenes."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class _Run:
         self.failed: list[dict[str, Any]] = []
         self.workers = 1
 
-    def go(self, crew: Crew) -> None:
+    def render(self, pool: WorkerPool) -> None:
         """Render until nothing is left."""
         self.bar = progress_bar(
             total=len(self.scenes), initial=len(self.scenes) - len(self.wanted), unit="scene", desc="render",
@@ -168,42 +168,41 @@ class _Run:
         )  # fmt: skip
         try:
             with self.bar:
-                crew.give(cut(self.scenes, self.wanted, crew.slots, crew.chunk_bytes))
-                told = ""
-                while crew.busy():
-                    while self.ledger.crowded:  # shards that wait for their store fill the disk: make no more of them
+                pool.submit(cut(self.scenes, self.wanted, pool.slots, pool.chunk_bytes))
+                note = ""
+                while pool.busy():
+                    while self.ledger.is_crowded():  # shards that wait for their store fill the disk
                         time.sleep(0.1)
-                    for news in crew.step():
-                        self._take(news)
-                    self.workers = crew.count
-                    if crew.note != told:
-                        told = crew.note
-                        self.bar.set_postfix_str(told)
-                    self.bar.update(0)  # the time, as often as the bar is shown anew
+                    for outcome in pool.poll():
+                        self._record(outcome)
+                    self.workers = pool.count
+                    if pool.note != note:
+                        note = pool.note
+                        self.bar.set_postfix_str(note)
+                    self.bar.update(0)  # the time, whenever the bar is drawn again
         finally:
-            crew.close()
+            pool.close()
 
-    def _take(self, news: News) -> None:
-        """Enter what a crew tells."""
-        match news:
-            case Done(line):
-                self._done(line)
-            case Failed():
-                self._failed(news)
+    def _record(self, outcome: Outcome) -> None:
+        match outcome:
+            case Result(line):
+                self._record_result(line)
+            case Failure():
+                self._record_failure(outcome)
             case Fatal(reason):
                 raise InputError(f"{reason} ({self._kept()})" if self.lines else reason)
 
-    def _done(self, line: dict[str, Any]) -> None:
+    def _record_result(self, line: dict[str, Any]) -> None:
         self.lines.append(line)
         self.ledger.add(line)
-        self._tick(1)
+        self._update_bar(1)
         if budget.free_bytes(self.folder) < self.options.keep_free:
             raise InputError(
                 f"{self.folder}: less than {budget.gigabytes(self.options.keep_free)} of disk are free; "
                 f"{self._kept()}; free space and run it again to go on"
             )
 
-    def _failed(self, failure: Failed) -> None:
+    def _record_failure(self, failure: Failure) -> None:
         for id in failure.ids:
             scene = self.wanted[id]
             self.attempts[id] = self.attempts.get(id, 0) + 1
@@ -214,16 +213,14 @@ class _Run:
             }  # fmt: skip
             self.failed.append(line)
             self.ledger.fail(line)
-        self._tick(len(failure.ids))
+        self._update_bar(len(failure.ids))
         if not self.lines and len(self.failed) >= HOPELESS:
             raise InputError(
-                f"{self.folder}: the first {len(self.failed)} scenes all failed, the last one thus: {failure.reason}; "
-                "mend that, then run it again with --retry-failed"
+                f"{self.folder}: the first {len(self.failed)} scenes all failed, the last one: {failure.reason}; "
+                "fix that, then run it again with --retry-failed"
             )
 
-    # ---- Telling ----
-
-    def _tick(self, count: int) -> None:
+    def _update_bar(self, count: int) -> None:
         pace = budget.recent_pace(self.lines, self.workers)
         left = len(self.wanted) - len(self.lines) - len(self.failed)
         eta = f"{budget.duration(pace.left(left))} left, " if pace else ""

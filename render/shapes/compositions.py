@@ -15,11 +15,11 @@ from render.shapes import grounds
 from render.shapes.blobby import blobby
 from render.shapes.geometry import sdf
 from render.shapes.geometry.contact import free_path
-from render.shapes.geometry.mesh import TriangleMesh, joined
+from render.shapes.geometry.mesh import TriangleMesh, join
 from render.shapes.geometry.noise import scalar_waves
 from render.shapes.geometry.polygonise import polygonise
 from render.shapes.geometry.sdf import Field
-from render.shapes.sculpture.family import RECIPES, weathered
+from render.shapes.sculpture.family import RECIPES, weather
 from render.shared import seeds
 
 TRIANGLES = 30_000  # of an object
@@ -37,7 +37,7 @@ def composition(seed: int) -> TriangleMesh:
     Object 0 is the ground, bowl or niche where there is one.
     """
     rng = seeds.generator(seed, "composition")
-    return joined(KINDS[kind(seed)][0](rng)).normalised()
+    return join(KINDS[kind(seed)][0](rng)).normalised()
 
 
 def kind(seed: int) -> str:
@@ -49,34 +49,34 @@ def kind(seed: int) -> str:
 
 def heap(rng: np.random.Generator) -> list[TriangleMesh]:
     """Heap objects on a ground."""
-    pile = [_meshed(grounds.ground(rng), 1.4)]
-    return _heaped(rng, pile, [_sized(rng, part(rng), 0.25, 0.47) for _ in range(int(rng.integers(3, 7)))], 0.66)
+    pile = [_mesh(grounds.ground(rng), 1.4)]
+    return _heap(rng, pile, [_scale(rng, part(rng), 0.25, 0.47) for _ in range(int(rng.integers(3, 7)))], 0.66)
 
 
 def in_bowl(rng: np.random.Generator) -> list[TriangleMesh]:
     """Fill a bowl, which stands on a ground in half of the cases."""
-    pile = [_meshed(grounds.bowl(rng), 1.2)]
+    pile = [_mesh(grounds.bowl(rng), 1.2)]
     if rng.random() < 0.5:
-        slab = _meshed(grounds.ground(rng), 1.4)
-        pile = [slab, _onto(pile[0], [slab])]
-    return _heaped(rng, pile, [_sized(rng, part(rng), 0.28, 0.5) for _ in range(int(rng.integers(2, 6)))], 0.5)
+        slab = _mesh(grounds.ground(rng), 1.4)
+        pile = [slab, _drop_onto(pile[0], [slab])]
+    return _heap(rng, pile, [_scale(rng, part(rng), 0.28, 0.5) for _ in range(int(rng.integers(2, 6)))], 0.5)
 
 
 def before_wall(rng: np.random.Generator) -> list[TriangleMesh]:
     """Put objects on a ground and push them against the wall behind, or against those before it."""
-    pile = [_meshed(grounds.corner(rng), 2.2)]
+    pile = [_mesh(grounds.corner(rng), 2.2)]
     for number in range(int(rng.integers(2, 6))):
-        body = _sized(rng, part(rng), 0.3, 0.6)
+        body = _scale(rng, part(rng), 0.3, 0.6)
         start = np.array([(-0.35, 0.35, 0.0, -0.2, 0.2)[number] + rng.uniform(-0.1, 0.1), rng.uniform(0.1, 0.35)])
-        _settle(pile, _at(body, *_rolled(_at(body, 0, 0), pile, start, 0.6)), BACK, 0.9)
+        _settle(pile, _at(body, *_roll_down(_at(body, 0, 0), pile, start, 0.6)), BACK, 0.9)
     return pile
 
 
 def in_niche(rng: np.random.Generator) -> list[TriangleMesh]:
     """Put an object before a niche and push it in, and at times others after it."""
-    pile = [_meshed(grounds.niche(rng), 2.2)]
+    pile = [_mesh(grounds.niche(rng), 2.2)]
     for number in range(int(rng.integers(1, 4))):
-        body = _sized(rng, part(rng), *((0.4, 0.55) if number == 0 else (0.2, 0.33)))
+        body = _scale(rng, part(rng), *((0.4, 0.55) if number == 0 else (0.2, 0.33)))
         reach = float(body.vertices[:, 2].min() - body.vertices[:, 2].mean())
         _settle(pile, _at(body, rng.uniform(-0.1, 0.1) * (1 + 2 * number), 0.2 - reach), BACK, 1.2)
     return pile
@@ -91,9 +91,9 @@ def links(rng: np.random.Generator) -> list[TriangleMesh]:
         form = sdf.torus([0, 0, 0], ring, tube, sdf.rotation("x", roll))
         if rng.random() < 0.6:
             form = sdf.displaced(form, scalar_waves(rng, 4, 30, slope=1.2), tube * rng.uniform(0.02, 0.08))
-        link = _moved(_meshed(form, 1.2), np.array([position, 0, 0]))
+        link = _move(_mesh(form, 1.2), np.array([position, 0, 0]))
         if number:
-            link = _moved(link, np.array([1.0, 0, 0]) * free_path(link, chain[-1], np.array([1.0, 0, 0])))
+            link = _move(link, np.array([1.0, 0, 0]) * free_path(link, chain[-1], np.array([1.0, 0, 0])))
         chain.append(link)
         position = float(link.vertices[:, 0].min() + link.vertices[:, 0].max()) / 2 + ring
         roll += 90 + rng.uniform(-25, 25)
@@ -103,10 +103,10 @@ def links(rng: np.random.Generator) -> list[TriangleMesh]:
 
 def concave(rng: np.random.Generator) -> list[TriangleMesh]:
     """Build a single deeply concave object, in half of the cases on a ground."""
-    body = polygonise(weathered(rng, grounds.hollow(rng)), half_size=1.7, triangles=2 * TRIANGLES).normalised()
+    body = polygonise(weather(rng, grounds.hollow(rng)), half_size=1.7, triangles=2 * TRIANGLES).normalised()
     if rng.random() < 0.5:
         return [body]
-    pile = [_meshed(grounds.ground(rng), 1.4)]
+    pile = [_mesh(grounds.ground(rng), 1.4)]
     _settle(pile, replace(body, vertices=body.vertices * 0.85))
     return pile
 
@@ -125,14 +125,14 @@ def part(rng: np.random.Generator) -> TriangleMesh:
     """Build one object in the unit sphere, turned as it stands or lies: a blob, a sculpture, or a simple solid."""
     choice = rng.random()
     if choice < 0.3:
-        return _lying(rng, blobby(int(rng.integers(2**31))))
+        return _lay_down(rng, blobby(int(rng.integers(2**31))))
     if choice < 0.65:
         name = str(rng.choice(list(RECIPES)))
-        form, stands = weathered(rng, RECIPES[name][0](rng)), name in _STANDING and rng.random() < 0.8
+        form, stands = weather(rng, RECIPES[name][0](rng)), name in _STANDING and rng.random() < 0.8
     else:
         form, stands = _solid(rng), False
     mesh = polygonise(form, half_size=1.7, triangles=TRIANGLES).normalised()
-    return mesh.rotated(sdf.rotation("y", rng.uniform(-180, 180))) if stands else _lying(rng, mesh)
+    return mesh.rotated(sdf.rotation("y", rng.uniform(-180, 180))) if stands else _lay_down(rng, mesh)
 
 
 def _solid(rng: np.random.Generator) -> Field:
@@ -153,11 +153,11 @@ def _solid(rng: np.random.Generator) -> Field:
     return forms[int(rng.integers(len(forms)))]
 
 
-def _meshed(form: Field, half_size: float) -> TriangleMesh:
+def _mesh(form: Field, half_size: float) -> TriangleMesh:
     return polygonise(form, half_size=half_size, triangles=TRIANGLES)
 
 
-def _lying(rng: np.random.Generator, mesh: TriangleMesh) -> TriangleMesh:
+def _lay_down(rng: np.random.Generator, mesh: TriangleMesh) -> TriangleMesh:
     """Turn an object so that its middle is low, as that of one at rest is: the lowest of `_POSES` random poses."""
     turns = Rotation.random(_POSES, rng=rng).as_matrix()  # (P, 3, 3)
     points = mesh.vertices - mesh.vertices.mean(0)
@@ -165,59 +165,59 @@ def _lying(rng: np.random.Generator, mesh: TriangleMesh) -> TriangleMesh:
     return mesh.rotated(turns[int(heights.argmin())])
 
 
-def _sized(rng: np.random.Generator, mesh: TriangleMesh, low: float, high: float) -> TriangleMesh:
+def _scale(rng: np.random.Generator, mesh: TriangleMesh, low: float, high: float) -> TriangleMesh:
     """Scale an object of the unit sphere to a radius between two."""
     return replace(mesh, vertices=mesh.vertices * rng.uniform(low, high))
 
 
-def _moved(mesh: TriangleMesh, by: np.ndarray) -> TriangleMesh:
+def _move(mesh: TriangleMesh, by: np.ndarray) -> TriangleMesh:
     return replace(mesh, vertices=(mesh.vertices + by).astype(np.float32))
 
 
 def _at(mesh: TriangleMesh, x: float, z: float) -> TriangleMesh:
     """Move the middle of an object to a place over the ground."""
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    return _moved(mesh, np.array([x - middle[0], 0, z - middle[2]]))
+    return _move(mesh, np.array([x - middle[0], 0, z - middle[2]]))
 
 
-def _free(mesh: TriangleMesh, pile: list[TriangleMesh], direction: np.ndarray, most: float = np.inf) -> float:
+def _free_distance(mesh: TriangleMesh, pile: list[TriangleMesh], direction: np.ndarray, most: float = np.inf) -> float:
     """Return how far an object can go before it touches one of a pile; the last ones are touched most often."""
     for other in reversed(pile):
         most = free_path(mesh, other, direction, most)
     return most
 
 
-def _onto(mesh: TriangleMesh, pile: list[TriangleMesh]) -> TriangleMesh:
+def _drop_onto(mesh: TriangleMesh, pile: list[TriangleMesh]) -> TriangleMesh:
     """Let an object fall from above a pile, some of which is below it."""
     top = max(float(other.vertices[:, 1].max()) for other in pile)
-    raised = _moved(mesh, UP * (top - float(mesh.vertices[:, 1].min()) + 0.1))
-    return _moved(raised, DOWN * _free(raised, pile, DOWN))
+    raised = _move(mesh, UP * (top - float(mesh.vertices[:, 1].min()) + 0.1))
+    return _move(raised, DOWN * _free_distance(raised, pile, DOWN))
 
 
 def _settle(pile: list[TriangleMesh], mesh: TriangleMesh, push: np.ndarray = DOWN, most: float = 0.0) -> None:
     """Add an object to a pile: let it fall, push it at most so far along the ground, and let it fall again."""
-    fallen = _onto(mesh, pile)
+    fallen = _drop_onto(mesh, pile)
     if most > 0:
-        fallen = _moved(fallen, UP * _free(fallen, pile, UP, _LIFT))
-        fallen = _moved(fallen, push * _free(fallen, pile, push, most))
-        fallen = _moved(fallen, DOWN * _free(fallen, pile, DOWN))
+        fallen = _move(fallen, UP * _free_distance(fallen, pile, UP, _LIFT))
+        fallen = _move(fallen, push * _free_distance(fallen, pile, push, most))
+        fallen = _move(fallen, DOWN * _free_distance(fallen, pile, DOWN))
     pile.append(fallen)
 
 
-def _heaped(
+def _heap(
     rng: np.random.Generator, pile: list[TriangleMesh], bodies: list[TriangleMesh], spread: float
 ) -> list[TriangleMesh]:
     """Add objects, the largest first, each from where it rolls down the others, then pushed back to them."""
     for body in sorted(bodies, key=lambda mesh: -float(np.ptp(mesh.vertices, axis=0).prod())):
         start = rng.uniform(-0.25, 0.25, 2)
-        place = _rolled(_at(body, 0, 0), pile, start, spread)
+        place = _roll_down(_at(body, 0, 0), pile, start, spread)
         far = float(np.hypot(*place))
         towards = np.array([-place[0], 0, -place[1]]) / max(far, 1e-6)
         _settle(pile, _at(body, *place), towards, far)
     return pile
 
 
-def _rolled(mesh: TriangleMesh, pile: list[TriangleMesh], start: np.ndarray, spread: float) -> np.ndarray:  # (2,)
+def _roll_down(mesh: TriangleMesh, pile: list[TriangleMesh], start: np.ndarray, spread: float) -> np.ndarray:  # (2,)
     """Return the place (x, z) within a radius `spread` where an object that starts above a pile rolls to.
 
     It moves to where, of the places around, it would lie lowest, until it lies lower than around. Heights are those of

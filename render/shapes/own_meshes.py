@@ -1,6 +1,6 @@
-"""Meshes of one's own by name: `meshes:<axis that is up>:<first digits of the file's SHA-256>:<path>`.
+"""Meshes of the user's own by name: `meshes:<axis that is up>:<first digits of the file's SHA-256>:<path>`.
 
-The digits tie a plan to the file's content: what was changed or moved since is told, not rendered.
+The digits tie a plan to the file's content: a file that was changed or moved since is reported, not rendered.
 """
 
 import hashlib

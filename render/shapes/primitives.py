@@ -19,7 +19,7 @@ from render.shared.files import atomic_path, cache_folder
 BUNNY_WHEEL = "pymeshfix==0.18.1"
 BUNNY_MEMBER = "pymeshfix/examples/StanfordBunny.ply"
 BUNNY_SHA256 = "04ade0928afe3f307851bcb7fa932d6f9375d7dff8432615c8105828209deb3f"
-# One build of the wheel, whatever interpreter runs this: only a data file is taken from it, nothing is installed.
+# One build of the wheel for any interpreter: only a data file is taken from it, nothing is installed.
 BUNNY_BUILD = ("--python-version", "3.11", "--implementation", "cp", "--abi", "cp311")
 BUNNY_PLATFORM = ("--platform", "manylinux_2_28_x86_64")
 
@@ -58,15 +58,15 @@ def bunny_file() -> Path:
     """
     path = cache_folder() / "StanfordBunny.ply"
     if not path.is_file():
-        data = _checked(_fetch_bunny(path), f"{BUNNY_MEMBER} of {BUNNY_WHEEL}")
+        data = _check(_fetch_bunny(path), f"{BUNNY_MEMBER} of {BUNNY_WHEEL}")
         with atomic_path(path) as temporary:
             temporary.write_bytes(data)
         return path
-    _checked(path.read_bytes(), str(path))
+    _check(path.read_bytes(), str(path))
     return path
 
 
-def _checked(data: bytes, source: str) -> bytes:
+def _check(data: bytes, source: str) -> bytes:
     """Return `data` if it is the pinned mesh."""
     digest = hashlib.sha256(data).hexdigest()
     if digest != BUNNY_SHA256:

@@ -42,7 +42,7 @@ def check_fields(
         config: What has the fields, numbers.
         bound: What they must be.
         names: The fields.
-        section: Section of the preset, where the field's name alone would not tell.
+        section: Section of the preset, where the field's name alone is not enough.
 
     Raises:
         InputError: the first that is not, with its value.

@@ -1,7 +1,7 @@
 """The door through which files from outside are decoded.
 
-Whatever a library raises on damaged bytes becomes one line, and a file whose header announces more than such a file can
-sensibly hold is refused before anything is unpacked: a picture of 1 KB may claim 100,000 x 100,000 pixels.
+Any error that a library raises on damaged bytes becomes one line, and a file whose header announces more than such a
+file can sensibly hold is refused before anything is unpacked: a picture of 1 KB may claim 100,000 x 100,000 pixels.
 """
 
 import os
@@ -27,7 +27,7 @@ TIMES = 128
 
 @contextmanager
 def decoding(path: str | Path, what: str, remedy: str = "copy it again") -> Iterator[None]:
-    """Turn whatever goes wrong while a library decodes a file into one line.
+    """Turn any error while a library decodes a file into one line.
 
     Every library fails in its own ways on damaged bytes, and hands on damaged arrays that fail later; so this catches
     every exception. Only decoding belongs inside.
@@ -82,7 +82,7 @@ def check_picture(path: str | Path, picture: Image.Image, data: bytes) -> None:
     Args:
         path: The file.
         picture: What Pillow opened.
-        data: The whole file; a PNG tells its bits per channel at byte 24, which Pillow keeps to itself.
+        data: The whole file; a PNG states its bits per channel at byte 24, which Pillow keeps to itself.
     """
     wide = picture.format == "PNG" and data[24:25] == b"\x10"
     bands = 3 if picture.mode == "P" else len(picture.getbands())
@@ -142,7 +142,7 @@ _kept = -1
 
 
 @contextmanager
-def silenced() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """Keep what C libraries print about damaged files off standard error, in all threads of the process.
 
     Python's own stream writes there as well, so nothing but decoding belongs inside.

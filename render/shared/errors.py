@@ -1,4 +1,4 @@
-"""Errors a user can cause, told in one line.
+"""Errors a user can cause, each one line.
 
 `InputError` is the only exception the command line turns into a message and exit code 2; anything
 else is a defect and keeps its traceback.

@@ -21,7 +21,7 @@ _PLAIN_NAME = re.compile(r"(?!\.)[^/\\\0-\x1f\x7f]{1,200}")
 
 
 def is_plain_name(name: str) -> bool:
-    """Tell whether a name from a file can be that of a file in a given folder, and of nothing outside it."""
+    """Return whether a name from a file can be that of a file in a given folder, and of nothing outside it."""
     return _PLAIN_NAME.fullmatch(name) is not None
 
 
@@ -32,14 +32,14 @@ def cache_folder() -> Path:
 
 
 def users_cache_folder() -> Path:
-    """Return `sdps` in the user's cache folder, whatever $SDPS_CACHE says."""
+    """Return `sdps` in the user's cache folder; $SDPS_CACHE does not count."""
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
     return (Path(base) if base else Path.home() / ".cache") / "sdps"
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success flush it to disk and rename it, on failure remove it.
+    """Yield a temporary path next to `path`; on success flush it to disk and rename it, on failure remove it.
 
     The temporary name keeps the suffix, since several writers choose the format by it.
 
@@ -62,10 +62,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Yield an empty folder beside `path` and rename it to `path` on success, in place of what is there.
+    """Yield an empty folder next to `path` and rename it to `path` on success, in place of what is there.
 
     Whenever it ends, the old folder or the new one stands at `path`; after a kill between two renamings the old one
-    lies beside it, and comes back with the next call for any folder of the same parent, or with `tidy`.
+    lies next to it, and comes back with the next call for any folder of the same parent, or with `tidy`.
 
     Raises:
         InputError: the disk is full or the parent cannot be written; nothing new is left behind.

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from render.shared.decoding import check_picture, decoding, silenced
+from render.shared.decoding import check_picture, decoding, silence
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
 
@@ -36,7 +36,7 @@ def read_image(path: str | Path, *, channels: int | None = 3) -> np.ndarray:
     Raises:
         InputError: missing, damaged, another number of channels, or neither 8 nor 16 bits.
     """
-    pixels = _decoded(path)
+    pixels = _decode(path)
     found = 1 if pixels.ndim == 2 else pixels.shape[2]
     if channels is None:
         return pixels if pixels.ndim == 2 else pixels[..., 2 if found >= 3 else 0]
@@ -54,20 +54,20 @@ def read_channels(path: str | Path) -> np.ndarray:
     Raises:
         InputError: missing, damaged, or neither 8 nor 16 bits.
     """
-    pixels = _decoded(path)
+    pixels = _decode(path)
     if pixels.ndim == 2:
         return pixels[..., None]
     return np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], axis=2) if pixels.shape[2] >= 3 else pixels
 
 
-def _decoded(path: str | Path) -> np.ndarray:
+def _decode(path: str | Path) -> np.ndarray:
     """Return the pixels as OpenCV has them, BGR, uint8 or uint16."""
     data = read_bytes(path, "no such picture; copy it there or drop it from the list that names it")
     with decoding(path, "a picture"):
         with Image.open(io.BytesIO(data)) as picture:
             check_picture(path, picture, data)
             picture.verify()
-        with silenced():  # libpng and libtiff print about odd profiles and tags
+        with silence():  # libpng and libtiff print about odd profiles and tags
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise InputError(f"{path}: damaged or not a picture; copy it again")

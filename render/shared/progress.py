@@ -18,15 +18,15 @@ _SHORT = 10.0
 
 
 def progress_bar(*args: Any, **options: Any) -> "tqdm[Any]":
-    """Return a tqdm bar; where standard error is no terminal it prints a line every 20 seconds instead."""
+    """Return a tqdm bar; where standard error is not a terminal it prints a line every 20 seconds instead."""
     if not sys.stderr.isatty():
         options = {"mininterval": 20.0, "maxinterval": 20.0, "ncols": 100, "ascii": True} | options
     return tqdm(*args, **options)
 
 
 @contextmanager
-def listening(listener: Listener) -> Iterator[None]:
-    """Tell `listener` the stages that `stage` names meanwhile; in one thread at a time."""
+def report_to(listener: Listener) -> Iterator[None]:
+    """Report to `listener` the stages that `stage` names inside; in one thread at a time."""
     global _listener
     before, _listener = _listener, listener
     try:
@@ -70,7 +70,7 @@ def bars(without: Collection[str] = ()) -> Iterator[None]:
     """
     shown: dict[str, tqdm[Any]] = {}
 
-    def tell(name: str, done: float) -> None:
+    def report(name: str, done: float) -> None:
         if name in without:
             return
         if name not in shown:
@@ -80,7 +80,7 @@ def bars(without: Collection[str] = ()) -> Iterator[None]:
         shown[name].update(max(done - shown[name].n, 0.0))
 
     try:
-        with listening(tell):
+        with report_to(report):
             yield
     finally:
         _close(shown)
@@ -93,17 +93,17 @@ def _close(shown: "dict[str, tqdm[Any]]") -> None:
 
 
 @contextmanager
-def together(weights: Mapping[str, float]) -> Iterator[None]:
-    """Tell who listens the share of a whole job: its stages in order, each with its part of the time; no others."""
+def share_out(weights: Mapping[str, float]) -> Iterator[None]:
+    """Report the share of a whole job: its stages in order, each with its part of the time; no others."""
     outer, total = _listener, sum(weights.values())
     if outer is None:
         yield
         return
     starts = dict(zip(weights, itertools.accumulate(weights.values(), initial=0.0), strict=False))
 
-    def tell(name: str, share: float) -> None:
+    def report(name: str, share: float) -> None:
         if name in weights:
             outer(name, (starts[name] + weights[name] * share) / total)
 
-    with listening(tell):
+    with report_to(report):
         yield

@@ -23,6 +23,6 @@ def generator(root: int, *keys: int | str) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence([root, len(keys), *(_word(key) for key in keys)]))
 
 
-def derived_seed(root: int, *keys: int | str) -> int:
+def derive_seed(root: int, *keys: int | str) -> int:
     """Return a 31-bit seed of its own for the stage named by `keys`."""
     return int(generator(root, *keys).integers(2**31))

@@ -27,7 +27,7 @@ TOGETHER = 8  # objects sent or fetched at once
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/{1,3}([^/].*)")  # `Path` makes one slash of two; a drive is one letter
 _VERSIONS = ("ETag", "etag", "generation", "md5Hash", "mtime", "LastModified", "last_modified")
 _DRIVERS = {"botocore", "aiobotocore", "aiohttp", "google", "gcsfs", "azure", "requests", "urllib3"}
-"""Packages whose errors tell of the connection or the store; errors of others are defects."""
+"""Packages whose errors are about the connection or the store; errors of others are defects."""
 _OPTIONS = {"s3": {"max_concurrency": 1}}  # else every read begins with a request for the size
 _INSTALL = {"s3": "sdps[storage]", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
 _HOPELESS = {errno.EINVAL, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EROFS}
@@ -40,7 +40,7 @@ class Missing(InputError):
 
 
 class Stored(NamedTuple):
-    """What a listing tells of an object: its bytes, and a text that changes when it is written again."""
+    """What a listing says of an object: its bytes, and a text that changes when it is written again."""
 
     size: int
     version: str
@@ -74,7 +74,6 @@ class Store:
         self.url = url
         self.wait = float(os.environ.get("SDPS_STORAGE_WAIT") or WAIT)
         self.stopped = threading.Event()  # ends waiting in other threads
-        self.requests, self.sent, self.fetched = 0, 0, 0
         self._open()
 
     @property
@@ -129,15 +128,12 @@ class Store:
     def read(self, name: str) -> bytes:
         """Return an object's bytes; `Missing` where there is none."""
         driver, root = self._open()
-        data = self._patiently("read", name, lambda: driver.cat_file(f"{root}/{name}"))
-        self.fetched += len(data)
-        return data
+        return self._patiently("read", name, lambda: driver.cat_file(f"{root}/{name}"))
 
     def write(self, name: str, data: bytes) -> Stored:
         """Write an object, in place of what is there; its version is left to the next listing."""
         driver, root = self._open()
         self._patiently("write", name, lambda: _put(driver, f"{root}/{name}", data))
-        self.sent += len(data)
         return Stored(len(data), "")
 
     def create(self, name: str, data: bytes) -> bool:
@@ -160,9 +156,8 @@ class Store:
     def _patiently(self, what: str, name: str, action: Callable[[], _T]) -> _T:
         """Do something, again while waiting may help."""
         where = f"{self.url}/{name}" if name else self.url
-        start, pause, told = time.monotonic(), 1.0, False
+        start, pause, warned = time.monotonic(), 1.0, False
         while True:
-            self.requests += 1
             try:
                 return action()
             except Exception as error:
@@ -176,10 +171,10 @@ class Store:
                         f"{where}: cannot {what} it ({error}); what is finished is kept, run the same command again "
                         "once the store is there"
                     ) from error
-                if not told:
+                if not warned:
                     _log.warning("%s: cannot %s it now (%s); trying again for %.0f s", where, what,
                                  _short(error), left)  # fmt: skip
-                told = True
+                warned = True
             self.stopped.wait(min(pause, left))
             pause = min(2 * pause, 20.0)
 
@@ -208,21 +203,21 @@ def _stored(info: dict[str, Any]) -> Stored:
 
 
 def _of_the_store(error: Exception) -> bool:
-    """Tell errors of store and connection from defects of this project."""
+    """Return whether an error is one of store or connection, not a defect of this project."""
     return isinstance(error, OSError | TimeoutError) or type(error).__module__.partition(".")[0] in _DRIVERS
 
 
 def _hopeless(where: str, error: Exception) -> InputError | None:
-    """Return what to say of an error that waiting does not mend."""
+    """Return what to say of an error that waiting does not help."""
     if isinstance(error, FileNotFoundError):
-        return Missing(f"{where}: {_short(error)}; create the bucket, or mend the address")
+        return Missing(f"{where}: {_short(error)}; create the bucket, or correct the address")
     if isinstance(error, PermissionError) or "Credential" in type(error).__name__:
         return InputError(f"{where}: refused ({_short(error)}); check the keys (for s3: `aws sts get-caller-identity`)")
     if isinstance(error, OSError) and error.errno in _HOPELESS:
-        return InputError(f"{where}: {_short(error)}; mend the address")
+        return InputError(f"{where}: {_short(error)}; correct the address")
     status = getattr(error, "status", 0)  # of aiohttp
     if status in (400, 401, 403, 404, 410):
-        return Missing(f"{where}: {_short(error)}; mend the address")
+        return Missing(f"{where}: {_short(error)}; correct the address")
     return None
 
 

@@ -65,7 +65,7 @@ def read_numbers(path: str | Path, columns: int, rows: int | None = None, what: 
     """Read a table of finite numbers, (rows, columns) float64.
 
     Raises:
-        InputError: missing file, another number of rows or columns, or something that is no finite number.
+        InputError: missing file, another number of rows or columns, or NaN or infinity.
     """
     table = []
     for number, fields in ((number, line.split()) for number, line in numbered_lines(read_text(path))):
@@ -97,7 +97,7 @@ def read_light_list(path: str | Path) -> tuple[list[str], np.ndarray]:
 
     Raises:
         InputError: what the loaders would choke on or misread: a '#', a field separator that is not one single space,
-            rows of different length, fewer than two rows, a name twice, or a direction that is no unit vector.
+            rows of different length, fewer than two rows, a name twice, or a direction that is not a unit vector.
     """
     rows = [line.rstrip("\r") for line in read_text(path).split("\n")]
     rows = [row for row in rows if row]

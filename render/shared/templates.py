@@ -1,4 +1,4 @@
-"""Pages and cards from Jinja2 templates, `*.html.j2` and `*.md.j2`, which lie beside the code that fills them."""
+"""Pages and cards from Jinja2 templates, `*.html.j2` and `*.md.j2`, which lie next to the code that fills them."""
 
 import html
 import re
@@ -36,13 +36,13 @@ def _environment(folder: Path) -> Environment:
         loader=FileSystemLoader(folder), autoescape=select_autoescape(["html.j2"], default=False),
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    environment.filters |= {"inline": inline, "commas": "{:,}".format, "spelled": spelled, "yaml": to_yaml}
+    environment.filters |= {"inline": inline, "commas": "{:,}".format, "spelled": spell, "yaml": to_yaml}
     environment.globals["table"] = markdown_table
     return environment
 
 
 def inline(value: Any) -> str:
-    """Escape what is no Markdown for one line or one cell of a table; code in backticks stays code."""
+    """Escape what is not Markdown for one line or one cell of a table; code in backticks stays code."""
     parts = _CODE.split(str(value).replace("\n", " ").replace("|", "\\|"))
     return "".join(part if number % 2 else html.escape(part, quote=False) for number, part in enumerate(parts))
 
@@ -53,7 +53,7 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join([*lines, *("| " + " | ".join(map(inline, row)) + " |" for row in rows)])
 
 
-def spelled(counts: Mapping[Any, int]) -> str:
+def spell(counts: Mapping[Any, int]) -> str:
     """Spell counts of scenes: the value alone when there is one, else each with its number."""
     if len(counts) == 1:
         return str(next(iter(counts)))

@@ -27,7 +27,7 @@ _CUT = re.compile(r".*~[0-9a-f]{8}", re.DOTALL)
 
 
 def temporary_path(path: Path, kind: Literal["tmp", "old"] = "tmp", *, suffix: bool = False) -> Path:
-    """Return a name beside `path` that no other process, machine or thread gives.
+    """Return a name next to `path` that no other process, machine or thread gives.
 
     Args:
         path: What is to be written.
@@ -36,21 +36,21 @@ def temporary_path(path: Path, kind: Literal["tmp", "old"] = "tmp", *, suffix: b
     """
     base, end = (path.stem, path.suffix) if suffix else (path.name, "")
     rest = f".{_owner(os.getpid())}-{secrets.token_hex(4)}.{kind}{end}"
-    return path.with_name(f".{_shortened(base, _LONGEST - 1 - len(os.fsencode(rest)))}{rest}")
+    return path.with_name(f".{_shorten(base, _LONGEST - 1 - len(os.fsencode(rest)))}{rest}")
 
 
 def is_temporary(name: str) -> bool:
-    """Tell whether a file's name is one that `temporary_path` gives, or that earlier versions gave."""
+    """Return whether a file's name is one that `temporary_path` gives, or that earlier versions gave."""
     return _NAME.fullmatch(name) is not None
 
 
 def is_empty(folder: Path) -> bool:
-    """Tell whether a folder holds nothing, or only what is being written or was when its writer was killed."""
+    """Return whether a folder holds nothing, or only what is being written or was when its writer was killed."""
     return all(is_temporary(path.name) for path in folder.iterdir())
 
 
 def may_be_alive(path: Path, clock: Callable[[], float | None]) -> bool:
-    """Tell whether the process that gave a temporary name may still be at work.
+    """Return whether the process that gave a temporary name may still be at work.
 
     Of this machine's processes the system knows. Of others, what was not touched for `AGE` is abandoned, by the clock
     of the file server: those of the machines may differ.
@@ -65,7 +65,7 @@ def may_be_alive(path: Path, clock: Callable[[], float | None]) -> bool:
         if runs is not None:
             return runs
     now = clock()
-    return now is None or now - _touched(path) < AGE
+    return now is None or now - _last_change(path) < AGE
 
 
 def tidy(folder: Path, *known: str) -> None:
@@ -98,7 +98,7 @@ def _home(folder: Path, match: re.Match[str], known: tuple[str, ...]) -> Path | 
     base, whole = match["base"], len(os.fsencode(match[0]))
     room = _LONGEST - (whole - len(os.fsencode(base)))
     for name in known:
-        if _shortened(name, room) == base:
+        if _shorten(name, room) == base:
             return folder / name
     cut = _CUT.fullmatch(base) and whole > _LONGEST - 4  # a letter has up to four bytes
     return None if cut else folder / base
@@ -131,7 +131,7 @@ def server_time(folder: Path) -> float | None:
             probe.unlink(missing_ok=True)
 
 
-def _shortened(base: str, room: int) -> str:
+def _shorten(base: str, room: int) -> str:
     """Return a base of at most so many bytes, different for different bases."""
     if len(os.fsencode(base)) <= room:
         return base
@@ -139,7 +139,7 @@ def _shortened(base: str, room: int) -> str:
     return os.fsencode(base)[: max(room - len(tail), 1)].decode(errors="ignore") + tail
 
 
-def _touched(path: Path) -> float:
+def _last_change(path: Path) -> float:
     """Return when a file, or anything in a folder, was last changed; copies may bear an older date."""
     states = [path.lstat(), *(below.lstat() for below in (path.rglob("*") if path.is_dir() else ()))]
     return max(max(state.st_mtime, state.st_ctime) for state in states)
@@ -168,7 +168,7 @@ def _owner(pid: int) -> str:
 
 
 def _runs(pid: int, start: int) -> bool | None:
-    """Tell whether a process of this machine runs; None where the system does not tell."""
+    """Return whether a process of this machine runs; None where the system does not report it."""
     if os.name != "posix":
         return None  # signal 0 is Ctrl-C on Windows
     try:

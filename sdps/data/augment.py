@@ -49,9 +49,9 @@ class Augmentation:
             paper): eight views for the price of one rendering.
         sensor: Cameras that record the images (`render.shared.imaging.sensor`); without it they clip and no more. Set
             `noise` to 0 with it.
-        mixed: Light of the images, mixed anew for every sample from all lights of its scene, which must be a dense
+        mixed: Light of the images, mixed again for every sample from all lights of its scene, which must be a dense
             light stage (`render.shared.imaging.mixing`); without it each image has one light. For networks that are
-            told no lights; a sample's directions are then where the light comes from on average.
+            given no lights; a sample's directions are then where the light comes from on average.
     """
 
     exposure: Literal["mean", "paper"] = "mean"

@@ -16,7 +16,7 @@ from torch.nn import functional
 from torch.utils.data import Dataset
 
 from render.records.manifest import SceneSpec
-from render.records.mirror import packed_as
+from render.records.mirror import describe_packing
 from render.shared.errors import InputError
 from render.shared.imaging.mixing import LightStage, mix, require_enough
 from render.shared.seeds import generator
@@ -103,7 +103,7 @@ class SceneDataset(Dataset[Any]):
         self.split = split
         self.options = options
         self.scenes = finished_scenes(Path(folder), split, skip_missing=skip_missing)
-        self.packed = packed_as(Path(folder), self.scenes)
+        self.packed = describe_packing(Path(folder), self.scenes)
         # Scenes of a set that does not fit would leave the cache before they are used a second time.
         fits = self.packed is None or self.packed.limit > _WITH_DECODED * self.packed.size
         self.store = SceneStore(Path(folder), cache=cache and fits)
@@ -134,7 +134,7 @@ def require_lights(where: str | Path, scenes: Sequence[SceneSpec], options: Samp
     """Refuse scenes whose lights samples cannot be made of.
 
     Raises:
-        InputError: too few for equally many images, or for light that is mixed; or an environment that is no map.
+        InputError: too few for equally many images, or for light that is mixed; or an environment that is not a map.
     """
     require_equal_counts(where, scenes, options.images)
     if options.augmentation.mixed is not None:
@@ -169,7 +169,7 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
         chosen = choose_images(directions, options, rng)
         images, directions = stored.images[chosen].astype(np.float32), directions[chosen]  # (Q, H, W, 3)
     else:
-        images, directions = _mixed(scene, stored.images, options, rng)
+        images, directions = _mix(scene, stored.images, options, rng)
     normals, mask = stored.normals, stored.mask
     if options.augmentation.symmetries:
         symmetry = Symmetry(int(rng.integers(4)), bool(rng.integers(2)))
@@ -191,7 +191,7 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     )
 
 
-def _mixed(
+def _mix(
     scene: SceneSpec, images: np.ndarray | PackedImages, options: SampleOptions, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return images (Q, H, W, 3) float32 under mixed light, and the directions (Q, 3) it comes from on average."""

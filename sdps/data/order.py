@@ -1,4 +1,4 @@
-"""In which order a trainer takes scenes: a matter of seed, epoch and place alone, so any place can be gone on from.
+"""In which order a trainer takes scenes: a matter of seed, epoch and place alone, so training can resume at any place.
 
 Of a packed set, too large to be shuffled as a whole, the tars come in random order and every scene is moved back at
 random by less than a window. So only the tars of about a window are in use at a time, and what a buffer of a stream
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.records.mirror import Packed, shown
+from render.records.mirror import Packed, display_name
 from render.records.packs import PACK
 from render.records.shards import file_hash
 from render.shared.errors import InputError
@@ -98,17 +98,17 @@ class PackedOrder:
         in_use = min(2 * window + 2 * self.ahead, len(dataset)) * packed.size / len(dataset)
         if packed.limit < in_use:
             raise InputError(
-                f"{shown(dataset.store.folder)}: shuffling among {window} scenes keeps {in_use / 1e9:.3g} GB on this "
-                f"disk, and --cache-gb is {packed.limit / 1e9:.3g}; raise it, or lower shuffle_window"
+                f"{display_name(dataset.store.folder)}: shuffling among {window} scenes keeps {in_use / 1e9:.3g} GB "
+                f"on this disk, and --cache-gb is {packed.limit / 1e9:.3g}; raise it, or lower shuffle_window"
             )
 
     def identity(self) -> dict[str, Any]:
-        """Return what the order depends on beside the scenes and the seed."""
+        """Return what the order depends on besides the scenes and the seed."""
         if self.windows is None:
             return {}
         return {"pack": file_hash(self.dataset.store.folder / PACK), "shuffle_window": self.windows.window}
 
-    def fetching(self, batches: Iterable[list[SampleKey]], size: int) -> Iterator[list[SampleKey]]:
+    def prefetch(self, batches: Iterable[list[SampleKey]], size: int) -> Iterator[list[SampleKey]]:
         """Yield batches of keys while a thread fetches what those to come are made of.
 
         Args:

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.records.manifest import FAILED, SceneSpec, read_failed, read_manifest
-from render.records.mirror import finished as there
-from render.records.mirror import kept, shard_path, stored_size
+from render.records.mirror import select_rendered, shard_path, stored_size, touch_files
 from render.records.shards import read_shard
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
@@ -89,7 +88,7 @@ class SceneStore:
             return _decode(shard_path(self.folder, scene), scene)
         entry = f"{scene.id}-{_identity(self.folder, scene)}"
         images, truth = (self.folder / CACHE_FOLDER / f"{entry}.{kind}.npy" for kind in ("images", "truth"))
-        if not kept(self.folder, truth, images):
+        if not touch_files(self.folder, truth, images):
             stored = _decode(shard_path(self.folder, scene), scene)
             packed = PackedImages.of(stored.images)
             # The images come last: where they are, the ground truth is.
@@ -116,7 +115,7 @@ def finished_scenes(folder: Path, split: str, *, skip_missing: bool = False) -> 
         InputError: no manifest, no scene of the split, or a folder whose rendering is not finished.
     """
     planned = read_manifest(folder, split)
-    scenes = there(folder, planned)
+    scenes = select_rendered(folder, planned)
     missing = {scene.id for scene in planned} - {scene.id for scene in scenes}
     failed = missing & read_failed(folder).keys() if missing and not skip_missing else set()
     if not scenes or (missing - failed and not skip_missing):

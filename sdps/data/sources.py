@@ -117,7 +117,7 @@ class StoredScenes:
         # The generator alone holds the loader, so closing it ends the workers.
         yield from DataLoader(
             self.dataset,
-            batch_sampler=packed.fetching(keys, self.batch) if packed else keys,
+            batch_sampler=packed.prefetch(keys, self.batch) if packed else keys,
             num_workers=self.workers,
             collate_fn=collate,
             pin_memory=self.pin_memory,

@@ -15,6 +15,8 @@ from contextlib import closing
 from fractions import Fraction
 from typing import Any, Protocol
 
+import numpy as np
+
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
@@ -27,7 +29,9 @@ from sdps.data.sources import share_of_batch
 class SceneStream(Protocol):
     """Scenes as they are rendered, endlessly; `next` waits for one and raises InputError where rendering fails."""
 
-    def __next__(self) -> tuple[SceneSpec, StoredScene]: ...
+    def __next__(self) -> tuple[SceneSpec, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Return a scene, and its images, normals and mask as in `StoredScene`."""
+        ...
 
     def close(self) -> None:
         """End the renderer; a `next` that waits in another thread ends, too."""
@@ -99,7 +103,7 @@ class StreamedScenes:
         """Yield batches endlessly, from sample `taken` on, a multiple of the batch; end after a mistake."""
         number, rest = divmod(taken, self.batch)
         if rest:
-            raise InputError(f"a stream goes on at a multiple of batch_scenes ({self.batch}) samples, not at {taken}")
+            raise InputError(f"a stream resumes at a multiple of batch_scenes ({self.batch}) samples, not at {taken}")
         self.close()
         self._running = self._run(number)
         return self._running
@@ -175,6 +179,7 @@ class _Window:
         missing = range(self.end, first + self.size)
         filling = self.show and not self.scenes
         for _ in progress_bar(missing, desc="render window", unit="scene", leave=False, disable=not filling):
-            self.scenes.append(next(self.stream))
+            scene, arrays = next(self.stream)
+            self.scenes.append((scene, StoredScene(*arrays)))
             self.end += 1
         return list(self.scenes)

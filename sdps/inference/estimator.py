@@ -292,13 +292,13 @@ def default_device(device: str | torch.device | None = None) -> torch.device:
     return torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
 
 
-def load_model(file: str | Path, device: torch.device, role: str | tuple[str, ...] = ()) -> TrainedModel:
+def load_model(file: str | Path, device: torch.device) -> TrainedModel:
     """Load a trained model for inference on `device`.
 
     Raises:
-        InputError: the file is missing, damaged, or of a model of another role.
+        InputError: the file is missing or damaged.
     """
-    model = load_weights(file, role)
+    model = load_weights(file)
     # A third faster on CPUs. The stubs of torch lack `memory_format`.
     model.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model

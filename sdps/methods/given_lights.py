@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from render.shared.imaging.reducing import reduced
+from render.shared.imaging.reducing import reduce_image
 from render.shared.imaging.vectors import unit
 from render.shared.seeds import generator
 from sdps.core.intensities import scale_to_mean
@@ -105,13 +105,13 @@ def reduce_images(images: ImageSource, mask: np.ndarray) -> ReducedImages:
     shrink = max(1.0, max(height, width) / _SIDE)
     shape = max(1, round(height / shrink)), max(1, round(width / shrink))
     inside = mask[rows, columns].astype(np.float32)
-    share = reduced(inside, shape)
+    share = reduce_image(inside, shape)
     small = share > (0.99 if (share > 0.99).sum() >= 50 else 0.5)
     grey = []
     for number in range(len(images)):
         image = np.asarray(images[number : number + 1])[0][rows, columns].astype(np.float32)
         image = np.where(mask[rows, columns][..., None], image, np.float32(0.0))
-        grey.append((reduced(image, shape) / np.maximum(share, 1e-6)[..., None])[small])
+        grey.append((reduce_image(image, shape) / np.maximum(share, 1e-6)[..., None])[small])
     values = np.stack(grey)  # (L, P, 3)
     values = remove_stray_light(values, stray_light(values)).mean(-1).astype(np.float64)
     return ReducedImages(values / max(values.mean(), 1e-12), small, small & _rim(mask, rows, columns, shape))

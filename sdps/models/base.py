@@ -47,29 +47,23 @@ class LightingNetwork(nn.Module, ABC):
     """Estimates the light of every image of a scene.
 
     `encode` looks at images one by one, `predict` at their features and the maximum over all of them, so that a caller
-    can go through any number of images in chunks. Subclasses set `extractor` and `classes`.
+    can go through any number of images in chunks.
 
     Attributes:
-        use_mask: The mask is a fourth input channel.
-        use_global: The feature shared by all images is seen next to each image's own.
+        use_mask: The mask is an input.
         classes: The discretised lighting space.
     """
 
     use_mask: bool = True
-    use_global: bool = True
-    extractor: nn.Module
     classes: LightClasses
 
+    @abstractmethod
     def encode(
         self,
         images: Tensor,  # (B, Q, 3, 128, 128)
         mask: Tensor,  # (B, 1, 128, 128)
     ) -> Tensor:
         """Return the local features (B, Q, F, 8, 8)."""
-        inputs = images
-        if self.use_mask:
-            inputs = torch.cat([images, mask[:, None].expand(-1, images.shape[1], -1, -1, -1)], dim=2)
-        return self.extractor(inputs.flatten(0, 1)).unflatten(0, images.shape[:2])
 
     @abstractmethod
     def predict(

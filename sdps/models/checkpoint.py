@@ -90,15 +90,11 @@ def _with_sorted_header(data: bytes) -> bytes:
     return _LENGTH.pack(len(text)) + text + data[start:]
 
 
-def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedModel:
+def load_weights(path: str | Path) -> TrainedModel:
     """Read weights written by `save_weights` and build their network. Runs no code from the file.
 
-    Args:
-        path: The file.
-        role: Role or roles the caller can use, e.g. `lighting`; any if empty.
-
     Raises:
-        InputError: missing, truncated or foreign file, a model of another role, or weights that do not fit it.
+        InputError: missing, truncated or foreign file, an unknown model, or weights that do not fit it.
     """
     if not Path(path).is_file():
         raise InputError(f"{path}: no such weights file; train one or give another path")
@@ -108,12 +104,6 @@ def load_weights(path: str | Path, role: str | tuple[str, ...] = ()) -> TrainedM
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: not written by this project (no {FORMAT!r} header); train the network again")
     name, options, metadata = _read_header(path, header)
-    roles = (role,) if isinstance(role, str) else role
-    if roles and registry.entry(name).role not in roles:
-        raise InputError(
-            f"{path}: holds {name!r}, a model for {registry.entry(name).role!r}; one for {' or '.join(roles)} is "
-            "needed here; swap the files"
-        )
     damaged = next((key for key, tensor in tensors.items() if not torch.isfinite(tensor).all()), None)
     if damaged is not None:
         raise InputError(f"{path}: {damaged} has values that are infinite or NaN; copy or train it again")

@@ -28,7 +28,7 @@ class LightingLogits(NamedTuple):
 
 
 class LightingTrunk(LightingNetwork):
-    """The layers every lighting network shares: extractor, local-global fusion, and convolutions down to 1x1.
+    """The layers that LCNet and its variants share: extractor, local-global fusion, and convolutions down to 1x1.
 
     Args:
         use_mask: The object mask is a fourth input channel.
@@ -57,7 +57,10 @@ class LightingTrunk(LightingNetwork):
     def encode(self, images: Tensor, mask: Tensor) -> Tensor:
         """Return the local features (B, Q, F, 8, 8) of images (B, Q, 3, 128, 128); half of both sides is possible."""
         assert images.shape[-2:] in {(side, side) for side in (EARLY_SIZE, INPUT_SIZE)}, images.shape
-        return super().encode(images, mask)
+        inputs = images
+        if self.use_mask:
+            inputs = torch.cat([images, mask[:, None].expand(-1, images.shape[1], -1, -1, -1)], dim=2)
+        return self.extractor(inputs.flatten(0, 1)).unflatten(0, images.shape[:2])
 
     def fuse(self, local: Tensor, shared: Tensor | None) -> Tensor:
         """Return one vector per image, (B Q, F', 1, 1); arguments as of `predict`."""

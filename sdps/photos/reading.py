@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from render.shared.errors import InputError
-from render.shared.imaging.reducing import check_scale, reduced, reduced_shape
+from render.shared.imaging.reducing import check_scale, reduce_image, smaller_shape
 from sdps.photos.faults import Faults
 from sdps.photos.light_files.light_choice import known_lights
 from sdps.photos.picture_file import decode, orient_pixels
@@ -86,14 +86,14 @@ class Photographs:
         for image, number in zip(images, numbers, strict=True):
             picture = decode(self.folder / self.files[number])
             pixels = orient_pixels(picture.pixels, self.orientation)
-            if reduced_shape(pixels.shape[:2], self.scale) != self.shape or picture.coding != self.coding:
+            if smaller_shape(pixels.shape[:2], self.scale) != self.shape or picture.coding != self.coding:
                 raise InputError(f"{self.folder / self.files[number]}: changed while it was in use; start again")
             if self.scale == 1.0:
                 to_linear(pixels[rows, columns], self.gamma, image)
             else:
                 for channel in range(3):  # one by one: a whole picture of floats may take a gigabyte
                     linear = to_linear(pixels[..., channel], self.gamma)
-                    image[..., channel] = reduced(linear, self.shape)[rows, columns]
+                    image[..., channel] = reduce_image(linear, self.shape)[rows, columns]
         return images
 
     @property

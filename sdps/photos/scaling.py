@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from render.shared.errors import InputError
-from render.shared.imaging.reducing import reduced, reduced_mask
+from render.shared.imaging.reducing import reduce_image, reduce_mask
 from sdps.photos.faults import Faults
 from sdps.photos.masks import read_mask
 from sdps.photos.response import brightness, to_linear
@@ -19,7 +19,7 @@ def reduced_grey(pixels: np.ndarray, gamma: str | float, shape: tuple[int, int])
     """Return the linear brightness of pixels (H, W, 3), a few rows at a time, reduced to a shape (h, w)."""
     step = max(1, _AT_ONCE // pixels.shape[1])
     rows = (pixels[start : start + step] for start in range(0, len(pixels), step))
-    return reduced(np.concatenate([brightness(to_linear(some, gamma)) for some in rows]), shape)
+    return reduce_image(np.concatenate([brightness(to_linear(some, gamma)) for some in rows]), shape)
 
 
 def refuse_huge(path: Path, full: tuple[int, int], shape: tuple[int, int], faults: Faults) -> None:
@@ -39,7 +39,7 @@ def read_reduced_mask(path: Path, full: tuple[int, int], shape: tuple[int, int])
         InputError: as `read_mask`, or nothing is left of it.
     """
     try:
-        mask = reduced_mask(read_mask(path, full), shape)
+        mask = reduce_mask(read_mask(path, full), shape)
     except InputError as error:
         try:
             mask = read_mask(path, shape)

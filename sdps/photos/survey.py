@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from render.shared.errors import InputError
-from render.shared.imaging.reducing import reduced, reduced_shape
+from render.shared.imaging.reducing import reduce_image, smaller_shape
 from render.shared.progress import progress_bar, stage
 from sdps.photos.faults import Faults
 from sdps.photos.masks import Variation, automatic_mask, bright_part
@@ -174,7 +174,7 @@ class _Look:
         self.turns.add(picture.orientation)
         pixels = orient_pixels(picture.pixels, self.first.orientation)
         if picture.coding.floating:
-            touched = reduced((~np.isfinite(pixels).all(-1)).astype(np.float32), self.shape) > 0
+            touched = reduce_image((~np.isfinite(pixels).all(-1)).astype(np.float32), self.shape) > 0
             self.broken[(self.broken < 0) & touched] = len(self.kept) - 1
         if not self.masked:
             self.variation.add(reduced_grey(pixels, self.gamma, self.shape))
@@ -182,7 +182,7 @@ class _Look:
     def _begin(self, name: str, picture: Picture) -> None:
         """Settle what the first photograph decides."""
         self.full = orient_pixels(picture.pixels, picture.orientation).shape[:2]
-        self.shape = reduced_shape(self.full, self.scale)
+        self.shape = smaller_shape(self.full, self.scale)
         refuse_huge(self.folder / name, self.full, self.shape, self.faults)
         self.first = picture
         self.gamma, self.why = resolve_gamma(self.asked, picture.coding, self.listing.places)

@@ -1,6 +1,6 @@
 """The data term and its gradient in one pass over pixels and images, compiled by numba.
 
-The tests compare it with `image_model.difference`, which takes the reflectance from `reflectance`.
+Tests compare it with `image_model.measure_differences`, whose reflectance is that of `reflectance`.
 """
 
 import os

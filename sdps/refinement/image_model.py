@@ -122,15 +122,9 @@ def measure_differences(model: Model, images: Tensor, dark: Tensor) -> Tensor:  
         dark: (P, L) bool, observations that are ignored.
     """
     cosine = model.normals @ model.directions.T  # (P, L)
-    reflected = reflect_without_modes(model)
+    reflected = reflect(measure_angles(model.normals, model.directions), model)
     observed = images / model.log_intensities.exp().T  # (P, 3, L)
     sigma = (reflected * cosine.clamp_min(SHADE_FLOOR)[:, None]).detach()
     gap = reflected * cosine.clamp_min(0.0)[:, None] - observed
     weight = torch.where(gap > SHADOW_EXCESS * sigma, SHADOW_WEIGHT, 1.0) * ~dark[:, None]
     return weight * (gap**2 / (sigma**2 + DATA_FLOOR) + ROBUST).sqrt()
-
-
-def reflect_without_modes(model: Model) -> Tensor:  # (P, 3, L)
-    """Return rho D + S."""
-    angles = measure_angles(model.normals, model.directions)
-    return reflect(angles, model.albedo, model.strength, model.body, model.amplitudes, model.sharpness)

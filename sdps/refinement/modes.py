@@ -1,8 +1,8 @@
 """Finding the modes of an object: the numbers m of G in `reflectance`.
 
-They are those that explain best what the rest of the model leaves of the images: weighted least squares of the
-logarithms, with a normal distribution in front of them. That distribution is of materials fitted to MERL, on a sphere:
-`lab/studies/reflectance_modes.py` measures it.
+They are those that best explain what the rest of the model leaves of the images: weighted least squares of the
+logarithms, with a normal prior. `lab/studies/reflectance_modes.py` measures the prior on spheres of materials fitted to
+MERL.
 """
 
 from functools import cache
@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from render.shared.config import read_yaml
-from sdps.refinement.image_model import Model, reflect_without_modes
-from sdps.refinement.reflectance import MODES, MOST_LOG_FACTOR, evaluate_factor, measure_angles, mode_terms
+from sdps.refinement.image_model import Model
+from sdps.refinement.reflectance import MODES, MOST_LOG_FACTOR, evaluate_factor, measure_angles, mode_terms, reflect
 
 _OBSERVATIONS = 100.0
 """What all observations of an object count as together: errors of neighbouring pixels and lights correlate."""
@@ -44,14 +44,15 @@ def fit_modes(model: Model, images: Tensor, usable: Tensor) -> Tensor:  # (MODES
     terms = mode_terms(measure_angles(model.normals, model.directions))
     shapes = torch.stack([torch.ones_like(left), *terms], dim=-1).flatten(0, 1)  # (P L, 1 + MODES)
     weighted = shapes.T * (weights.flatten() * (_OBSERVATIONS / _SPREAD**2))
-    normal = (weighted @ shapes).double() + _precision()
+    normal = (weighted @ shapes).double() + _load_precision()
     return torch.linalg.solve(normal, (weighted @ left.flatten()).double())[1:].float()
 
 
 def compare_logs(model: Model, images: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
     """Return the logarithm of observed over predicted radiance (P, L), and its weights, which add up to 1."""
     cosine = model.normals @ model.directions.T  # (P, L)
-    predicted = (reflect_without_modes(model) * cosine.clamp_min(0.0)[:, None]).mean(dim=1)
+    reflected = reflect(measure_angles(model.normals, model.directions), model)
+    predicted = (reflected * cosine.clamp_min(0.0)[:, None]).mean(dim=1)
     observed = (images * torch.exp(-model.log_intensities).T).mean(dim=1)
     left = torch.log((observed + _LEAST_RADIANCE) / (predicted + _LEAST_RADIANCE))
     weights = cosine * ((cosine > _LEAST_LIT) & (usable > 0.0) & (predicted > _LEAST_RADIANCE))
@@ -59,8 +60,8 @@ def compare_logs(model: Model, images: Tensor, usable: Tensor) -> tuple[Tensor, 
 
 
 @cache
-def _precision() -> Tensor:
-    """Return the inverse of the second moments, with a constant in front that is free."""
+def _load_precision() -> Tensor:
+    """Return the inverse of the prior's second moments, preceded by a constant that is free."""
     moments = np.array(read_yaml(str(ASSET))["second_moments"])
     precision = np.zeros((1 + MODES, 1 + MODES))
     precision[1:, 1:] = np.linalg.inv(moments + _LEAST_MOMENT * np.eye(MODES))

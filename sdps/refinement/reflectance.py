@@ -3,15 +3,15 @@
 Pixel p, light i, channel c; n unit normal, l unit direction to the light, v = (0, 0, 1), h = (l + v) / |l + v|:
 
     f_pic = (rho_pc D_pi + S_pi) G_pi                                                   radiance is f max(n . l, 0)
-    D_pi  = exp(sum_j b_j BODY_j)                                                       body; 1 is Lambertian
+    D_pi  = exp(b . (x + y,  x y,  x^2 + y^2,  o))                                      body; 1 is Lambertian
     S_pi  = s_p sum_k a_k exp(-kappa_k t_pi) / (l_i . h_i)^2                            spherical Gaussians
-    G_pi  = exp(sum_j m_j MODES_j), between exp(-0.7) and exp(0.7)                      what real materials add
+    G_pi  = exp(m . ((x + y) o,  (1 - l . v) o,  (x + y) x y,  (x + y) (x - y)^2,  t^2,  sqrt(t)))
     x = 1 - n . l,  y = 1 - n . v,  t = 1 - n . h
     o = (l . v - n . l n . v) / (max(n . l, n . v) if positive, else 1)                 towards the light, and away
 
 n . l and n . v are held above 0.02 in x, y and o. o is the term of Oren and Nayar (1994) as Fujii writes it:
-cos(azimuth between l and v) sin sin / max(cos, cos). The terms of G were chosen one by one: each explains most of what
-those before it leave of the 100 materials fitted to MERL.
+cos(azimuth between l and v) sin sin / max(cos, cos). G, between exp(-0.7) and exp(0.7), is what real materials add: its
+terms were chosen one by one, each explaining most of what those before it leave of the 100 materials fitted to MERL.
 
 `fused` compiles rho D + S and its gradient, and is tested against this module; the page of `sdps app` interpolates
 tables that are evaluated here. A new term of the body changes `body_terms` and `fused`; a new term of G changes
@@ -84,13 +84,13 @@ def half_vectors(directions: Array) -> Array:  # (L, 3)
 
 
 def evaluate_body(angles: Angles, body: Array) -> Array:  # (P, L)
-    """Return D; body (4,) is b."""
+    """Return D."""
     xp = _library(angles.x)
     return xp.exp(xp.tensordot(body, xp.stack(body_terms(angles)), 1))
 
 
 def evaluate_lobes(angles: Angles, strength: Array, amplitudes: Array, sharpness: Array) -> Array:  # (P, L)
-    """Return S; strength (P,) is s, amplitudes (K,) a and sharpness (K,) kappa."""
+    """Return S."""
     xp = _library(angles.t)
     lobes = (amplitudes[:, None, None] * xp.exp(-sharpness[:, None, None] * angles.t)).sum(0)
     # The denominator of a microfacet highlight, 4 n.l n.v, is 4 (l.h)^2 where n = h; and 2 (l.h)^2 = 1 + l.v.
@@ -98,42 +98,27 @@ def evaluate_lobes(angles: Angles, strength: Array, amplitudes: Array, sharpness
 
 
 def evaluate_log_factor(angles: Angles, modes: Array) -> Array:  # (P, L)
-    """Return the logarithm of G before it is bounded; modes (6,) is m."""
+    """Return the logarithm of G before it is bounded."""
     return _library(angles.t).stack(mode_terms(angles), -1) @ modes
 
 
 def evaluate_factor(angles: Angles, modes: Array) -> Array:  # (P, L)
-    """Return G; modes (6,) is m."""
+    """Return G."""
     xp = _library(angles.t)
     return xp.exp(xp.clip(evaluate_log_factor(angles, modes), -MOST_LOG_FACTOR, MOST_LOG_FACTOR))
 
 
-def reflect(
-    angles: Angles, albedo: Array, strength: Array, body: Array, amplitudes: Array, sharpness: Array
-) -> Array:  # (P, 3, L)
-    """Return rho D + S, what is reflected without G.
-
-    Args:
-        angles: Of P pixels and L lights.
-        albedo: (P, 3) rho.
-        strength: (P,) s.
-        body: (4,) b.
-        amplitudes: (K,) a.
-        sharpness: (K,) kappa.
-    """
-    specular = evaluate_lobes(angles, strength, amplitudes, sharpness)
-    return albedo[..., None] * evaluate_body(angles, body)[:, None] + specular[:, None]
+def reflect(angles: Angles, surface: Any) -> Array:  # (P, 3, L)
+    """Return rho D + S; the surface has albedo (P, 3), strength (P,), body (4,), amplitudes (K,) and sharpness (K,)."""
+    specular = evaluate_lobes(angles, surface.strength, surface.amplitudes, surface.sharpness)
+    return surface.albedo[..., None] * evaluate_body(angles, surface.body)[:, None] + specular[:, None]
 
 
-def shade(
-    normals: Array, directions: Array, albedo: Array, strength: Array, *, body: Array, amplitudes: Array,
-    sharpness: Array, modes: Array,
-) -> Array:  # (P, 3, L)  # fmt: skip
-    """Return the radiance of unit normals (P, 3) under lights (L, 3) of intensity 1; the rest is as in `reflect`."""
+def shade(normals: Array, directions: Array, surface: Any) -> Array:  # (P, 3, L)
+    """Return the radiance of unit normals (P, 3) under lights (L, 3) of intensity 1; the surface has modes (M,) too."""
     angles = measure_angles(normals, directions)
-    reflected = reflect(angles, albedo, strength, body, amplitudes, sharpness)
-    lit = _library(normals).clip(normals @ directions.T, 0.0, None) * evaluate_factor(angles, modes)
-    return reflected * lit[:, None]
+    lit = _library(normals).clip(normals @ directions.T, 0.0, None) * evaluate_factor(angles, surface.modes)
+    return reflect(angles, surface) * lit[:, None]
 
 
 def _library(array: Array) -> Any:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from render.shared.seeds import derived_seed
+from render.shared.seeds import derive_seed
 from sdps.core.metrics import angle_degrees
 from sdps.data.dataset import Batch
 from sdps.models.base import Lights
@@ -112,7 +112,7 @@ def sample_pixels(batch: Batch, lights: Lights, count: int) -> PixelSamples:
 
 def _draw_scene(batch: Batch, lights: Lights, scene: int, seed: int, count: int, min_lights: int) -> PixelSamples:
     # Always on the CPU: generators of different devices give different numbers.
-    rng = torch.Generator().manual_seed(derived_seed(seed, "pixels"))
+    rng = torch.Generator().manual_seed(derive_seed(seed, "pixels"))
     inside = _inside(batch, scene)
     if not len(inside):
         return _gather(batch, lights, scene, inside)

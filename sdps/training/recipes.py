@@ -12,6 +12,7 @@ CONFIGS: dict[Role, type[TrainingConfig]] = {
     "lighting": LightingTraining, "normals": NormalTraining, "pixels": PixelTraining,
 }  # fmt: skip
 """The configuration of each role; a preset has a section for each."""
+_LISTED = "`sdps models` lists what there is"
 
 
 class Run(NamedTuple):
@@ -45,7 +46,8 @@ def run(name: str, sections: Mapping[str, Mapping[str, Any]], runs: Mapping[str,
     own = dict(runs.get(name, {}))
     model = own.pop("base", name)
     if model not in MODELS:
-        raise unknown("model", str(model), [*MODELS, *(other for other in runs if other != name)])
+        field = f"correct runs.{name}.base; " if name in runs else ""
+        raise unknown("model", str(model), [*MODELS, *(other for other in runs if other != name)], field + _LISTED)
     role, recipe, where = entry(model).role, entry(model).recipe, f"runs.{name}"
     values: dict[str, Any] = {}
     for layer, settings in (("", recipe), (role, sections.get(role, {})), (where, own)):
@@ -82,5 +84,5 @@ def expand(names: list[str], known: Mapping[str, Any]) -> list[str]:
         elif name in MODELS or name in known:
             result.append(name)
         else:
-            raise unknown("model", name, [*MODELS, *COMBINATIONS, *known, "all"])
+            raise unknown("model", name, [*MODELS, *COMBINATIONS, *known, "all"], _LISTED)
     return list(dict.fromkeys(result))

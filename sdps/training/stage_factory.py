@@ -22,7 +22,7 @@ def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping
             starts from.
 
     Raises:
-        InputError: a start of another network.
+        InputError: a start of another network, or lights of a model that finds none.
     """
     stage = _stage(name, model, config, trained)
     if "start" in trained:
@@ -39,5 +39,8 @@ def _stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, 
     role = registry.entry(model).role
     if role == "lighting":
         return LightingStage(cast(LightingTraining, config), model=model, name=name)
+    lighting = trained.get("lighting")
+    if lighting is not None and lighting.role != "lighting":
+        raise InputError(f"runs.{name}.lights: {lighting.name!r} finds no lights; name a lighting model, or `true`")
     kind = PixelStage if role == "pixels" else NormalStage
-    return kind(cast(NormalTraining, config), trained.get("lighting"), model=model, name=name)
+    return kind(cast(NormalTraining, config), lighting, model=model, name=name)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from render.shared.seeds import derived_seed, generator
+from render.shared.seeds import derive_seed, generator
 from sdps.core.lighting import ReadOut
 from sdps.core.losses import NormalCriterion, masked_normal_loss
 from sdps.core.metrics import angle_degrees, direction_mae, intensity_error
@@ -42,7 +42,7 @@ class Stage(ABC):
     def __init__(self, name: str, model: str, config: TrainingConfig, options: dict[str, Any]) -> None:
         self.name, self.model, self.config, self.options = name, model, config, options
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(derived_seed(config.seed, "weights", model))
+            torch.manual_seed(derive_seed(config.seed, "weights", model))
             self.network: nn.Module = registry.create(model, **options)
 
     def frozen(self) -> list[nn.Module]:

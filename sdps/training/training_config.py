@@ -49,7 +49,7 @@ class TrainingConfig:
         compile: Compile the network with `torch.compile`.
         precision: `auto` (what is faster on this machine, `sdps.core.precision`), `float32`, or `bfloat16`, which
             runs the networks under autocast; weights and loss stay float32.
-        channels_last: Keep feature maps channels-last, which is faster on every processor tried (docs/training.md).
+        channels_last: Keep feature maps channels-last, faster on every processor tried (docs/studies/speed.md).
         workers: Loader processes; 0 loads in the trainer's own.
         cache: Keep decoded scenes as memory-mapped arrays in `<data>/cache`.
         shuffle_window: Of a packed set (`sdps data pack`), scenes among which the order is drawn; only about twice as
@@ -163,17 +163,14 @@ class LightingTraining(TrainingConfig):
                 f"size must be {INPUT_SIZE} for LCNet, whose last layers need it, or {EARLY_SIZE} for a run that "
                 f"others start from, got {self.size}"
             )
-        self.classes()
+        low, high = self.intensity_range()
+        # Refuses numbers that make no classes.
+        LightClasses(directions=self.direction_classes, intensities=self.intensity_classes, low=low, high=high)
 
     def intensity_range(self) -> tuple[float, float]:
         """Return the range the intensity classes cover: the one intensities are drawn from."""
         low, high = self.augmentation.intensity_range
         return low, max(high, low + 1e-3)
-
-    def classes(self) -> LightClasses:
-        """Return the discretised lighting space."""
-        low, high = self.intensity_range()
-        return LightClasses(directions=self.direction_classes, intensities=self.intensity_classes, low=low, high=high)
 
 
 @dataclass(frozen=True, kw_only=True)

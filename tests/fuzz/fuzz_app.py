@@ -90,7 +90,7 @@ def uploads(folder: Path) -> None:
 
 
 def room(folder: Path) -> None:
-    """Write what the room Data and runs shows: scenes, a failure, learning curves, a section."""
+    """Write what the page Data and runs shows: scenes, a failure, learning curves, a section."""
     folder = folder / "root"
     data_folders.good_folder(folder)
     failed = {"id": "sphere-00000", "seed": 1, "shape": "sphere", "material": "chrome", "reason": "it broke",
@@ -152,7 +152,7 @@ def read_upload(folder: Path, path: Path) -> None:
 
 
 def read_room(folder: Path, path: Path) -> None:
-    """Look at everything the room Data and runs shows."""
+    """Look at everything the page Data and runs shows."""
     with Page(folder) as page:
         for name in ("list", "scenes", "strip", "curves", "sections"):
             page.send("GET", _REQUESTS[name][1])
@@ -162,7 +162,7 @@ class Page:
     """A browser's session with the application.
 
     Args:
-        folder: Its `root` is what the room Data and runs shows.
+        folder: Its `root` is what the page Data and runs shows.
     """
 
     def __init__(self, folder: Path) -> None:

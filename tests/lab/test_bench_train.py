@@ -15,7 +15,7 @@ from lab.bench.bench_train import MUON, ONE_THREAD, OURS, PLAIN, BenchTrainConfi
 from render.records.manifest import read_manifest
 from render.records.shards import read_shard
 from render.shared.errors import InputError
-from render.shared.seeds import derived_seed
+from render.shared.seeds import derive_seed
 
 QUICK = BenchTrainConfig(models=("nenet",), seconds=1e-3, rounds=2, scenes=2, images=2, size=32)
 
@@ -102,7 +102,7 @@ def test_both_loops_minimise_the_same(folder: Path, tmp_path: Path) -> None:
     batch = bench_train.first_batch(QUICK, "nenet", folder)
     settings = replace(bench_train.training(QUICK, "nenet"), precision="float32", channels_last=False)
     trainer = bench_train.make_trainer(settings, "nenet", folder, tmp_path)
-    torch.manual_seed(derived_seed(QUICK.seed, "weights", "nenet"))  # the weights the stage drew
+    torch.manual_seed(derive_seed(QUICK.seed, "weights", "nenet"))  # the weights the stage drew
     step = bench_train.plain_loop("nenet", batch)
     first = step()
     assert trainer.take_step(batch, 0.5)["loss"] == pytest.approx(first, rel=1e-5)

@@ -14,7 +14,7 @@ from pipelines import cli
 from pipelines.evaluate import elsewhere
 from pipelines.shared.cluster import mapped
 from pipelines.shared.cluster.cluster_config import ClusterChoice
-from render.running.station import Mismatch
+from render.running.cluster_worker import Mismatch
 from render.shared.errors import InputError
 from sdps.methods.pretrained import shipped_folder
 

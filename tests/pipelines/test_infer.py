@@ -22,7 +22,7 @@ from pipelines.cli import build_parser, main
 from pipelines.infer import write_page
 from render.shared.config import to_plain
 from render.shared.errors import InputError
-from render.shared.progress import listening
+from render.shared.progress import report_to
 from sdps import api
 from sdps.api import infer, load
 from sdps.core.metrics import direction_mae, intensity_error, normal_mae
@@ -274,7 +274,7 @@ def test_what_does_not_fit_stops_before_it_starts(hills: tuple, tmp_path: Path, 
 def test_every_stage_tells_how_far_it_is(hills: tuple, tmp_path: Path) -> None:
     folder, _, _ = hills
     told: dict[str, list[float]] = {}
-    with listening(lambda name, share: told.setdefault(name, []).append(share)):
+    with report_to(lambda name, share: told.setdefault(name, []).append(share)):
         photos = load(folder)
         result = infer(photos, "sdps-frames", refine=True)
         result.save(tmp_path)

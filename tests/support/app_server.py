@@ -67,11 +67,11 @@ def contents(folder: Path) -> dict[str, int]:
 class Client:
     """A browser's requests: it keeps its cookie and names its origin."""
 
-    def __init__(self, address: str, room: str = "photographs") -> None:
+    def __init__(self, address: str, page: str = "photographs") -> None:
         self.address, self.origin = address, address
         self.cookies = http.cookiejar.CookieJar()
         self.opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(self.cookies))
-        self.get(f"/{room}")
+        self.get(f"/{page}")
 
     @property
     def token(self) -> str:

@@ -1,1 +1,1 @@
-"""What all rooms share: visitors, uploads, the queue and its worker."""
+"""What all pages share: sessions, uploads, the queue of jobs and its worker."""

@@ -15,20 +15,20 @@ from typing import Any
 
 from render.backend.orphans import end_with_parent
 from render.shared.errors import InputError
-from render.shared.progress import listening
+from render.shared.progress import report_to
 
 TASKS = {
-    "example": "pipelines.app.pages.photo_tasks:example",
+    "example": "pipelines.app.pages.photo_tasks:render_example",
     "check": "pipelines.app.pages.photo_tasks:check",
     "infer": "pipelines.app.pages.photo_tasks:infer",
-    "gallery": "pipelines.app.pages.studio_tasks:gallery",
-    "scene": "pipelines.app.pages.studio_tasks:scene",
-    "keep": "pipelines.app.pages.studio_tasks:keep",
+    "gallery": "pipelines.app.pages.studio_tasks:render_gallery",
+    "scene": "pipelines.app.pages.studio_tasks:render_scene",
+    "keep": "pipelines.app.pages.studio_tasks:pack_scene",
     "preset": "pipelines.app.pages.studio_tasks:make_training_preset",
     "shard": "pipelines.app.pages.studio_tasks:prepare_shard",
 }
-"""Task by name: module and function. Loaded when first asked for."""
-_STEP = 0.004  # smallest advance of a share that is told
+"""Tasks by name: module and function, loaded when first used."""
+_STEP = 0.004  # smallest progress that is reported
 
 
 def serve(pipe: Connection) -> None:
@@ -43,7 +43,7 @@ def serve(pipe: Connection) -> None:
             return
         answer: tuple[Any, ...]
         try:
-            with listening(_make_reporter(pipe)):
+            with report_to(_make_reporter(pipe)):
                 result = load_task(name)(**arguments)
             _clean_up()
             answer = ("done", result, measure_memory())
@@ -51,9 +51,9 @@ def serve(pipe: Connection) -> None:
             answer = ("failed", str(error))
         except MemoryError:
             answer = ("failed", "there is not enough memory; try fewer or smaller pictures")
-        except Exception as error:  # a defect: its traceback is for the terminal, a line for the page
+        except Exception as error:  # a bug: traceback in the terminal, one line on the page
             traceback.print_exc()
-            answer = ("failed", f"this should not have happened ({type(error).__name__}); see the terminal")
+            answer = ("failed", f"unexpected error ({type(error).__name__}); the terminal shows its traceback")
         try:
             pipe.send(answer)
         except OSError:
@@ -67,7 +67,7 @@ def load_task(name: str) -> Callable[..., Any]:
 
 
 def measure_memory() -> int:
-    """Return the bytes this process holds now; where the system does not say, the most it ever held."""
+    """Return the bytes this process holds now, or its peak where the system does not tell the current size."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
     except OSError:
@@ -75,22 +75,22 @@ def measure_memory() -> int:
 
 
 def _clean_up() -> None:
-    """Give back what the libraries keep for later; a rare large scene would otherwise stay for good."""
+    """Release memory that libraries cache; otherwise one large scene would occupy it for good."""
     gc.collect()
     if "drjit" in sys.modules:
         sys.modules["drjit"].flush_malloc_cache()
-    with suppress(OSError, AttributeError):  # other systems have no such call
+    with suppress(OSError, AttributeError):  # other systems do not have this call
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def _warm_up() -> None:
-    """Load what the first job would wait for."""
+    """Load the libraries that the first job would wait for."""
     for name in ("sdps.api", "render.api"):
         importlib.import_module(name)
 
 
 def _make_reporter(pipe: Connection) -> Callable[[str, float], None]:
-    """Return what passes stages on, but not every one of thousands."""
+    """Return a function that sends stages through the pipe, but not each of thousands."""
     last: list[Any] = ["", -1.0]
 
     def tell(name: str, share: float) -> None:

@@ -1,4 +1,4 @@
-"""ZIP archives from outside: their usable files, under harmless names, and no more bytes than there is room for."""
+"""ZIP archives that users upload: their usable files, under safe names, within the limits."""
 
 import io
 import re
@@ -13,18 +13,18 @@ from render.shared.errors import InputError
 
 _CHUNK = 2**20
 _MOST_LISTING = 4 * 2**20
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # zipfile unpacks what others hold whole, however much it is
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # zipfile unpacks other methods in one piece, however large
 
 
 def unpack(archive: Path, folder: Path, limits: Limits, coming: Incoming) -> list[Path]:
-    """Unpack the usable files of a ZIP into a new folder, without their folders, check them, and return them.
+    """Unpack the usable files of a ZIP into a new folder, without subfolders; check and return them.
 
-    The archive is used up: it is unpacked from its end and cut off where it was read, so that it and its files never
-    take much more together than either does alone. Sizes are counted while reading, since an archive may lie.
+    The archive is consumed: it is unpacked from its end and truncated as it is read, so that it and its files together
+    never take much more space than either alone. Sizes are counted while reading, since an archive may lie.
 
     Raises:
-        InputError: not a ZIP, nothing usable in it, a name twice, a link, a password, another method than Deflate, too
-            many files or bytes, a picture of too many pixels.
+        InputError: not a ZIP, no usable file, a duplicate name, a link, a password, a method other than Deflate, too
+            many files or bytes, a picture with too many pixels.
     """
     files = []
     folder.mkdir()
@@ -42,45 +42,45 @@ def unpack(archive: Path, folder: Path, limits: Limits, coming: Incoming) -> lis
         coming.give(left)
     except InputError:
         raise
-    except Exception as error:  # damaged archives end in errors of many kinds: zlib.error, OSError of a seek
+    except Exception as error:  # damaged archives raise many kinds of errors: zlib.error, OSError of a seek
         refusal = explain_full_disk(archive.name, error) if isinstance(error, OSError) else None
         raise refusal or InputError(f"{archive.name}: cannot be unpacked ({error}); make the ZIP again") from error
     return files
 
 
 class _Archive(io.FileIO):
-    """A file of which nobody reads very much at once: `zipfile` would load a table of contents of gigabytes."""
+    """A file that refuses huge reads: `zipfile` would load a table of contents of gigabytes."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > _MOST_LISTING:
-            raise InputError(f"{Path(str(self.name)).name}: holds too many files; leave some out")
+            raise InputError(f"{Path(str(self.name)).name}: contains too many files; leave some out")
         return super().read(size if size is not None and size >= 0 else _MOST_LISTING) or b""
 
 
 def _choose_files(opened: zipfile.ZipFile, name: str, limits: Limits) -> list[zipfile.ZipInfo]:
-    """Return what is to be unpacked.
+    """Return the entries to unpack.
 
     Raises:
-        InputError: as `unpack`, of what the table of contents tells.
+        InputError: as `unpack`, as far as the table of contents shows it.
     """
     chosen: dict[str, zipfile.ZipInfo] = {}
     for item in opened.infolist():
-        last = None if item.is_dir() or _is_hidden(item.filename) else _name(item.filename)
+        last = None if item.is_dir() or _is_hidden(item.filename) else _find_safe_name(item.filename)
         if last is None:
             continue
         if stat.S_ISLNK(item.external_attr >> 16):
-            raise InputError(f"{name}: {last} in it is a link; put the file itself there")
+            raise InputError(f"{name}: {last} is a link; put the file itself into the ZIP")
         if item.flag_bits & 1:
-            raise InputError(f"{name}: is locked with a password; make the ZIP without one")
+            raise InputError(f"{name}: needs a password; make the ZIP without one")
         if item.compress_type not in _METHODS:
-            raise InputError(f"{name}: is packed in a way that is not read here; make the ZIP with Deflate")
+            raise InputError(f"{name}: uses a compression method that is not supported; make the ZIP with Deflate")
         if last in chosen:
-            raise InputError(f"{last}: is twice in the archive, in two folders; send one folder at a time")
+            raise InputError(f"{last}: two folders of the archive have a file of this name; send one folder at a time")
         chosen[last] = item
         if len(chosen) > limits.files:
             raise InputError(f"{name}: more than {limits.files} files; leave some out")
     if not chosen:
-        raise InputError(f"{name}: no pictures in it; put {list_kinds()} files there")
+        raise InputError(f"{name}: contains no pictures; add {list_kinds()} files")
     return list(chosen.values())
 
 
@@ -92,8 +92,8 @@ def _extract(opened: zipfile.ZipFile, item: zipfile.ZipInfo, path: Path, coming:
         while chunk := source.read(_CHUNK):
             size += len(chunk)
             if most is not None and size > most:
-                raise InputError(f"{name}: unpacks to too many bytes, {path.name} alone to more than {most >> 20} MiB")
-            coming.take(len(chunk), f"{name}: unpacks to too many bytes")
+                raise InputError(f"{name}: is too large unpacked; {path.name} alone has more than {most >> 20} MiB")
+            coming.take(len(chunk), f"{name}: is too large unpacked")
             target.write(chunk)
 
 
@@ -101,8 +101,8 @@ def _is_hidden(name: str) -> bool:
     return any(part.startswith((".", "__MACOSX")) for part in re.split(r"[/\\]", name) if part not in ("", ".", ".."))
 
 
-def _name(name: str) -> str | None:
-    """Return what a file of an archive will be called, None where it is of no use."""
+def _find_safe_name(name: str) -> str | None:
+    """Return the safe name of a file of an archive, None if it cannot be used."""
     try:
         return clean_name(name)
     except InputError:

@@ -1,6 +1,6 @@
-"""An upload under way: a folder of its own until all of it is there and checked, and the bytes it takes.
+"""An unfinished upload: it has a folder of its own until it is complete and checked, and its bytes are counted.
 
-What fails, is refused or is cut off leaves neither files nor bytes behind, and nobody meets half of an upload.
+If it fails, is refused or breaks off, it leaves neither files nor counted bytes; nobody sees half of an upload.
 """
 
 import asyncio
@@ -26,12 +26,12 @@ class Incoming:
     """One upload. Its methods may be called from any thread.
 
     Attributes:
-        folder: Of its own, empty at first.
-        size: Bytes that it takes of its session's.
+        folder: Its own, empty at first.
+        size: Bytes of the session that it uses.
     """
 
     def __init__(self, session: Session, most: int, place: str) -> None:
-        """Begin an upload into a place of a session whose uploads may have `most` bytes together."""
+        """Start an upload into a place of a session whose uploads may have `most` bytes in total."""
         self.folder = session.folder / f".incoming-{secrets.token_hex(8)}"
         self.size = 0
         self._session, self._most, self._place = session, most, place
@@ -40,7 +40,7 @@ class Incoming:
         """Count bytes before they are written.
 
         Raises:
-            InputError: they do not fit; the message begins with `what`.
+            InputError: they exceed the limit; the message begins with `what`.
         """
         self._session.take(size, self._most, what)
         self.size += size
@@ -51,15 +51,15 @@ class Incoming:
         self.size -= size
 
     def add(self, files: Sequence[Path], folder: Path, most: int) -> int:
-        """Move files into the place's folder, all of them or none, and return how many files lie there then.
+        """Move files into the place's folder, all or none, and return how many files are there then.
 
         Args:
             files: Complete and checked.
             folder: Of the place.
-            most: Files that may lie there.
+            most: Files that may be there.
 
         Raises:
-            InputError: a name that is taken, too many files, or a place that is gone.
+            InputError: a duplicate name, too many files, or a place that was removed.
         """
         with self._session.lock:
             there = list_names(folder)
@@ -82,15 +82,15 @@ class Incoming:
             return len(there) + len(files)
 
     def put(self, made: Path, path: Path, most: int | None = None) -> None:
-        """Move a file or a folder to a path, in place of what is there, which is removed with this upload's folder.
+        """Move a file or a folder to a path; what was there is removed with this upload's folder.
 
         Args:
             made: Complete and checked.
-            path: Where it comes to; nobody else writes there.
+            path: Its new place; nobody else writes there.
             most: Entries that the path's folder may have.
 
         Raises:
-            InputError: too many entries, or a place that is gone.
+            InputError: too many entries, or a place that was removed.
         """
         old = self.folder / f".old-{secrets.token_hex(8)}"
         with self._session.lock:
@@ -108,7 +108,7 @@ class Incoming:
             self.size = self._session.keep(self._place, self.size, replace=True)
 
     def remove(self, path: Path) -> None:
-        """Remove a file that was put there, if there is one, and stop counting its bytes."""
+        """Remove a file that was put there, if it exists, and stop counting its bytes."""
         with self._session.lock:
             path.unlink(missing_ok=True)
             self.size += self._session.keep(self._place, 0, replace=True)
@@ -116,11 +116,11 @@ class Incoming:
 
 @asynccontextmanager
 async def open_upload(session: Session, most: int, place: str) -> AsyncIterator[Incoming]:
-    """Yield an upload; what it has not put in place when it ends is removed, and its bytes are given back.
+    """Yield an upload; when it ends, files that it has not moved to their place are removed and no longer counted.
 
     Args:
-        session: Whose.
-        most: Bytes that the session's uploads may have together.
+        session: The session that uploads.
+        most: Bytes that the session's uploads may have in total.
         place: What the bytes are counted for: a set's name, or a path that begins with it.
     """
     coming = Incoming(session, most, place)
@@ -148,7 +148,7 @@ async def open_upload(session: Session, most: int, place: str) -> AsyncIterator[
 
 
 async def receive(stream: AsyncIterator[bytes], path: Path, coming: Incoming, most: int | None = None) -> int:
-    """Write a request's body into a new file, and return its bytes. They are counted before they are kept anywhere.
+    """Write a request's body into a new file, and return its size. Bytes are counted before they are stored.
 
     Args:
         stream: The body.
@@ -158,7 +158,7 @@ async def receive(stream: AsyncIterator[bytes], path: Path, coming: Incoming, mo
 
     Raises:
         InputError: too many bytes.
-        Refused: no byte came for two minutes.
+        Refused: nothing arrived for two minutes.
     """
     size, block = 0, bytearray()
     try:
@@ -168,7 +168,7 @@ async def receive(stream: AsyncIterator[bytes], path: Path, coming: Incoming, mo
                     coming.take(len(chunk), f"{path.name}: too large")
                     size += len(chunk)
                     if most is not None and size > most:
-                        raise InputError(f"{path.name}: too large; such a file may have {format_size(most)} here")
+                        raise InputError(f"{path.name}: too large; such a file may have at most {format_size(most)}")
                     block += chunk
                     if len(block) >= _BLOCK:
                         await run_in_thread(_write, handle, bytes(block))
@@ -176,7 +176,7 @@ async def receive(stream: AsyncIterator[bytes], path: Path, coming: Incoming, mo
                     clock.reschedule(asyncio.get_running_loop().time() + _STALLED)
                 await run_in_thread(_write, handle, bytes(block))
     except TimeoutError as error:
-        raise Refused(f"{path.name}: nothing came for {_STALLED:.0f} s; send it again", 408) from error
+        raise Refused(f"{path.name}: nothing arrived for {_STALLED:.0f} s; send it again", 408) from error
     return size
 
 
@@ -186,10 +186,10 @@ def _write(handle: BinaryIO, block: bytes) -> None:
 
 
 def list_names(folder: Path) -> set[str]:
-    """Return what lies in a place's folder.
+    """Return the names in a place's folder.
 
     Raises:
-        InputError: the place is gone.
+        InputError: the place was removed.
     """
     try:
         return set(os.listdir(folder))
@@ -198,9 +198,9 @@ def list_names(folder: Path) -> set[str]:
 
 
 async def run_in_thread(function: Callable[..., T], *values: object) -> T:
-    """Call a function in a thread. One who is cancelled meanwhile goes on once it has ended, and not before.
+    """Call a function in a thread. A caller that is cancelled meanwhile continues only once the function has ended.
 
-    Otherwise what is cleaned up after the call would be cleaned up under its hands.
+    Otherwise the caller would clean up while the function still uses the files.
     """
     running = asyncio.ensure_future(asyncio.to_thread(function, *values))
     cancelled: asyncio.CancelledError | None = None
@@ -213,6 +213,6 @@ async def run_in_thread(function: Callable[..., T], *values: object) -> T:
             break
     if cancelled is not None:
         if not running.cancelled():
-            running.exception()  # looked at, so that nobody complains that it was not
+            running.exception()  # retrieved, so that asyncio does not warn
         raise cancelled
     return running.result()

@@ -1,7 +1,7 @@
-"""One queue of jobs for everybody, run one after another in one process of their own.
+"""One queue of jobs for all sessions, run one after another in a process of their own.
 
 The server's process loads neither torch nor Mitsuba. The worker keeps both loaded between jobs; it is replaced when a
-running job is cancelled, when it dies, and when it holds more memory than allowed.
+running job is cancelled, when it dies, and when it holds too much memory.
 """
 
 import itertools
@@ -21,23 +21,23 @@ QUEUED, RUNNING, DONE, FAILED, CANCELLED = "queued", "running", "done", "failed"
 _LIVE = (QUEUED, RUNNING)
 WAITING_LIMIT = 20
 _MEMORY_LIMIT = 4 * 2**30
-"""Bytes the worker may hold after a job; above that a fresh one takes its place."""
+"""Bytes the worker may hold after a job; above that it is replaced."""
 _KEPT = 200  # finished jobs of which the state is remembered
 _POLL = 0.2
 
 
 @dataclass
 class Job:
-    """A job, what became of it and how far it is.
+    """A job and its state.
 
     Attributes:
         id: Number.
-        owner: Session that asked for it; nobody else may see or cancel it.
+        owner: Session that requested it; no other may see or cancel it.
         task: Name of a task of `app_worker.TASKS`.
         arguments: Its keyword arguments.
         state: queued, running, done, failed or cancelled.
         stage: What it is doing.
-        share: Share that is done, in [0, 1].
+        share: How much of it is done, in [0, 1].
         message: Of a failed job, one line.
         result: What the task returned.
         began: Time it started (`time.monotonic`).
@@ -56,7 +56,7 @@ class Job:
 
 
 class _Worker:
-    """A worker process and the pipe to it. One thread starts it, talks to it and ends it; others may `kill` it."""
+    """A worker process and the pipe to it. One thread starts, uses and ends it; others may `kill` it."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -67,7 +67,7 @@ class _Worker:
         self.condemned = False
 
     def is_usable(self) -> bool:
-        """Tell whether it can be given a job."""
+        """Return whether it can take a job."""
         return not self.condemned and self.process.is_alive()
 
     def kill(self) -> None:
@@ -76,15 +76,15 @@ class _Worker:
         self.process.kill()
 
     def end(self) -> None:
-        """End it and wait for it; the system may take seconds to take back the memory of a large process."""
+        """End it and wait for it; the system may need seconds to reclaim the memory of a large process."""
         self.kill()
         self.process.join(5)
         self.pipe.close()
 
 
 class Jobs:
-    """The queue and its worker. Thread-safe; but for `close`, no method waits for a process, so any may be called on
-    the event loop.
+    """The queue and its worker. Thread-safe; only `close` waits for a process, so the event loop may call all other
+    methods.
     """
 
     def __init__(self, memory_limit: int = _MEMORY_LIMIT) -> None:
@@ -94,14 +94,14 @@ class Jobs:
         self._waiting: deque[Job] = deque()
         self._changed = threading.Condition()
         self._closed = False
-        self._worker: _Worker | None = None  # set by the thread alone
+        self._worker: _Worker | None = None  # set only by the thread
         self.worker_memory = 0
         """Bytes the worker held after its last job."""
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
         self._thread.start()
 
     def submit(self, owner: str, task: str, **arguments: Any) -> Job | None:
-        """Queue a job; None where too many wait."""
+        """Queue a job; return None if too many are waiting."""
         with self._changed:
             if len(self._waiting) >= WAITING_LIMIT:
                 return None
@@ -119,7 +119,7 @@ class Jobs:
         return job if job is not None and job.owner == owner else None
 
     def works_in(self, place: Path) -> bool:
-        """Tell whether a job waits or runs that was given a folder as its place."""
+        """Return whether a waiting or running job uses a folder as its `place`."""
         with self._changed:
             return any(job.state in _LIVE and job.arguments.get("place") == str(place) for job in self._jobs.values())
 
@@ -136,7 +136,7 @@ class Jobs:
         }  # fmt: skip
 
     def cancel(self, job: Job) -> None:
-        """Take a waiting job out of the queue; of a running one end the worker, which `_run` notices."""
+        """Remove a waiting job from the queue; for a running one end the worker, which `_run` notices."""
         with self._changed:
             if job.state == QUEUED:
                 self._waiting.remove(job)
@@ -147,7 +147,7 @@ class Jobs:
                     self._worker.kill()
 
     def forget(self, owner: str) -> None:
-        """Cancel the jobs of an owner who is gone, and keep nothing of them."""
+        """Cancel and forget the jobs of a session that has ended."""
         with self._changed:
             for job in [job for job in self._jobs.values() if job.owner == owner]:
                 self.cancel(job)
@@ -166,7 +166,7 @@ class Jobs:
         return next((job for job in self._jobs.values() if job.state == RUNNING), None)
 
     def _run(self) -> None:
-        """Pass jobs to the worker, one after another; the worker starts before the first job, so that it is warm."""
+        """Pass jobs to the worker one by one; it starts before the first job, so that its libraries are loaded."""
         while True:
             worker = self._find_worker()
             with self._changed:
@@ -174,7 +174,7 @@ class Jobs:
                     self._changed.wait()
                 if self._closed:
                     break
-                if worker is None or not worker.is_usable():  # it may have died while there was nothing to do
+                if worker is None or not worker.is_usable():  # it may have died while idle
                     continue
                 job = self._waiting.popleft()
                 job.state, job.began = RUNNING, time.monotonic()
@@ -182,7 +182,7 @@ class Jobs:
                 worker.pipe.send((job.task, job.arguments))
                 self._follow(job, worker)
             except (EOFError, OSError):
-                self._end(job, FAILED, "the worker ended, perhaps for want of memory; try fewer or smaller pictures")
+                self._end(job, FAILED, "the worker stopped, perhaps out of memory; try fewer or smaller pictures")
                 worker.kill()
             if self.worker_memory > self._memory_limit:
                 worker.kill()
@@ -190,7 +190,7 @@ class Jobs:
             worker.end()
 
     def _find_worker(self) -> _Worker | None:
-        """Return a worker that can be given a job: the one there is, or a new one; None where none can be started."""
+        """Return a worker that can take a job, started if necessary; None if none can be started."""
         old = self._worker
         if old is not None and old.is_usable():
             return old
@@ -206,7 +206,7 @@ class Jobs:
         return worker
 
     def _follow(self, job: Job, worker: _Worker) -> None:
-        """Take in what the worker says of a job until it ends.
+        """Read the worker's reports on a job until it ends.
 
         Raises:
             EOFError: the worker died.
@@ -234,7 +234,7 @@ class Jobs:
 
 
 def replace_nonfinite(value: Any) -> Any:
-    """Return a result with None for numbers that JSON does not have; one of them would make all of it unreadable."""
+    """Return a result with None for NaN and infinity, which JSON does not have."""
     if isinstance(value, dict):
         return {key: replace_nonfinite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,16 +1,16 @@
-"""What the server refuses with a status of its own, and sizes in words."""
+"""Refusals with a status of their own, and sizes as text."""
 
 import errno
 
 from render.shared.errors import InputError
 
-GONE = "that has been removed; load it again"
-"""Of a set of photographs that is not there any more."""
+GONE = "that was removed; load it again"
+"""Message for a set of photographs that no longer exists."""
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
 
 class Refused(InputError):
-    """A refusal that is not the visitor's mistake; those are plain `InputError`, and 400.
+    """A refusal that is not the user's mistake; mistakes are plain `InputError`, status 400.
 
     Args:
         message: One line.
@@ -23,14 +23,14 @@ class Refused(InputError):
 
 
 def explain_full_disk(name: str, error: OSError) -> Refused | None:
-    """Return the refusal where the disk has no room for an upload, None for other errors."""
+    """Return the refusal if the disk is full, None for other errors."""
     if error.errno not in _FULL:
         return None
-    return Refused(f"{name}: the disk of the server is full; free space on it and try again", 507)
+    return Refused(f"{name}: the server's disk is full; free some space and try again", 507)
 
 
 def format_size(size: int) -> str:
-    """Return a number of bytes in words."""
+    """Return a number of bytes as text."""
     if size < 2**20:
         return f"{size / 2**10:.0f} KiB"
     return f"{size / 2**20:.0f} MiB" if size < 2**30 else f"{size / 2**30:.1f} GiB"

@@ -1,4 +1,4 @@
-"""Who is who: a cookie per browser, a temporary folder per session, gone when the session or the server ends."""
+"""Sessions: a cookie per browser, and a temporary folder that is removed when the session or the server ends."""
 
 import os
 import re
@@ -26,25 +26,25 @@ _PREFIX = "sdps-pages-"
 _NEW = 3600.0
 COOKIE = "sdps-session"
 _IDLE = 6 * 3600.0
-_MOST = 32  # sessions at once; of those that hold nothing, then of all, the one that was idle longest goes
-_AT_A_TIME = 4 * _MOST  # between two looks at which sessions ended
-_SET = re.compile(r"[0-9a-f]{16}")  # what `make_place` calls them; other folders are those of the other rooms
+_MOST = 32  # sessions at once; those without files go first, and of them those idle for longest
+_AT_A_TIME = 4 * _MOST  # sessions between two clean-ups
+_SET = re.compile(r"[0-9a-f]{16}")  # what `make_place` calls them; the other pages name their folders differently
 
 
 @dataclass
 class Session:
     """What belongs to one browser.
 
-    Bytes are counted when they are about to be written and until they are gone from the disk, so that `taken` is never
-    too small. All methods are thread-safe and short: the event loop may call them.
+    Bytes count from before they are written until they are removed from the disk, so that `taken` is never too
+    small. All methods are thread-safe and short: the event loop may call them.
 
     Attributes:
         token: Secret name.
         folder: Holds everything this session uploaded and made.
         used: Time of the last request (`time.monotonic`).
-        taken: Bytes of uploads, those under way among them.
-        lock: For those who change what lies in the folder.
-        under_way: Number of uploads under way into each place.
+        taken: Bytes of uploads, unfinished ones included.
+        lock: Held while files of the folder change.
+        under_way: Number of unfinished uploads into each place.
     """
 
     token: str
@@ -60,25 +60,25 @@ class Session:
         """Count bytes before they are written.
 
         Raises:
-            InputError: `taken` would pass `most`; nothing is counted. It begins with `what`.
+            InputError: `taken` would exceed `most`; nothing is counted. The message begins with `what`.
         """
         with self.lock:
             if self.taken + size > most:
-                raise InputError(f"{what}; all uploads together may have {format_size(max(most - self.taken, 0))} more")
+                raise InputError(f"{what}; {format_size(max(most - self.taken, 0))} are left for all uploads together")
             self.taken += size
 
     def give(self, size: int) -> None:
-        """Stop counting bytes that are gone."""
+        """Stop counting bytes that were removed."""
         with self.lock:
             self.taken -= size
 
     def keep(self, place: str, size: int, *, replace: bool = False) -> int:
-        """Note that a place holds `size` of the bytes taken, and return those that it holds no longer.
+        """Record that a place holds `size` of the bytes taken; return the bytes it held that were replaced.
 
         Args:
             place: Name of a set, or a path that begins with it.
             size: Bytes.
-            replace: They are in place of those it held; else they are added.
+            replace: They replace those it held; otherwise they are added.
         """
         with self.lock:
             old = self._kept.pop(place, 0)
@@ -89,7 +89,7 @@ class Session:
         """Return the folder of a set of photographs.
 
         Raises:
-            InputError: no such set in this session.
+            InputError: this session has no such set.
         """
         path = self.folder / name
         if not _SET.fullmatch(name) or not path.is_dir():
@@ -108,38 +108,38 @@ class Session:
         return name
 
     def set_aside(self, most: int, busy: Callable[[Path], bool]) -> list[tuple[str, Path]]:
-        """Take sets out of use, those unused for longest first, until `most` are left; `clear` then removes them.
+        """Rename the sets that were unused for longest, until `most` are left; `clear` then removes them.
 
         Args:
             most: Sets that may stay.
-            busy: Tells whether somebody works on a folder; such a set stays, and one with uploads under way.
+            busy: Whether a job uses a folder; such a set stays, and so does one with unfinished uploads.
 
         Returns:
             (name of the set, where its folder lies now).
 
         Raises:
-            Refused: there is work on too many of them.
+            Refused: too many of them are in use.
         """
         gone = []
         with self.lock:
             free = [name for name in self._sets if not self.under_way[name] and not busy(self.folder / name)]
             surplus = len(self._sets) - most
             if surplus > len(free):
-                raise Refused("too many sets of photographs are in work; wait until one is done", 503)
+                raise Refused("too many sets of photographs are being processed; wait until one is finished", 503)
             for name in free[: max(surplus, 0)]:
                 aside = self.folder / f".gone-{secrets.token_hex(8)}"
                 try:
                     os.rename(self.folder / name, aside)
                 except FileNotFoundError:
                     pass
-                except OSError:  # somebody reads there, which some systems do not allow; it goes the next time
+                except OSError:  # being read, which blocks it on some systems; it is removed the next time
                     continue
                 del self._sets[name]
                 gone.append((name, aside))
         return gone
 
     def clear(self, gone: list[tuple[str, Path]]) -> None:
-        """Remove what was set aside, and stop counting its bytes; this may take a while."""
+        """Remove sets that were set aside, and stop counting their bytes; this may take a while."""
         for name, aside in gone:
             shutil.rmtree(aside, ignore_errors=True)
             with self.lock:
@@ -167,7 +167,7 @@ class Sessions:
             return session
 
     def create(self) -> Session:
-        """Begin a session. Where very many begin at a time, the oldest that holds nothing ends."""
+        """Start a session. If very many start at once, the oldest one without files ends."""
         token = secrets.token_urlsafe(32)
         session = Session(token, self.folder / secrets.token_hex(8))
         session.folder.mkdir()
@@ -189,10 +189,10 @@ class Sessions:
     def expire(
         self, idle: float = _IDLE, most: int = _MOST, ended: Callable[[str], None] = lambda _: None
     ) -> list[str]:
-        """Remove sessions that were not used for `idle` seconds, and those above `most`; return their tokens.
+        """Remove sessions that were idle for `idle` seconds, and those in excess of `most`; return their tokens.
 
-        Of too many, those that hold nothing go first: a program that looks at the page again and again, without a
-        cookie, must not end the session of somebody who reads his results. One with uploads under way stays.
+        Those without files go first: a program that keeps loading the page without a cookie must not end the session
+        of somebody who is reading results. Sessions with unfinished uploads stay.
 
         Args:
             idle: Seconds.
@@ -244,7 +244,7 @@ def _lock_folder(folder: Path) -> int | None:
 
 
 def _remove_leftovers(parent: Path) -> None:
-    """Remove folders of servers that were killed: no process holds them. One that was made just now may yet be held."""
+    """Remove the folders of killed servers: no process locks them. A very new folder may not be locked yet."""
     for folder in parent.glob(f"{_PREFIX}*"):
         with suppress(OSError):
             handle = _lock_folder(folder) if time.time() - folder.stat().st_mtime > _NEW else None

@@ -1,4 +1,4 @@
-"""What may be uploaded: so many files, bytes and pixels, of these kinds, under harmless names."""
+"""What may be uploaded: kinds of files, safe names, and limits of files, bytes and pixels."""
 
 import re
 import struct
@@ -12,14 +12,14 @@ from PIL import Image
 
 from render.shared.errors import InputError
 from render.shared.files import parse_json
-from sdps.photos.light_files import SUFFIXES as BESIDE
+from sdps.photos.light_files import SUFFIXES as LIGHT_FILES
 from sdps.photos.pictures.picture_kinds import SUFFIXES
 
 PICTURES = tuple(SUFFIXES)
-"""Suffixes of the pictures that `sdps infer` reads; so does the page."""
+"""Suffixes of the pictures that `sdps infer` and the app read."""
 _NAME = re.compile(r"[^\w.,()+ -]+")
-_LONGEST = 200  # bytes of a name; file systems allow 255, and we put something before or after it
-_TEXTS = (*BESIDE, ".yaml", ".yml")
+_LONGEST = 200  # bytes of a name; file systems allow 255, and we may add a prefix or suffix
+_TEXTS = (*LIGHT_FILES, ".yaml", ".yml")
 _MOST_TEXT = 8 * 2**20
 _EXR, _EXR_HEADER = b"\x76\x2f\x31\x01", 2**16
 _EXR_WINDOW = re.compile(rb"(?:dataWindow|displayWindow)\0box2i\0\x10\0\0\0(.{16})", re.DOTALL)
@@ -33,7 +33,7 @@ class Limits:
 
     Attributes:
         files: Files of one set.
-        bytes: Bytes of the session, archives unpacked.
+        bytes: Bytes of the session, with archives unpacked.
         pixels: Pixels of one picture.
     """
 
@@ -42,16 +42,16 @@ class Limits:
     pixels: int = 25_000_000
 
 
-def clean_name(name: str, allowed: tuple[str, ...] = PICTURES + BESIDE) -> str:
-    """Return the last part of a name without odd characters, at most 200 bytes of it.
+def clean_name(name: str, allowed: tuple[str, ...] = PICTURES + LIGHT_FILES) -> str:
+    """Return the last part of a name without unusual characters, at most 200 bytes.
 
     Raises:
-        InputError: another suffix than those allowed, or nothing left.
+        InputError: a suffix that is not allowed, or nothing is left.
     """
     last = _NAME.sub("_", re.split(r"[/\\]", name)[-1]).strip(" .")
     last = last.encode("utf-8", "replace")[-_LONGEST:].decode("utf-8", "ignore").strip(" .")
     if Path(last).suffix.lower() not in allowed or not Path(last).stem:
-        raise InputError(f"{last or 'file'}: cannot be used here; allowed are {', '.join(allowed)}")
+        raise InputError(f"{last or 'file'}: cannot be used here; give one of {', '.join(allowed)}")
     return last
 
 
@@ -59,7 +59,7 @@ async def read_settings(stream: AsyncIterator[bytes]) -> dict[str, Any]:
     """Return the JSON object of a request's body.
 
     Raises:
-        InputError: more than 64 KiB, or no JSON object.
+        InputError: more than 64 KiB, or not a JSON object.
     """
     body = bytearray()
     async for chunk in stream:
@@ -76,18 +76,18 @@ async def read_settings(stream: AsyncIterator[bytes]) -> dict[str, Any]:
 
 
 def most_bytes(name: str) -> int | None:
-    """Return the bytes that a file of this name may have, None for what the session may have: texts are read whole."""
+    """Return how many bytes a file of this name may have (text files are read whole); None: as many as the session."""
     return _MOST_TEXT if Path(name).suffix.lower() in _TEXTS else None
 
 
 def list_kinds() -> str:
-    """Return the kinds of pictures in words: PNG, TIFF, ... or EXR."""
+    """Return the kinds of pictures as text: PNG, TIFF, ... or EXR."""
     *others, last = dict.fromkeys(SUFFIXES.values())
     return f"{', '.join(others)} or {last}"
 
 
 def check_pixels(path: Path, limits: Limits) -> None:
-    """Refuse a picture of too many pixels by its header, before anything decodes it.
+    """Refuse a picture with too many pixels by its header, before anything decodes it.
 
     Raises:
         InputError: too large, or a header that cannot be read.
@@ -104,13 +104,13 @@ def check_pixels(path: Path, limits: Limits) -> None:
 
 def _describe_excess(path: Path, what: str, limits: Limits) -> str:
     return (
-        f"{path.name}: {what}; at most {limits.pixels / 1e6:.3g} million are allowed here, scale the pictures down or "
+        f"{path.name}: {what}; at most {limits.pixels / 1e6:.3g} million are allowed here; scale the pictures down or "
         "use `sdps infer`"
     )
 
 
 def _read_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) that the header tells. The kind is that of the content, whatever the name says."""
+    """Return (width, height) from the header. The content decides which kind of file it is, not the name."""
     try:
         with path.open("rb") as opened:
             head = opened.read(_EXR_HEADER)
@@ -126,23 +126,23 @@ def _read_size(path: Path) -> tuple[int, int]:
             return image.size
     except Image.DecompressionBombError:
         raise
-    except Exception as error:  # the libraries' errors on damaged files are of many kinds
-        raise InputError(f"{path.name}: is no picture that can be read; save it again") from error
+    except Exception as error:  # libraries raise many kinds of errors on damaged files
+        raise InputError(f"{path.name}: cannot be read as a picture; save it again") from error
 
 
 @cache
 def _list_formats() -> list[str]:
-    """Return what Pillow calls the kinds that are read, but TIFF; TGA last: its files begin with nothing fixed."""
+    """Return Pillow's names of the kinds that are read, except TIFF; TGA last, whose files have no signature."""
     Image.init()
     known = {Image.registered_extensions().get(suffix) for suffix in PICTURES} & {*Image.OPEN} - {"TIFF"}
     return sorted(filter(None, known), key=lambda name: name == "TGA")
 
 
 def _read_exr_size(head: bytes) -> tuple[int, int]:
-    """Return the largest (width, height) in an OpenEXR file's headers, read by hand: its library could take us down.
+    """Return the largest (width, height) in an OpenEXR file's headers, read by hand, since the library may crash.
 
     A header is a magic number and a version, then attributes: name, type, length, value. Each part of a file has one,
-    and pixels may be put into a display window that is larger than the data.
+    and the display window may be larger than the data window.
     """
     windows = [struct.unpack("<4i", found[1]) for found in _EXR_WINDOW.finditer(head)]
     sizes = [(right - left + 1, high - low + 1) for left, low, right, high in windows]

@@ -1,1 +1,1 @@
-"""The rooms of the page: what the server answers, and what the worker does, one pair of modules each."""
+"""The pages: for each, a module of what the server answers and one of what the worker does."""

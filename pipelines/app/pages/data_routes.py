@@ -1,4 +1,4 @@
-"""The room "Data and runs": what lies in one folder of this machine: scenes, learning curves, results."""
+"""The page "Data and runs": scenes, learning curves and results of one folder on this machine."""
 
 import asyncio
 import json
@@ -26,28 +26,28 @@ from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import read_whole_lines
 
-_ROOM = "data"
+_PAGE = "data"
 _DEEP, _MOST = 4, 300
 _SIDE = 96
 _POINTS = 400  # of a learning curve
 
 
-def _folder(request: Request) -> Path:
-    """Return the folder a request names, which must lie in the one that is shown.
+def _find_folder(request: Request) -> Path:
+    """Return the folder a request names, which must be inside the one that is shown.
 
     Raises:
-        InputError: it does not, or is not there.
+        InputError: it is not inside, or does not exist.
     """
     root = Path(request.app.state.folder).resolve()
-    with suppress(OSError, ValueError):  # too long a name, or one with a zero
+    with suppress(OSError, ValueError):  # the name is too long or contains a zero byte
         folder = (root / request.query_params.get("folder", ".")).resolve()
         if folder.is_relative_to(root) and folder.is_dir():
             return folder
-    raise InputError("no such folder")
+    raise InputError("there is no such folder; load the page again")
 
 
-async def listing(request: Request) -> Response:
-    """Send the data folders and runs there are, newest first."""
+async def send_listing(request: Request) -> Response:
+    """Send the list of data folders and runs, newest first."""
     root = Path(request.app.state.folder).resolve()
     rows = await asyncio.to_thread(_list_rows, root)
     return JSONResponse({"root": str(request.app.state.folder), "rows": rows})
@@ -61,7 +61,7 @@ def _list_rows(root: Path) -> list[dict[str, str]]:
 def _find_folders(root: Path) -> Iterator[tuple[float, str, Path]]:
     for place, folders, files in os.walk(root):
         path = Path(place)
-        # Folders may be removed while this looks at them, and names that are not valid text cannot be sent.
+        # Folders may be removed meanwhile, and names that are not valid text cannot be sent.
         with suppress(OSError, UnicodeEncodeError):
             place.encode()
             if MANIFEST in files:
@@ -72,13 +72,13 @@ def _find_folders(root: Path) -> Iterator[tuple[float, str, Path]]:
         folders[:] = [] if deep else [name for name in folders if name not in ("shards", "models", REPORT, "log")]
 
 
-async def scenes(request: Request) -> Response:
-    """Send the scenes of a data folder, and what became of each."""
-    folder = _folder(request)
-    return JSONResponse(await asyncio.to_thread(_scenes, folder))
+async def send_scenes(request: Request) -> Response:
+    """Send the scenes of a data folder and the state of each."""
+    folder = _find_folder(request)
+    return JSONResponse(await asyncio.to_thread(_read_scenes, folder))
 
 
-def _scenes(folder: Path) -> list[dict[str, Any]]:
+def _read_scenes(folder: Path) -> list[dict[str, Any]]:
     manifest = read_manifest(folder)
     failed = survey(folder, manifest).failed
     return [_describe_scene(scene, folder, failed.get(scene.id)) for scene in manifest]
@@ -94,9 +94,9 @@ def _describe_scene(scene: SceneSpec, folder: Path, failures: list[dict[str, Any
     }  # fmt: skip
 
 
-async def scene(request: Request) -> Response:
+async def send_scene(request: Request) -> Response:
     """Send the strip of pictures and the mean radiance of one scene."""
-    folder, name = _folder(request), request.query_params.get("id")
+    folder, name = _find_folder(request), request.query_params.get("id")
     async with request.app.state.reading:
         found = await asyncio.to_thread(_read_scene, folder, name)
     return JSONResponse(found)
@@ -118,54 +118,54 @@ def _draw_strip(path: Path, scene: SceneSpec, _time: int) -> dict[str, Any]:
 
 
 def _find_scene(folder: Path, name: str | None) -> SceneSpec:
-    """Return a scene of a data folder; of a large one this takes seconds, so not on the event loop.
+    """Return a scene of a data folder; for a large folder this takes seconds, so not on the event loop.
 
     Raises:
-        InputError: there is none of this name.
+        InputError: there is no scene of this name.
     """
-    chosen = _manifest(folder, _read_time(folder / MANIFEST)).get(name or "")
+    chosen = _index_manifest(folder, _read_time(folder / MANIFEST)).get(name or "")
     if chosen is None:
-        raise InputError("no such scene")
+        raise InputError("there is no such scene; load the page again")
     return chosen
 
 
 @lru_cache(maxsize=4)
-def _manifest(folder: Path, _time: int) -> dict[str, SceneSpec]:
+def _index_manifest(folder: Path, _time: int) -> dict[str, SceneSpec]:
     return {scene.id: scene for scene in read_manifest(folder)}
 
 
 def _read_time(path: Path) -> int:
-    """Return when a file was changed, in nanoseconds; 0 where there is none, which its reader then says."""
+    """Return when a file was changed, in nanoseconds; 0 if there is none, which its reader will report."""
     try:
         return path.stat().st_mtime_ns
     except OSError:
         return 0
 
 
-async def start(request: Request) -> Response:
+async def start_lamp(request: Request) -> Response:
     """Queue the preparation of a scene for the lamp."""
-    folder = _folder(request)
+    folder = _find_folder(request)
     chosen = await asyncio.to_thread(_find_scene, folder, request.query_params.get("id"))
-    place = make_tab_folder(request, _ROOM)
+    place = make_tab_folder(request, _PAGE)
     return queue_task(request, "shard", place=str(place), shard=str(folder / chosen.file))
 
 
-async def file(request: Request) -> Response:
-    """Send what was made of the scene under the lamp."""
+async def send_file(request: Request) -> Response:
+    """Send a file of the tab's scene under the lamp."""
     name = request.path_params["name"]
-    path = find_tab_folder(request, _ROOM) / name
+    path = find_tab_folder(request, _PAGE) / name
     if name not in ("basis.bin", "truth.bin") or not path.is_file():
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path)
 
 
-async def curves(request: Request) -> Response:
+async def send_curves(request: Request) -> Response:
     """Send the learning curves of a run as they are now: {model: {metric: [[step, value], ...]}}."""
-    folder = _folder(request)
-    return JSONResponse(await asyncio.to_thread(_curves, folder))
+    folder = _find_folder(request)
+    return JSONResponse(await asyncio.to_thread(_read_curves, folder))
 
 
-def _curves(folder: Path) -> dict[str, dict[str, list[list[float]]]]:
+def _read_curves(folder: Path) -> dict[str, dict[str, list[list[float]]]]:
     found: dict[str, dict[str, list[list[float]]]] = {}
     for path in sorted((folder / "models").glob("*/metrics.jsonl")):
         series: dict[str, list[list[float]]] = {}
@@ -178,7 +178,7 @@ def _curves(folder: Path) -> dict[str, dict[str, list[list[float]]]]:
 
 
 def _can_be_drawn(value: object) -> bool:
-    """Tell whether a value has a place in a plot; those of a training that diverged have none."""
+    """Return whether a value can be plotted; those of a diverged training cannot."""
     return isinstance(value, int | float) and abs(value) < 1e300  # NaN is not below it either
 
 
@@ -187,19 +187,19 @@ def _thin(values: list[list[float]]) -> list[list[float]]:
     return values[::step] + ([values[-1]] if (len(values) - 1) % step else [])
 
 
-async def sections(request: Request) -> Response:
-    """Send what was evaluated: text, tables and the names of the pictures."""
-    folder = _folder(request)
-    return Response(await asyncio.to_thread(_sections, folder), media_type="application/json")
+async def send_sections(request: Request) -> Response:
+    """Send the evaluation: text, tables and the names of the pictures."""
+    folder = _find_folder(request)
+    return Response(await asyncio.to_thread(_read_sections, folder), media_type="application/json")
 
 
-def _sections(folder: Path) -> str:
+def _read_sections(folder: Path) -> str:
     return json.dumps(replace_nonfinite([to_plain(section) for _, section in read_sections(folder)]))
 
 
-async def picture(request: Request) -> Response:
+async def send_picture(request: Request) -> Response:
     """Send a picture of a section."""
-    report = _folder(request) / REPORT
+    report = _find_folder(request) / REPORT
     path = find_file(report, f"{request.query_params.get('section', '')}/{request.query_params.get('file', '')}")
     if path is None or path.suffix not in (".png", ".jpg"):
         return JSONResponse({"message": "no such file"}, 404)
@@ -207,12 +207,12 @@ async def picture(request: Request) -> Response:
 
 
 ROUTES = [
-    Route("/list", listing),
-    Route("/scenes", scenes),
-    Route("/scene", scene),
-    Route("/start", start, methods=["POST"]),
-    Route("/files/{name}", file),
-    Route("/curves", curves),
-    Route("/sections", sections),
-    Route("/picture", picture),
+    Route("/list", send_listing),
+    Route("/scenes", send_scenes),
+    Route("/scene", send_scene),
+    Route("/start", start_lamp, methods=["POST"]),
+    Route("/files/{name}", send_file),
+    Route("/curves", send_curves),
+    Route("/sections", send_sections),
+    Route("/picture", send_picture),
 ]

@@ -4,6 +4,7 @@ Pictures are thinned to at most 384 pixels a side. Everything is in the frame x 
 """
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,9 +86,8 @@ def shade_object(
     if not lobes:
         return albedo * np.maximum(normals @ light, 0.0)[..., None]
     numbers = {name: np.array(values) for name, values in lobes.items()}
-    shape = normals.shape
-    pixels = normals.reshape(-1, 3), light[None], albedo.reshape(-1, 3), strength.reshape(-1)
-    return shade(*pixels, **numbers).reshape(shape)
+    surface = SimpleNamespace(albedo=albedo.reshape(-1, 3), strength=strength.reshape(-1), **numbers)
+    return shade(normals.reshape(-1, 3), light[None], surface).reshape(albedo.shape)
 
 
 def _reflectance(result: "Inference") -> tuple[np.ndarray, np.ndarray, dict[str, list[float]]]:

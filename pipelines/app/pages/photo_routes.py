@@ -1,4 +1,4 @@
-"""The room "Photographs": uploads, masks, inferences and what they made."""
+"""The page "Photographs": uploads, masks, inferences and their results."""
 
 import asyncio
 import io
@@ -35,8 +35,8 @@ _MOST_SETS = 12
 _PACKING = threading.Lock()
 
 
-async def new(request: Request) -> Response:
-    """Begin a set of photographs; the one unused for longest goes where there are a dozen."""
+async def make_set(request: Request) -> Response:
+    """Start a set of photographs; if there are a dozen, the one unused for longest is removed."""
     session: Session = request.state.session
     gone = session.set_aside(_MOST_SETS - 1, request.app.state.jobs.works_in)
     name = session.make_place()
@@ -47,7 +47,7 @@ async def new(request: Request) -> Response:
 
 @accept_uploads
 async def upload(request: Request) -> Response:
-    """Take one file, or a ZIP that is unpacked at once: all of its files or none."""
+    """Receive one file, or a ZIP, which is unpacked at once: all of its files or none."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
     name, given = request.path_params["set"], request.path_params["name"]
@@ -64,7 +64,7 @@ async def upload(request: Request) -> Response:
 
 
 def _accept(coming: Incoming, path: Path, folder: Path, limits: Limits) -> int:
-    """Check what was uploaded, and move it into a set's folder; return how many files lie there then."""
+    """Check an upload and move it into a set's folder; return how many files are there then."""
     if path.suffix.lower() == ".zip":
         return coming.add(unpack(path, coming.folder / "unpacked", limits, coming), folder, limits.files)
     uploads.check_pixels(path, limits)
@@ -72,8 +72,8 @@ def _accept(coming: Incoming, path: Path, folder: Path, limits: Limits) -> int:
 
 
 @accept_uploads
-async def paint(request: Request) -> Response:
-    """Take a mask painted on the page, a PNG of the photographs' size; an empty body takes the painted one away."""
+async def upload_mask(request: Request) -> Response:
+    """Receive a mask painted on the page, a PNG of the photographs' size; an empty body removes the painted mask."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
     name = request.path_params["set"]
@@ -103,14 +103,14 @@ def _store_mask(coming: Incoming, source: Path, target: Path, limits: Limits) ->
     coming.put(made, target)
 
 
-async def start(request: Request) -> Response:
-    """Queue a task on a set: the example, the checks or an inference."""
+async def start_task(request: Request) -> Response:
+    """Queue a task for a set: the example, the checks or an inference."""
     session: Session = request.state.session
     name, task = request.path_params["set"], request.path_params["task"]
     if task not in _TASKS:
         raise unknown("task", task, _TASKS)
     asked = await uploads.read_settings(request.stream()) if task != "example" else {}
-    place = session.find_place(name)  # looked for after the wait: it may have gone meanwhile
+    place = session.find_place(name)  # only now, since it may have been removed meanwhile
     arguments: dict[str, Any] = {"place": str(place)}
     if task != "example":
         arguments |= {"gamma": _read_choice(asked, "gamma", _GAMMAS), "lights": asked.get("lights") is True}
@@ -119,7 +119,7 @@ async def start(request: Request) -> Response:
     if task == "infer":
         runs = [int(path.name) for path in (place / "runs").glob("*")]
         if len(runs) >= _MOST_RUNS:
-            raise InputError(f"{_MOST_RUNS} runs on one set are enough here; load the photographs again")
+            raise InputError(f"a set can have at most {_MOST_RUNS} runs; load the photographs again")
         latest = max(runs, default=0) + 1
         run = place / "runs" / str(latest)
         run.mkdir(parents=True)
@@ -141,21 +141,21 @@ def _read_choice(asked: dict[str, Any], key: str, known: tuple[str, ...]) -> str
     return value
 
 
-async def file(request: Request) -> Response:
-    """Send a file that the session's set holds, and nothing outside it."""
+async def send_file(request: Request) -> Response:
+    """Send a file of the session's set, and nothing outside it."""
     path = find_file(request.state.session.find_place(request.path_params["set"]), request.path_params["path"])
     if path is None:
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path)
 
 
-async def pixel(request: Request) -> Response:
-    """Send what one pixel measures in every photograph, and what the model says it should."""
+async def send_pixel(request: Request) -> Response:
+    """Send the values of one pixel in every photograph, and those of the model."""
     view = _find_run(request) / "view"
     try:
         row, column = (int(request.query_params[key]) for key in ("row", "column"))
     except (KeyError, ValueError) as error:
-        raise InputError("row and column must be numbers inside the picture") from error
+        raise InputError("row and column: must be numbers inside the picture") from error
     return JSONResponse(replace_nonfinite(await asyncio.to_thread(_read_pixel, view, row, column)))
 
 
@@ -165,13 +165,13 @@ def _read_pixel(view: Path, row: int, column: int) -> dict[str, list[float]]:
         if (view / f"{name}.npy").is_file():
             values = np.load(view / f"{name}.npy", mmap_mode="r")
             if not (0 <= row < values.shape[0] and 0 <= column < values.shape[1]):
-                raise InputError("outside the picture; row and column must be numbers inside it")
+                raise InputError("row and column: outside the picture")
             found[name] = np.asarray(values[row, column], np.float64).round(5).tolist()
     return found
 
 
-async def download(request: Request) -> Response:
-    """Send everything `sdps infer` wrote as one ZIP."""
+async def send_archive(request: Request) -> Response:
+    """Send all files that `sdps infer` writes as one ZIP."""
     run = _find_run(request)
     archive = run / "sdps-infer.zip"
     await run_in_thread(_pack, run / "files", archive)
@@ -179,7 +179,7 @@ async def download(request: Request) -> Response:
 
 
 def _pack(folder: Path, archive: Path) -> None:
-    with _PACKING:  # two who ask for the same would write to the same
+    with _PACKING:  # two requests for the same run would write the same file
         if archive.is_file():
             return
         with atomic_path(archive) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as opened:
@@ -191,16 +191,16 @@ def _pack(folder: Path, archive: Path) -> None:
 def _find_run(request: Request) -> Path:
     run = request.state.session.find_place(request.path_params["set"]) / "runs" / str(read_number(request, "run"))
     if not (run / "view" / "view.json").is_file():
-        raise InputError("that run is no longer here; start it again")
+        raise InputError("that run was removed; start it again")
     return run
 
 
 ROUTES = [
-    Route("/sets", new, methods=["POST"]),
+    Route("/sets", make_set, methods=["POST"]),
     Route("/sets/{set}/uploads/{name}", upload, methods=["PUT"]),
-    Route("/sets/{set}/mask", paint, methods=["PUT"]),
-    Route("/sets/{set}/start/{task}", start, methods=["POST"]),
-    Route("/sets/{set}/files/{path:path}", file),
-    Route("/sets/{set}/runs/{run}/pixel", pixel),
-    Route("/sets/{set}/runs/{run}/download", download),
+    Route("/sets/{set}/mask", upload_mask, methods=["PUT"]),
+    Route("/sets/{set}/start/{task}", start_task, methods=["POST"]),
+    Route("/sets/{set}/files/{path:path}", send_file),
+    Route("/sets/{set}/runs/{run}/pixel", send_pixel),
+    Route("/sets/{set}/runs/{run}/download", send_archive),
 ]

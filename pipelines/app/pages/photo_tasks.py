@@ -1,10 +1,12 @@
-"""What the worker does with photographs: the example, the checks, an inference and what the page shows of it.
+"""What the worker does with photographs: the example, the checks, an inference and the files the page shows.
 
 A set of photographs is a folder with `photos` (what was uploaded), `painted.png` (a mask painted on the page), `view`
 (thumbnails) and `runs/<number>`, each with `files` (what `sdps infer` writes) and `view`.
 """
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from pipelines.app.pages import object_view
 from pipelines.shared import pictures
 from render.shared.errors import InputError
 from render.shared.files import write_json
-from render.shared.progress import stage, together
+from render.shared.progress import share_out, stage
 
 PHOTOS, VIEW, PAINTED, TRUTH = "photos", "view", "painted.png", "truth.npy"
 _EXAMPLE = {"shape": "bunny", "material": "red-phenolic", "lights": "near-uniform:48", "size": 256, "spp": 32}
@@ -28,7 +30,7 @@ _INFERRING = {
 """Stages and about how long each takes with the recommended method."""
 
 
-def example(place: str) -> dict[str, Any]:
+def render_example(place: str) -> dict[str, Any]:
     """Render the bunny under 48 lights of unequal strength as 16-bit photographs with a mask; then check them."""
     import render
     from pipelines.evaluate.workbench import write_photographs
@@ -48,18 +50,18 @@ def check(place: str, **options: Any) -> dict[str, Any]:
 
     Args:
         place: The set's folder.
-        options: `gamma`, `frame`, `lights` (use those beside the photographs).
+        options: `gamma`, `frame`, `lights` (use the lights file among the photographs).
 
     Returns:
         What the page shows.
 
     Raises:
-        InputError: photographs that cannot be used; paths are told from the set's folder.
+        InputError: photographs that cannot be used; paths are relative to the set's folder.
     """
     from sdps import photos as photographs
 
     folder = Path(place)
-    with together(_CHECKING), _ShortPaths(folder):
+    with share_out(_CHECKING), _shorten_paths(folder):
         stage("reading")
         photos = _load(folder, anyway=True, **options)
         stage("checks")
@@ -95,7 +97,7 @@ def list_methods(lit: bool) -> list[dict[str, str]]:
     from sdps.models.registry import COMBINATIONS
 
     there = sdps.available_methods()
-    found = [{"name": "auto", "about": "the best there is for these photographs (recommended)"}]
+    found = [{"name": "auto", "about": "the best method for these photographs (recommended)"}]
     for name, about in there.items():
         combined = name in COMBINATIONS
         classical = name in METHODS and METHODS[name].calibrated == lit
@@ -128,7 +130,7 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
     run = folder / "runs" / str(number)
     _remove_failed_runs(run)
     shares = _INFERRING | ({"refinement": 40.0} if refine or method.endswith("+refine") else {})
-    with together(shares), _ShortPaths(folder):
+    with share_out(shares), _shorten_paths(folder):
         stage("reading")
         photos = _load(folder, anyway=anyway, **options)
         result = sdps.infer(
@@ -144,14 +146,14 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
 
 
 def _remove_failed_runs(run: Path) -> None:
-    """Remove what earlier runs left that failed or were cancelled; this one's number is above theirs."""
+    """Remove files of earlier runs that failed or were cancelled; this run has the highest number."""
     for old in run.parent.glob("*"):
         if int(old.name) < int(run.name) and not (old / VIEW / "view.json").is_file():
             shutil.rmtree(old, ignore_errors=True)
 
 
 def _measure_error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float | None:
-    """Return the mean angular error in degrees where the truth is known, which it is of the example."""
+    """Return the mean angular error in degrees if the truth is known, as for the example."""
     if not (folder / TRUTH).is_file():
         return None
     from sdps.core.metrics import normal_mae
@@ -175,7 +177,7 @@ def _load(
 
 
 def _has_lights(folder: Path) -> bool:
-    """Tell whether there is a file of lights; of several, `_load` says so."""
+    """Return whether there is a lights file; if there are several, `_load` reports that."""
     from sdps.photos.light_files import find_lights
 
     try:
@@ -190,16 +192,11 @@ def _save(path: Path, picture: np.ndarray, side: int) -> None:
     image.save(path, quality=88)
 
 
-class _ShortPaths:
-    """Take the temporary folder out of what an error says."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, InputError):
-            text = str(error).replace(f"{self.folder / PHOTOS}/", "").replace(str(self.folder / PHOTOS), "photographs")
-            raise InputError(text.replace(f"{self.folder}/", "")) from error
+@contextmanager
+def _shorten_paths(folder: Path) -> Iterator[None]:
+    """Remove the temporary folder from error messages."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error).replace(f"{folder / PHOTOS}/", "").replace(str(folder / PHOTOS), "photographs")
+        raise InputError(text.replace(f"{folder}/", "")) from error

@@ -9,7 +9,8 @@ them). With n . l and n . v held above the least cosine, and p the larger of the
     tilt     sqrt(1 - n . h)                        from 0 to 1
     across   l . v                                  from 0 to 1
 
-which makes reflectance smooth between entries: where it has edges (balance 0, azimuth 0), there are entries.
+which makes reflectance smooth between entries: where it has edges (balance 0, azimuth 0), there are entries. Terms of G
+in the tilt have a table of their own, so no term may mix it with the other angles.
 """
 
 from typing import Any
@@ -45,26 +46,21 @@ def build_tables(lobes: dict[str, Any]) -> tuple[dict[str, Any], bytes]:
         (*GLOSSY, 2) of S of strength 1 and of what the tilt adds to log G.
     """
     body, modes, amplitudes, sharpness = (np.array(lobes[name]) for name in _NUMBERS)
-    around = _list_matte_angles()
-    matte = np.stack([np.log(evaluate_body(around, body)), evaluate_log_factor(around, modes)], axis=-1)
-    tilts, across = (part.reshape(1, -1) for part in np.meshgrid(*(np.linspace(0, 1, size) for size in GLOSSY[::-1])))
-    nothing = np.zeros_like(tilts)
-    above = Angles(nothing, nothing, nothing, tilts**2, across)
-    shine = evaluate_lobes(above, np.ones(1), amplitudes, sharpness)
-    glossy = np.stack([shine, evaluate_log_factor(above, modes)], axis=-1)
+    angles = _list_matte_angles()
+    matte = np.log(evaluate_body(angles, body)), evaluate_log_factor(angles, modes)
+    across, tilt = np.meshgrid(*(np.linspace(0, 1, size) for size in GLOSSY), indexing="ij")
+    nothing = np.zeros_like(tilt)
+    angles = Angles(nothing, nothing, nothing, tilt**2, across)
+    glossy = evaluate_lobes(angles, np.ones(1), amplitudes, sharpness), evaluate_log_factor(angles, modes)
     about = {"least": LEAST_COSINE, "limit": MOST_LOG_FACTOR, "matte": list(MATTE), "glossy": list(GLOSSY)}
-    return about, b"".join(part.astype("<f4").tobytes() for part in (matte, glossy))
+    return about, b"".join(np.stack(pair, axis=-1).astype("<f4").tobytes() for pair in (matte, glossy))
 
 
-def _list_matte_angles() -> Angles:
-    """Return the angles of the entries of the first table, at tilt 0; (1, entries)."""
-    azimuth, balance, slant = (
-        axis.reshape(1, -1)
-        for axis in np.meshgrid(
-            np.linspace(-1, 1, MATTE[0]), np.linspace(-1, 1, MATTE[1]),
-            np.linspace(0, np.arccosh(1 / LEAST_COSINE), MATTE[2]), indexing="ij",
-        )
-    )  # fmt: skip
+def _list_matte_angles() -> Angles:  # (*MATTE)
+    """Return the angles of the entries of the first table, at tilt 0."""
+    ranges = (-1, 1), (-1, 1), (0, np.arccosh(1 / LEAST_COSINE))
+    axes = [np.linspace(*ends, size) for ends, size in zip(ranges, MATTE, strict=True)]
+    azimuth, balance, slant = np.meshgrid(*axes, indexing="ij")
     more = 1 / np.cosh(slant)
     less = LEAST_COSINE + (more - LEAST_COSINE) * (1 - np.abs(balance))
     light, view = np.where(balance > 0, more, less), np.where(balance > 0, less, more)

@@ -1,4 +1,4 @@
-"""The room "Studio": scenes, uploads of meshes and materials, and files to keep."""
+"""The page "Studio": scenes, uploads of meshes and materials, and files to keep."""
 
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,13 @@ from render.shared.errors import unknown
 
 UPLOADS = "uploads"
 MESHES, MATERIALS = (".ply", ".obj", ".stl", ".off", ".glb"), (".yaml", ".yml", ".binary", ".bsdf", ".zip")
-_ROOM = "studio"
+_PAGE = "studio"
 _ASKED = ("shape", "material", "yaw", "pitch", "roll", "bounces", "size", "direct")
 _TASKS = ("gallery", "scene", "keep", "preset")
 _MOST = 20
 
 
-async def start(request: Request) -> Response:
+async def start_task(request: Request) -> Response:
     """Queue a task: the gallery, a scene, its files or a preset of such scenes."""
     task = request.path_params["task"]
     if task not in _TASKS:
@@ -31,7 +31,7 @@ async def start(request: Request) -> Response:
     arguments: dict[str, Any] = {}
     if task != "gallery":
         asked = await uploads.read_settings(request.stream())
-        place = make_tab_folder(request, _ROOM)
+        place = make_tab_folder(request, _PAGE)
         arguments = {"place": str(place)} | {name: asked[name] for name in _ASKED if name in asked}
         if task != "scene":
             arguments.pop("direct", None)
@@ -40,7 +40,7 @@ async def start(request: Request) -> Response:
 
 @accept_uploads
 async def upload(request: Request) -> Response:
-    """Take a mesh, a material file, or a ZIP of PBR maps, which becomes a folder."""
+    """Receive a mesh, a material file, or a ZIP of PBR maps, which becomes a folder."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
     folder = session.folder / UPLOADS
@@ -55,24 +55,24 @@ async def upload(request: Request) -> Response:
 
 
 def _accept(coming: Incoming, path: Path, target: Path, limits: Limits) -> None:
-    """Put what was uploaded where the studio looks for it, in place of what had the same name."""
+    """Move an upload to where the studio looks for it, replacing what has the same name."""
     if path.suffix.lower() == ".zip":
         archive, path = path, coming.folder / "maps"
         unpack(archive, path, limits, coming)
     coming.put(path, target, _MOST)
 
 
-async def file(request: Request) -> Response:
-    """Send what was made of the tab's last scene."""
+async def send_file(request: Request) -> Response:
+    """Send a file of the tab's last scene."""
     name = request.path_params["name"]
-    path = find_tab_folder(request, _ROOM) / name
+    path = find_tab_folder(request, _PAGE) / name
     if name not in ("basis.bin", "truth.bin", "direct.bin", "scene.zip") or not path.is_file():
         return JSONResponse({"message": "no such file"}, 404)
     return FileResponse(path, filename=name if name.endswith(".zip") else None)
 
 
 ROUTES = [
-    Route("/start/{task}", start, methods=["POST"]),
+    Route("/start/{task}", start_task, methods=["POST"]),
     Route("/uploads/{name}", upload, methods=["PUT"]),
-    Route("/files/{name}", file),
+    Route("/files/{name}", send_file),
 ]

@@ -26,7 +26,7 @@ UPLOADS = "uploads"
 _LIGHTS, _SPP, _SIZES = "near-uniform:60", 8, (128, 256)
 _FINAL_SPP = 64
 _HEADROOM = 4.0
-"""Largest radiance that is sent, with the brightest 5 % of the object at 0.8; highlights above it are clipped."""
+"""Largest radiance that is sent, with the brightest 5 % of the object at 0.8; brighter highlights are clipped."""
 _SHAPE = re.compile(r"sphere|bunny|(blobby|sculpture):\d{1,9}")
 _MATERIAL = re.compile(r"[a-z0-9:.+-]+|lambertian:[0-9.]+(/[0-9.]+){0,2}")
 _FILES = re.compile(r"\.(ya?ml|binary|bsdf)\b|\b(maps|uv):")
@@ -34,7 +34,7 @@ _TILE = 56
 _SEEDED = ("blobby", "sculpture")
 
 
-def gallery() -> dict[str, Any]:
+def render_gallery() -> dict[str, Any]:
     """Return the built-in materials by category and a strip of spheres, rendered once and kept in the user's cache."""
     import render
     from render.materials import library
@@ -54,7 +54,7 @@ def gallery() -> dict[str, Any]:
     return {"groups": groups, "tile": _TILE, "picture": pictures.data_uri(Image.open(picture))}
 
 
-def scene(place: str, direct: bool = False, **asked: Any) -> dict[str, Any]:
+def render_scene(place: str, direct: bool = False, **asked: Any) -> dict[str, Any]:
     """Render a scene for the page.
 
     Args:
@@ -86,7 +86,7 @@ def write_basis(
     folder: Path, images: np.ndarray, lights: np.ndarray, normals: np.ndarray, depth: np.ndarray, mask: np.ndarray,
     exposure: float,
 ) -> dict[str, Any]:  # fmt: skip
-    """Write what the page mixes a picture from, and return the rest.
+    """Write the images that the page mixes, and return what else it needs.
 
     `basis.bin`: uint8 images (L, h, w, 3), round(255 sqrt(radiance * exposure / 4)), then `truth.bin`: int8 normals
     (h, w, 3), n * 127, and uint8 depth (h, w), 1 to 255 from far to near, 0 outside the mask.
@@ -105,13 +105,13 @@ def write_basis(
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file at once, since the server may be sending the last scene's at this moment."""
+    """Replace a file in one step, since the server may be sending the last scene's."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
 def triangulate(lights: np.ndarray) -> list[list[int]]:
-    """Return triangles of neighbouring lights (L, 3), by their numbers; none where all lie on a line."""
+    """Return triangles of neighbouring lights (L, 3), by their numbers; none if all are on a line."""
     try:
         return Delaunay(lights[:, :2] / (1.0 + lights[:, 2:])).simplices.tolist()
     except (ValueError, RuntimeError):  # QhullError is a RuntimeError
@@ -119,18 +119,18 @@ def triangulate(lights: np.ndarray) -> list[list[int]]:
 
 
 def prepare_shard(place: str, shard: str) -> dict[str, Any]:
-    """Prepare a shard for the page, as `scene` does with what it renders."""
+    """Prepare a shard for the page, as `render_scene` does with what it renders."""
     read: Shard = read_shard(Path(shard))
     images = read.images.astype(np.float32)
     exposure = pictures.auto_exposure(images, read.mask)
     return write_basis(Path(place), images, read.light_directions, read.normals, read.depth, read.mask, exposure)
 
 
-def keep(place: str, **asked: Any) -> str:
-    """Render the scene well and pack shard, preset and the program that repeats it; return the name of the ZIP.
+def pack_scene(place: str, **asked: Any) -> str:
+    """Render the scene with little noise and pack shard, preset and a program that repeats it; return the ZIP's name.
 
     Raises:
-        InputError: as `scene`.
+        InputError: as `render_scene`.
     """
     import render
 
@@ -162,7 +162,7 @@ def make_training_preset(place: str, **asked: Any) -> str:
     """Return the YAML of a preset that trains on such scenes: many shapes of the family in this material.
 
     Raises:
-        InputError: a shape that belongs to no family.
+        InputError: a shape that does not belong to a family.
     """
     spec = check_choice(Path(place), **asked)
     family = spec["shape"].split(":")[0]
@@ -176,10 +176,10 @@ def make_training_preset(place: str, **asked: Any) -> str:
 
 
 def check_choice(place: Path, **asked: Any) -> dict[str, Any]:
-    """Return the shape, material and pose that were asked for, checked; uploads are files of the scene's folder.
+    """Check and return the chosen shape, material and pose; names of uploads become paths.
 
     Raises:
-        InputError: a name that is none, or a number out of range.
+        InputError: an unknown name, or a number out of range.
     """
     shape, material = str(asked.get("shape", "")), str(asked.get("material", ""))
     loaded = {path.name: str(path) for path in (place.parent / UPLOADS).glob("*")}
@@ -188,15 +188,15 @@ def check_choice(place: Path, **asked: Any) -> dict[str, Any]:
     if material not in loaded and (not _MATERIAL.fullmatch(material) or _FILES.search(material)):
         raise InputError(f"material {material[:60]!r}: give a name, lambertian:<albedo> or a pattern, or load a file")
     if Path(loaded.get(shape, "")).is_dir() and shape in loaded:
-        raise InputError(f"shape {shape[:60]!r}: is a folder of maps; use it as a material, and load a mesh")
+        raise InputError(f"shape {shape[:60]!r}: is a folder of maps; choose a shape or load a mesh")
     shape, material = loaded.get(shape, shape), loaded.get(material, material)
     try:
         turn = [float(asked.get(name, 0.0)) for name in ("yaw", "pitch", "roll")]
         bounces, size = int(asked.get("bounces", 1)), int(asked.get("size", 256))
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError("the pose, bounces and size must be numbers") from error
+        raise InputError("yaw, pitch, roll, bounces and size: must be numbers") from error
     if not np.isfinite(turn).all() or not 0 <= bounces <= 8 or size not in _SIZES:
-        raise InputError("bounces must be 0 to 8 and the size 128 or 256")
+        raise InputError("bounces: must be 0 to 8, and size 128 or 256")
     rotation = Rotation.from_euler("yxz", turn, degrees=True).as_matrix().round(9).tolist()
     return {"shape": shape, "material": material, "rotation": rotation, "bounces": bounces, "size": size}
 

@@ -1,6 +1,6 @@
-// The room "Data and runs".
+// The page "Data and runs".
 
-import { $, ask, element, follow, own, showError } from "./jobs.js";
+import { $, ask, element, follow, inTab, showError } from "./jobs.js";
 import { LightStage } from "./light_stage.js";
 import { LightPad } from "./relight.js";
 
@@ -9,7 +9,7 @@ const query = (path, values = {}) => `/data/${path}?${new URLSearchParams({ fold
 
 async function begin() {
   const { root, rows } = await ask("/data/list");
-  $("root").textContent = rows.length ? `What lies in ${root}.` : `There is no data folder and no run in ${root}. Render some (sdps render-data), or name another folder: sdps app FOLDER.`;
+  $("root").textContent = rows.length ? `Contents of ${root}.` : `${root} contains neither data folders nor runs. Render scenes (sdps render-data), or choose another folder: sdps app FOLDER.`;
   $("folders").replaceChildren(...rows.map(({ folder, kind }) => {
     const button = element("button", { type: "button", "aria-pressed": "false" }, `${kind}: ${folder === "." ? root.split("/").pop() || root : folder}`);
     button.addEventListener("click", () => {
@@ -25,27 +25,27 @@ async function open(folder, kind) {
   clearTimeout(state.timer);
   for (const id of ["scenes", "curves", "results", "status", "lamp-card", "lamp-status"]) $(id).hidden = true;
   try {
-    if (kind === "data") await scenes();
-    else { await curves(folder); await results(); }
+    if (kind === "data") await showScenes();
+    else { await showCurves(folder); await showResults(); }
   } catch (error) { showError($("status"), error); }
 }
 
 // ---- Scenes ----
 
-async function scenes() {
+async function showScenes() {
   state.rows = await ask(query("scenes"));
   state.shown = 60;
   const count = (name) => state.rows.filter((row) => row.state === name).length;
   const facts = [`${state.rows.length} scenes`, `${count("rendered")} rendered`, `${count("planned")} to render`, `${count("failed")} failed`];
   $("counts").replaceChildren(...facts.map((text) => element("span", {}, text)));
   $("scenes").hidden = false;
-  tiles();
+  drawTiles();
 }
 
-function matching() {
+function listMatching() {
   const words = $("find").value.toLowerCase().split(/\s+/).filter(Boolean), key = $("sort").value;
   const rows = state.rows.filter((row) => words.every((word) => `${row.id} ${row.shape} ${row.material} ${row.split} ${row.state}`.toLowerCase().includes(word)));
-  const order = { failed: 0, rendered: 1, planned: 2 }, planned = (row) => row.state === "planned"; // what can be seen comes first
+  const order = { failed: 0, rendered: 1, planned: 2 }, planned = (row) => row.state === "planned"; // scenes with a picture come first
   return rows.sort((one, two) => planned(one) - planned(two) || (key === "radiance" ? (two.radiance ?? -1) - (one.radiance ?? -1)
     : key === "state" ? order[one.state] - order[two.state] : one[key].localeCompare(two[key], "en", { numeric: true })));
 }
@@ -65,54 +65,54 @@ async function fill(row, figure) {
   figure.querySelector(".note").textContent = (row.radiance ?? null) === null ? row.reason || row.state : `mean radiance ${row.radiance.toFixed(3)}`;
 }
 
-function tiles() {
-  const rows = matching(), some = rows.slice(0, state.shown);
+function drawTiles() {
+  const rows = listMatching(), some = rows.slice(0, state.shown);
   $("tiles").replaceChildren(...some.map((row) => {
     const button = element("button", { type: "button", class: "scene", disabled: row.state !== "rendered" },
       element("img", { alt: "", width: 384, height: 96 }), element("span", {}, `${row.id}: ${row.shape}, ${row.material} (${row.split})`), element("span", { class: "note" }, row.reason || row.state));
     button.row = row;
-    button.addEventListener("click", () => light(row));
+    button.addEventListener("click", () => showUnderLamp(row));
     seen.observe(button);
     return button;
   }));
   $("more").hidden = rows.length <= state.shown;
 }
 
-async function light(row) {
+async function showUnderLamp(row) {
   try {
-    const about = await follow(await ask(own(query("start", { id: row.id })), { method: "POST" }), $("lamp-status"), "Scene");
+    const about = await follow(await ask(inTab(query("start", { id: row.id })), { method: "POST" }), $("lamp-status"), "Scene");
     if (!about) return;
-    const [basis, truth] = await Promise.all(["basis.bin", "truth.bin"].map(async (name) => (await fetch(own(`/data/files/${name}`))).arrayBuffer()));
+    const [basis, truth] = await Promise.all(["basis.bin", "truth.bin"].map(async (name) => (await fetch(inTab(`/data/files/${name}`))).arrayBuffer()));
     state.stage = new LightStage(basis, truth, about);
     $("lamp-title").textContent = `${row.id}: ${row.shape}, ${row.material}`;
     $("lamp-card").hidden = false;
     $("scrub").max = about.lights.length - 1;
     state.pad = new LightPad($("lamp"), $("view"), (direction) => state.stage.draw($("view"), direction, $("overlay").value), about.lights);
-    scrub();
+    showLight();
     $("lamp-card").scrollIntoView({ behavior: "smooth", block: "center" });
   } catch (error) { showError($("lamp-status"), error); }
 }
 
-function scrub() {
+function showLight() {
   const number = Number($("scrub").value), [x, y, z] = state.stage.about.lights[number];
   state.pad.set(x, y);
-  $("scrub-note").textContent = `Light ${number + 1} of ${state.stage.about.lights.length}: ${[x, y, z].map((v) => v.toFixed(3)).join(", ")}. Between the lights, images are mixed.`;
+  $("scrub-note").textContent = `Light ${number + 1} of ${state.stage.about.lights.length}: ${[x, y, z].map((v) => v.toFixed(3)).join(", ")}. Between the lights, images are blended.`;
 }
 
 // ---- Learning curves ----
 
 const COLOURS = ["#3b6fb6", "#d2691e", "#2e8b57", "#a03070", "#7a6a00", "#606060"];
 
-async function curves(folder) {
+async function showCurves(folder) {
   const models = await ask(query("curves"));
   if (state.folder !== folder) return;
   const keys = [...new Set(Object.values(models).flatMap((series) => Object.keys(series)))].sort();
   $("curves").hidden = !keys.length;
-  $("charts").replaceChildren(...keys.map((key) => chart(key, Object.entries(models).filter(([, series]) => series[key]).map(([name, series]) => [name, series[key]]))));
-  state.timer = setTimeout(() => { if (state.folder === folder && !document.hidden) curves(folder).catch(() => {}); else state.timer = setTimeout(() => curves(folder), 5000); }, 5000);
+  $("charts").replaceChildren(...keys.map((key) => drawChart(key, Object.entries(models).filter(([, series]) => series[key]).map(([name, series]) => [name, series[key]]))));
+  state.timer = setTimeout(() => { if (state.folder === folder && !document.hidden) showCurves(folder).catch(() => {}); else state.timer = setTimeout(() => showCurves(folder), 5000); }, 5000);
 }
 
-function chart(key, lines) {
+function drawChart(key, lines) {
   const points = lines.flatMap(([, values]) => values), most = Math.max(...points.map(([step]) => step), 1);
   const high = Math.max(...points.map(([, v]) => v)), low = Math.min(0, ...points.map(([, v]) => v)), x = (s) => 12 + 86 * s / most, y = (v) => 54 - 50 * (v - low) / Math.max(high - low, 1e-9);
   const text = (at, up, words, anchor) => element("text", { x: at, y: up, "font-size": 3.6, "text-anchor": anchor, fill: "currentColor" }, words);
@@ -125,15 +125,15 @@ function chart(key, lines) {
 
 // ---- Results ----
 
-async function results() {
+async function showResults() {
   const sections = await ask(query("sections"));
   $("results").hidden = !sections.length;
-  $("tables").replaceChildren(...sections.map((section) => element("article", {}, element("h3", {}, section.title), element("p", { class: "note" }, section.text), ...section.tables.map(table),
+  $("tables").replaceChildren(...sections.map((section) => element("article", {}, element("h3", {}, section.title), element("p", { class: "note" }, section.text), ...section.tables.map(buildTable),
     ...section.strips.map((strip) => element("figure", {}, element("figcaption", {}, strip.title), element("div", { class: "thumbs", tabindex: 0, role: "group", "aria-label": strip.title },
       ...strip.pictures.map(({ file, caption }) => element("figure", { class: "large" }, element("img", { src: query("picture", { section: section.name, file }), alt: caption, loading: "lazy" }), element("figcaption", {}, caption)))))))));
 }
 
-function table({ title, header, rows, note }) {
+function buildTable({ title, header, rows, note }) {
   const body = element("tbody"), number = (text) => Number.parseFloat(text);
   const show = (list) => body.replaceChildren(...list.map((cells) => element("tr", {}, ...cells.map((cell) => element("td", { class: Number.isNaN(number(cell)) ? "" : "number" }, cell)))));
   let last = null;
@@ -154,12 +154,12 @@ function table({ title, header, rows, note }) {
 
 // ---- Wiring ----
 
-$("find").addEventListener("input", () => { state.shown = 60; tiles(); });
+$("find").addEventListener("input", () => { state.shown = 60; drawTiles(); });
 $("sort").addEventListener("change", async () => {
-  if ($("sort").value === "radiance") for (const row of matching().slice(0, 300)) await measure(row);
-  tiles();
+  if ($("sort").value === "radiance") for (const row of listMatching().slice(0, 300)) await measure(row);
+  drawTiles();
 });
-$("more").addEventListener("click", () => { state.shown += 120; tiles(); });
-$("scrub").addEventListener("input", scrub);
+$("more").addEventListener("click", () => { state.shown += 120; drawTiles(); });
+$("scrub").addEventListener("input", showLight);
 $("overlay").addEventListener("change", () => state.pad?.show());
 begin().catch((error) => showError($("status"), error));

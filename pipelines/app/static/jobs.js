@@ -1,4 +1,4 @@
-// What all rooms share: requests, jobs with progress and cancel, small helpers for elements.
+// Shared by all pages: requests, jobs with progress and cancel, small helpers for elements.
 
 export const $ = (id) => document.getElementById(id);
 
@@ -20,8 +20,8 @@ export async function ask(path, options = {}) {
 export const post = (path, value = {}) =>
   ask(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(value) });
 
-// The address of what belongs to this tab alone, such as the scene it shows. Loading the page again keeps the tab's name.
-export function own(path) {
+// The address of a file or task of this tab alone, such as its scene. Reloading the page keeps the tab's name.
+export function inTab(path) {
   const name = sessionStorage.getItem("tab") ?? Math.random().toString(16).slice(2, 14);
   sessionStorage.setItem("tab", name);
   return `${path}${path.includes("?") ? "&" : "?"}tab=${name}`;
@@ -35,7 +35,7 @@ export function showError(box, error) {
 }
 
 const STAGES = {
-  "": "starting", reading: "reading the photographs", checks: "checking them", pictures: "making thumbnails", lights: "finding the lights",
+  "": "starting", reading: "reading the photographs", checks: "checking the photographs", pictures: "making thumbnails", lights: "finding the lights",
   normals: "finding the normals", refinement: "refining", depth: "building the surface", albedo: "finding the colours", surface: "drawing the surface", meshes: "writing meshes",
   "relit pictures": "relighting", page: "writing the report",
 };
@@ -55,7 +55,7 @@ export async function follow(job, box, title) {
   box.setAttribute("role", "status");
   box.replaceChildren(element("div", { class: "row" }, text, cancel), bar, left);
   box.hidden = false;
-  // Nobody waits for a job whose page is gone. A short one that runs may end: to stop it would cost a new worker.
+  // Nobody waits for a job whose page was closed. A short running one may finish: stopping it would cost a new worker.
   const leave = () => { if (job.state === "queued" || job.task === "infer") navigator.sendBeacon(`/jobs/${job.id}/cancel`); };
   addEventListener("pagehide", leave);
   try { return await waited(); } finally { removeEventListener("pagehide", leave); }

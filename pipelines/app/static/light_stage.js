@@ -1,7 +1,7 @@
-// A scene under any light, mixed from images under one light at a time (`studio_tasks.write_basis`).
-// In steps of the light nothing is rendered: the three images around it are mixed by barycentric weights.
+// A scene under any light, blended from images under one light each (`studio_tasks.write_basis`): the three images
+// around the light, with barycentric weights. Nothing is rendered while the light moves.
 
-import { coded } from "./relight.js";
+import { encode } from "./relight.js";
 
 export class LightStage {
   constructor(basis, truth, about) {
@@ -15,7 +15,7 @@ export class LightStage {
     this.places = about.lights.map(([x, y, z]) => [x / (1 + z), y / (1 + z)]);
   }
 
-  // Numbers and weights of the images that make a direction; of directions outside all triangles, the nearest edge.
+  // Numbers and weights of the images to blend for a direction; outside all triangles, those of the nearest edge.
   weights([x, y, z]) {
     const px = x / (1 + z), py = y / (1 + z);
     let best = null, most = -Infinity;
@@ -63,7 +63,7 @@ export class LightStage {
         const shadow = overlay === "shadows" && this.depth[i] && lit < 0.02;
         for (let c = 0; c < 3; c++) {
           const value = inter ? Math.max(0, full[3 * i + c] - direct[3 * i + c]) : full[3 * i + c];
-          data[4 * i + c] = shadow ? [214, 60, 120][c] : coded(scale * value);
+          data[4 * i + c] = shadow ? [214, 60, 120][c] : encode(scale * value);
         }
       }
     }

@@ -1,4 +1,4 @@
-// A mesh that can be turned, by three.js (three.bundle.js; THREE-LICENSE.txt).
+// A mesh that can be rotated, drawn by three.js (three.bundle.js; THREE-LICENSE.txt).
 
 import * as three from "./three.bundle.js";
 

@@ -1,4 +1,4 @@
-// The room "Photographs".
+// The page "Photographs".
 
 import { $, ask, element, follow, post, seconds, showError } from "./jobs.js";
 import { MaskPainter } from "./mask_painter.js";
@@ -20,7 +20,7 @@ async function begin() {
 async function upload(files) {
   const box = $("load-status");
   try {
-    if (!files.length) throw new Error("nothing that can be used was chosen");
+    if (!files.length) throw new Error("none of the chosen files can be used");
     await begin();
     const bar = element("progress", { max: files.length, value: 0, "aria-label": "Uploading" });
     box.className = "status";
@@ -46,9 +46,9 @@ async function example() {
 }
 
 const USABLE = $("files").accept.split(",");
-const usable = (files) => [...files].filter(({ name }) => USABLE.some((suffix) => name.toLowerCase().endsWith(suffix)) && !name.startsWith("."));
+const filterUsable = (files) => [...files].filter(({ name }) => USABLE.some((suffix) => name.toLowerCase().endsWith(suffix)) && !name.startsWith("."));
 
-async function dropped(transfer) {
+async function listDropped(transfer) {
   const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
   const files = [];
   const walk = async (entry) => {
@@ -63,7 +63,7 @@ async function dropped(transfer) {
     }
   };
   for (const entry of entries) await walk(entry);
-  return usable(entries.length ? files : transfer.files);
+  return filterUsable(entries.length ? files : transfer.files);
 }
 
 // ---- Checks and mask ----
@@ -88,13 +88,13 @@ function review(found) {
     element("img", { src: inSet(`files/view/${number}.jpg?${stamp}`), alt: name, loading: "lazy" }), element("figcaption", { title: name }, name))));
   const items = found.findings.map(({ level, text, images }) => element("li", { class: level }, element("b", {}, `${level}: `), text,
     images.length && images.length < found.files.length ? element("span", { class: "note" }, ` (${images.slice(0, 6).join(", ")}${images.length > 6 ? ", ..." : ""})`) : ""));
-  $("findings").replaceChildren(...(items.length ? items : [element("li", {}, "Nothing speaks against these photographs.")]));
+  $("findings").replaceChildren(...(items.length ? items : [element("li", {}, "No problems found.")]));
   $("notes").replaceChildren(...found.notes.map((note) => element("li", {}, note)));
   $("lights-row").hidden = !found.lights_there;
   const chosen = $("method").value;
   $("method").replaceChildren(...found.methods.map(({ name }) => element("option", { value: name }, name === "auto" ? "recommended" : name)));
   if (found.methods.some(({ name }) => name === chosen)) $("method").value = chosen;
-  aboutMethod();
+  describeMethod();
   painter.load(inSet(`files/view/picture.jpg?${stamp}`), inSet(`files/view/mask.png?${stamp}`));
   $("mask-use").disabled = true;
   $("mask-reset").disabled = found.mask !== "painted";
@@ -102,7 +102,7 @@ function review(found) {
   $("review").scrollIntoView({ behavior: "smooth" });
 }
 
-function aboutMethod() { $("method-about").textContent = state.checked.methods.find(({ name }) => name === $("method").value)?.about ?? ""; }
+function describeMethod() { $("method-about").textContent = state.checked.methods.find(({ name }) => name === $("method").value)?.about ?? ""; }
 
 async function sendMask(blob) {
   try {
@@ -140,8 +140,8 @@ async function show(run) {
     return button;
   }));
   const facts = [`method: ${run.method}`, `${seconds(run.seconds)}`, `${run.components} part${run.components > 1 ? "s" : ""}`, `integrability: ${run.integrability}°`];
-  if (run.residual !== null) facts.push(`off Lambert's law: ${run.residual}`);
-  if (run.error !== null) facts.push(`normals off the truth: ${run.error}°`);
+  if (run.residual !== null) facts.push(`deviation from Lambert's law: ${run.residual}`);
+  if (run.error !== null) facts.push(`error of the normals: ${run.error}°`);
   $("verdict").hidden = !run.verdict;
   $("verdict").textContent = run.verdict;
   $("run-facts").replaceChildren(...facts.map((text) => element("span", {}, text)), ...(run.terms ? [element("span", {}, `weights: ${run.terms}`)] : []));
@@ -153,20 +153,20 @@ async function show(run) {
   const object = new Reflectance(basis, run, tables);
   if (state.run !== run) return;
   new LightPad($("relit-light"), $("relit"), (light) => object.draw($("relit"), light), run.lights);
-  sphere(run);
+  drawLights(run);
   $("cross").hidden = true;
   $("chart").replaceChildren();
   compare();
   try {
     state.mesh ??= new MeshView($("mesh"));
     await state.mesh.load(inRun("mesh.ply"));
-  } catch (error) { $("mesh").replaceChildren(element("p", { class: "note" }, `No three dimensions here: ${error.message}`)); }
+  } catch (error) { $("mesh").replaceChildren(element("p", { class: "note" }, `The surface cannot be shown here: ${error.message}`)); }
 }
 
-function sphere(run) {
+function drawLights(run) {
   if (!run.lights.length) {
     $("sphere").replaceChildren();
-    $("sphere-note").textContent = "This method finds no lights.";
+    $("sphere-note").textContent = "This method does not find lights.";
     return;
   }
   const strongest = Math.max(...run.intensities);
@@ -179,14 +179,14 @@ function sphere(run) {
     svg.append(element("circle", { class: "light", cx: x, cy: -y, r: 0.02 + 0.03 * Math.sqrt(part), fill: `hsl(${45 - 20 * (1 - part)} 95% ${35 + 25 * part}%)`, stroke: "currentColor", "stroke-width": 0.008, "fill-opacity": 0.25 + 0.75 * Math.min(1, sure) }, element("title", {}, text)));
   });
   $("sphere").replaceChildren(svg);
-  $("sphere-note").textContent = `Seen from the camera; rings at 30° and 60°. Larger: stronger.${run.confidence.length ? " Fainter: less sure." : ""}`;
+  $("sphere-note").textContent = `Seen from the camera; rings at 30° and 60°. Larger: stronger.${run.confidence.length ? " Fainter: less certain." : ""}`;
 }
 
 // ---- A pixel's intensities ----
 
 let pixel = null, asking = false;
 
-function point(event) {
+function inspectPointed(event) {
   const image = $("normals"), box = image.getBoundingClientRect(), { width, height } = state.run;
   const scale = Math.min(box.width / width, box.height / height);
   const column = Math.floor((event.clientX - box.left - (box.width - width * scale) / 2) / scale);
@@ -205,20 +205,20 @@ async function inspect(row, column) {
   try {
     do {
       const [wanted, run] = [pixel, state.run];
-      chart(await ask(inSet(`runs/${run.number}/pixel?row=${wanted[0]}&column=${wanted[1]}`)), wanted, run);
+      drawChart(await ask(inSet(`runs/${run.number}/pixel?row=${wanted[0]}&column=${wanted[1]}`)), wanted, run);
       if (wanted === pixel) break;
     } while (true);
-  } catch { /* a run that is gone */ }
+  } catch { /* the run was removed */ }
   asking = false;
 }
 
-function chart({ observed, model }, [row, column], run) {
+function drawChart({ observed, model }, [row, column], run) {
   const most = Math.max(...observed, ...(model ?? []), 1e-6), x = (i) => 4 + 92 * i / Math.max(1, observed.length - 1), y = (v) => 56 - 52 * v / most;
   const svg = element("svg", { viewBox: "0 0 100 62", role: "img", "aria-label": `Intensities of pixel row ${row * run.step}, column ${column * run.step}` }, element("line", { x1: 4, x2: 96, y1: 56, y2: 56, stroke: "currentColor", "stroke-width": 0.3 }));
   if (model) svg.append(element("polyline", { points: model.map((v, i) => `${x(i)},${y(v)}`).join(" "), fill: "none", stroke: "var(--accent)", "stroke-width": 0.7 }));
   observed.forEach((v, i) => svg.append(element("circle", { cx: x(i), cy: y(v), r: 0.9, fill: "#e0702c" }, element("title", {}, `${run.files[i]}: ${v.toFixed(4)}`))));
   $("chart").replaceChildren(svg);
-  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: ${run.tables ? "the refined model" : "Lambert's law"} on what was found. ` : ""}Highest: ${most.toFixed(3)}.`;
+  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: ${run.tables ? "the refined model" : "Lambert's law"} for what was found. ` : ""}Highest: ${most.toFixed(3)}.`;
 }
 
 // ---- Comparison ----
@@ -248,11 +248,11 @@ function divide() {
 
 $("choose-files").addEventListener("click", () => $("files").click());
 $("choose-folder").addEventListener("click", () => $("folder").click());
-for (const id of ["files", "folder"]) $(id).addEventListener("change", () => { const chosen = usable($(id).files); $(id).value = ""; upload(chosen); });
+for (const id of ["files", "folder"]) $(id).addEventListener("change", () => { const chosen = filterUsable($(id).files); $(id).value = ""; upload(chosen); });
 $("example").addEventListener("click", example);
 $("drop").addEventListener("dragover", (event) => { event.preventDefault(); $("drop").classList.add("over"); });
 $("drop").addEventListener("dragleave", () => $("drop").classList.remove("over"));
-$("drop").addEventListener("drop", async (event) => { event.preventDefault(); $("drop").classList.remove("over"); upload(await dropped(event.dataTransfer)); });
+$("drop").addEventListener("drop", async (event) => { event.preventDefault(); $("drop").classList.remove("over"); upload(await listDropped(event.dataTransfer)); });
 for (const [id, adding] of [["brush-add", true], ["brush-take", false]]) $(id).addEventListener("click", () => {
   painter.adding = adding;
   $("brush-add").setAttribute("aria-pressed", adding);
@@ -261,15 +261,15 @@ for (const [id, adding] of [["brush-add", true], ["brush-take", false]]) $(id).a
 $("brush-size").addEventListener("input", () => { painter.radius = Number($("brush-size").value); });
 $("mask-use").addEventListener("click", async () => sendMask(await painter.blob()));
 $("mask-reset").addEventListener("click", () => sendMask(new Blob([])));
-$("method").addEventListener("change", aboutMethod);
+$("method").addEventListener("change", describeMethod);
 for (const id of ["gamma", "lights", "frame"]) $(id).addEventListener("change", () => { if (id !== "frame" || $("lights").checked) check(); });
 $("form").addEventListener("submit", infer);
 const hover = $("normals").parentElement;
 hover.tabIndex = 0;
 hover.setAttribute("role", "group");
 hover.setAttribute("aria-label", "Pixels of the normal map; arrow keys move");
-hover.addEventListener("pointermove", point);
-hover.addEventListener("pointerdown", point);
+hover.addEventListener("pointermove", inspectPointed);
+hover.addEventListener("pointerdown", inspectPointed);
 hover.addEventListener("keydown", (event) => {
   const step = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] }[event.key];
   if (!step) return;

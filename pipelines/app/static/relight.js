@@ -1,16 +1,16 @@
-// Objects under a light that is dragged: the pad that chooses the direction, and two ways to make the picture.
+// Objects under a light that is dragged: the pad that chooses its direction, and the picture of an object.
 // Frame: x right, y up, z to the camera; a light vector points from the surface to the light.
 
 import { element } from "./jobs.js";
 
-const CURVE = new Uint8ClampedArray(4096); // linear radiance, 1 = 4095, as sRGB's 8 bits
+const SRGB = new Uint8ClampedArray(4096); // linear radiance, 1 = 4095, as sRGB's 8 bits
 for (let i = 0; i < 4096; i++) {
   const v = i / 4095;
-  CURVE[i] = Math.round(255 * (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055));
+  SRGB[i] = Math.round(255 * (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055));
 }
-export const coded = (v) => CURVE[v >= 1 ? 4095 : v <= 0 ? 0 : (v * 4095 + 0.5) | 0];
+export const encode = (v) => SRGB[v >= 1 ? 4095 : v <= 0 ? 0 : (v * 4095 + 0.5) | 0];
 
-// A disc of directions, with two sliders for the keyboard. `surface`: a picture on which dragging works as well.
+// A disc of directions, with two sliders for the keyboard. `surface`: a picture on which dragging works too.
 export class LightPad {
   constructor(box, surface, changed, marks = []) {
     this.changed = changed;
@@ -91,7 +91,7 @@ export class Reflectance {
       const nz = n[p + 2] / 32767, cosine = (n[p] * lx + n[p + 1] * ly) / 32767 + nz * lz;
       if (cosine <= 0) continue;
       const [body, lobes] = this.matte ? this.reflect(cosine, nz, lz) : [1, 0], gloss = shine * this.strength[i] * lobes;
-      for (let c = 0; c < 3; c++) data[4 * i + c] = coded((peak * a[p + c] * body + gloss) * cosine);
+      for (let c = 0; c < 3; c++) data[4 * i + c] = encode((peak * a[p + c] * body + gloss) * cosine);
     }
     context.putImageData(image, 0, 0);
   }
@@ -103,8 +103,8 @@ export class Reflectance {
     const slant = Math.acosh(1 / more) / Math.acosh(1 / least), balance = more > least ? (l - v) / (more - least) : 0;
     const azimuth = (across - l * v) / Math.sqrt(Math.max((1 - l * l) * (1 - v * v), 1e-12));
     const tilt = Math.sqrt(Math.max(0, 1 - (cosine + facing) / Math.sqrt(2 + 2 * across)));
-    between(around, this.matte, matte, (azimuth + 1) / 2, (balance + 1) / 2, slant);
-    between(above, this.glossy, glossy, 0, across, tilt);
+    interpolate(around, this.matte, matte, (azimuth + 1) / 2, (balance + 1) / 2, slant);
+    interpolate(above, this.glossy, glossy, 0, across, tilt);
     const factor = Math.exp(Math.min(limit, Math.max(-limit, around[1] + above[1])));
     return [factor * Math.exp(around[0]), factor * above[0]];
   }
@@ -114,7 +114,7 @@ const around = new Float64Array(2), above = new Float64Array(2);
 
 // The two values that a table holds at a place, linear between its entries, into `found`; shares of the way along the
 // axes, the last of which runs fastest.
-function between(found, table, sizes, outer, middle, inner) {
+function interpolate(found, table, sizes, outer, middle, inner) {
   const depth = sizes.length === 3 ? sizes[0] - 1 : 0, rows = sizes.at(-2) - 1, columns = sizes.at(-1) - 1;
   const z = depth * Math.min(1, Math.max(0, outer)), y = rows * Math.min(1, Math.max(0, middle)), x = columns * Math.min(1, Math.max(0, inner));
   const k = Math.min(z | 0, Math.max(depth - 1, 0)), j = Math.min(y | 0, rows - 1), i = Math.min(x | 0, columns - 1);

@@ -1,18 +1,18 @@
-// The room "Studio".
+// The page "Studio".
 
-import { $, ask, element, follow, own, post, showError } from "./jobs.js";
+import { $, ask, element, follow, inTab, post, showError } from "./jobs.js";
 import { LightStage } from "./light_stage.js";
 import { LightPad } from "./relight.js";
 
 let scene = null, pad = null, material = "red-phenolic", mesh = null, wanted = 0, shown = 0, busy = false;
 
-function asked() {
+function readChoice() {
   const shape = $("shape").value, seeded = shape === "blobby" || shape === "sculpture";
   const numbers = Object.fromEntries(["yaw", "pitch", "roll", "bounces"].map((id) => [id, Number($(id).value)]));
   return { shape: shape === "own" ? mesh : seeded ? `${shape}:${$("seed").value}` : shape, material, ...numbers, size: 256 };
 }
 
-// Render what is chosen; while one is rendered, only the latest other choice waits.
+// Render the chosen scene; while one is being rendered, only the latest choice waits.
 async function render() {
   wanted += 1;
   if (busy) return;
@@ -20,9 +20,9 @@ async function render() {
   while (shown !== wanted) {
     const number = wanted;
     try {
-      const began = performance.now(), about = await follow(await post(own("/studio/start/scene"), asked()), $("status"), "Scene");
+      const began = performance.now(), about = await follow(await post(inTab("/studio/start/scene"), readChoice()), $("status"), "Scene");
       if (about) {
-        const [basis, truth] = await Promise.all(["basis.bin", "truth.bin"].map(async (name) => (await fetch(own(`/studio/files/${name}`))).arrayBuffer()));
+        const [basis, truth] = await Promise.all(["basis.bin", "truth.bin"].map(async (name) => (await fetch(inTab(`/studio/files/${name}`))).arrayBuffer()));
         const light = pad?.direction;
         scene = new LightStage(basis, truth, about);
         $("rate").textContent = `${about.name}: rendered in ${((performance.now() - began) / 1000).toFixed(1)} s`;
@@ -33,7 +33,7 @@ async function render() {
     shown = number;
   }
   busy = false;
-  if (["shadows", "interreflections"].includes($("overlay").value)) direct();
+  if (["shadows", "interreflections"].includes($("overlay").value)) renderDirect();
 }
 
 let frames = [];
@@ -45,13 +45,13 @@ function draw(light) {
   $("view").dataset.milliseconds = (frames.reduce((sum, value) => sum + value, 0) / frames.length).toFixed(1);
 }
 
-// The images without interreflections are rendered when an overlay wants them.
-async function direct() {
+// Images without interreflections are rendered when an overlay needs them.
+async function renderDirect() {
   const current = scene;
   if (current && !current.direct && Number($("bounces").value) > 0) {
     try {
-      if (await follow(await post(own("/studio/start/scene"), { ...asked(), direct: true }), $("status"), "Direct light"))
-        current.direct = new Uint8Array(await (await fetch(own("/studio/files/direct.bin"))).arrayBuffer());
+      if (await follow(await post(inTab("/studio/start/scene"), { ...readChoice(), direct: true }), $("status"), "Direct light"))
+        current.direct = new Uint8Array(await (await fetch(inTab("/studio/files/direct.bin"))).arrayBuffer());
     } catch (error) { showError($("status"), error); }
   }
   pad?.show();
@@ -59,7 +59,7 @@ async function direct() {
 
 // ---- Materials ----
 
-async function gallery() {
+async function fillGallery() {
   try {
     const { groups, tile, picture } = await follow(await post("/studio/start/gallery"), $("gallery-status"), "Materials");
     let place = 0;
@@ -71,16 +71,16 @@ async function gallery() {
       return button;
     }));
     $("gallery").replaceChildren(...buttons);
-    mark();
+    markChosen();
   } catch (error) { showError($("gallery-status"), error); }
 }
 
-function mark() { for (const button of $("gallery").children) button.setAttribute("aria-pressed", button.dataset.name === material); }
+function markChosen() { for (const button of $("gallery").children) button.setAttribute("aria-pressed", button.dataset.name === material); }
 
 function choose(name) {
   material = name;
   $("name").value = name;
-  mark();
+  markChosen();
   render();
 }
 
@@ -116,15 +116,15 @@ $("own").addEventListener("submit", (event) => { event.preventDefault(); choose(
 
 $("keep").addEventListener("click", async () => {
   try {
-    const name = await follow(await post(own("/studio/start/keep"), asked()), $("keep-status"), "Test scene");
+    const name = await follow(await post(inTab("/studio/start/keep"), readChoice()), $("keep-status"), "Test scene");
     if (!name) return;
     $("keep-status").hidden = false;
-    $("keep-status").replaceChildren(element("a", { class: "button", href: own(`/studio/files/${name}`), download: true }, "Download shard, preset and command (ZIP)"));
+    $("keep-status").replaceChildren(element("a", { class: "button", href: inTab(`/studio/files/${name}`), download: true }, "Download shard, preset and command (ZIP)"));
   } catch (error) { showError($("keep-status"), error); }
 });
 $("preset").addEventListener("click", async () => {
   try {
-    const text = await follow(await post(own("/studio/start/preset"), asked()), $("keep-status"), "Preset");
+    const text = await follow(await post(inTab("/studio/start/preset"), readChoice()), $("keep-status"), "Preset");
     if (!text) return;
     $("preset-text").textContent = text;
     $("preset-out").hidden = false;
@@ -139,5 +139,5 @@ $("shape").addEventListener("change", () => {
 });
 $("seed").addEventListener("input", () => { $("seed-value").value = $("seed").value; });
 for (const id of ["seed", "yaw", "pitch", "roll", "bounces"]) $(id).addEventListener("change", render);
-$("overlay").addEventListener("change", () => { if (["shadows", "interreflections"].includes($("overlay").value)) direct(); else pad?.show(); });
-render().then(gallery);
+$("overlay").addEventListener("change", () => { if (["shadows", "interreflections"].includes($("overlay").value)) renderDirect(); else pad?.show(); });
+render().then(fillGallery);

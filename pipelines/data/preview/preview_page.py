@@ -9,7 +9,7 @@ import numpy as np
 from pipelines.data.preview import preview_plots as plots
 from pipelines.data.preview.preview_sample import STAGE_COLUMNS, Sample, Stage
 from pipelines.shared import pictures
-from render.planning.composition import Composition, light_directions
+from render.planning.plan_counts import PlanCounts, light_directions
 from render.records.manifest import SceneSpec
 from render.shared.config import read_yaml
 from render.shared.errors import InputError
@@ -23,7 +23,7 @@ _SCRIPT = Path(__file__).with_name("preview.js")
 
 
 def render(
-    folder: Path, scenes: Sequence[SceneSpec], there: Sequence[SceneSpec], counts: Composition, sample: Sample,
+    folder: Path, scenes: Sequence[SceneSpec], there: Sequence[SceneSpec], counts: PlanCounts, sample: Sample,
     shown: Sequence[tuple[SceneSpec, np.ndarray]],
 ) -> str:  # fmt: skip
     """Build the page.
@@ -32,7 +32,7 @@ def render(
         folder: Data folder.
         scenes: The manifest.
         there: Its scenes that have a shard.
-        counts: Composition of the manifest.
+        counts: What the manifest holds.
         sample: What was read of the shards.
         shown: (scene, strip) of the scenes on the page.
     """
@@ -85,7 +85,7 @@ def _failures(folder: Path) -> list[dict[str, Any]] | str:
         return str(error)
 
 
-def _plots(directions: np.ndarray, counts: Composition, sample: Sample) -> dict[str, list[str]]:
+def _plots(directions: np.ndarray, counts: PlanCounts, sample: Sample) -> dict[str, list[str]]:
     """Draw the plots of every heading as SVG."""
     rows, elevation = sample.statistics, "elevation above the image plane, degrees"
     return {

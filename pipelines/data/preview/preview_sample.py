@@ -8,7 +8,7 @@ import numpy as np
 
 from pipelines.shared import pictures
 from render.checks.statistics import SceneStatistics, measure, slants
-from render.planning.composition import components
+from render.planning.plan_counts import components
 from render.records.manifest import SceneSpec
 from render.records.mirror import shard_path
 from render.records.shards import Shard, read_shard

@@ -76,7 +76,7 @@ def from_arguments(args: argparse.Namespace) -> ClusterChoice | None:
     """Return the cluster the flags name, if they name one.
 
     Raises:
-        InputError: what is no cluster, or a bad file.
+        InputError: not a cluster, or a bad file.
     """
     if args.cluster is None:
         if args.cluster_config is not None:

@@ -1,4 +1,4 @@
-"""The line to a Dask cluster: opened, opened again when it broke, and closed with whatever was started for it."""
+"""The connection to a Dask cluster: opened, opened again when it broke, and closed with all that was started for it."""
 
 import importlib
 import logging
@@ -32,8 +32,8 @@ class Link:
 
     def __init__(self, choice: ClusterChoice) -> None:
         self.choice = choice
-        distributed = _module("distributed", "distributed", "sdps[cluster]")
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is told in our own words
+        distributed = _import("distributed", "distributed", "sdps[cluster]")
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # we report what matters ourselves
         self._client_class = distributed.Client
         self.cluster = self._start()
         try:
@@ -84,28 +84,28 @@ class Link:
         choice = self.choice
         if choice.local:
             memory = max(budget.available_memory() // choice.local, budget.GIBIBYTE)
-            with _undisturbed():
+            with _without_ctrl_c():
                 return importlib.import_module("distributed").LocalCluster(
                     n_workers=choice.local, threads_per_worker=1, memory_limit=memory, dashboard_address=":0",
                     silence_logs=logging.CRITICAL,
                 )  # fmt: skip
         if choice.name in BATCH:
             kind, command = BATCH[choice.name]
-            with _undisturbed():  # its import takes Ctrl-C for itself
-                jobqueue = _module("dask_jobqueue", "dask-jobqueue", "sdps[cluster]")
+            with _without_ctrl_c():  # its import takes Ctrl-C for itself
+                jobqueue = _import("dask_jobqueue", "dask-jobqueue", "sdps[cluster]")
             if shutil.which(command) is None:
                 raise InputError(
                     f"--cluster {choice.name}: no command {command} here; run this where jobs are submitted"
                 )
-            cluster = self._made(getattr(jobqueue, kind), choice.config.job)
+            cluster = self._make(getattr(jobqueue, kind), choice.config.job)
             cluster.scale(jobs=choice.config.jobs)
             return cluster
         if choice.name == KUBERNETES:
-            operator = _module("dask_kubernetes.operator", "dask-kubernetes", "dask-kubernetes")
-            return self._made(operator.KubeCluster, {"n_workers": choice.config.jobs} | choice.config.job)
+            operator = _import("dask_kubernetes.operator", "dask-kubernetes", "dask-kubernetes")
+            return self._make(operator.KubeCluster, {"n_workers": choice.config.jobs} | choice.config.job)
         return None
 
-    def _made(self, kind: Any, arguments: dict[str, Any]) -> Any:
+    def _make(self, kind: Any, arguments: dict[str, Any]) -> Any:
         """Make a cluster, whose own complaints about its arguments become one line."""
         try:
             return kind(**arguments)
@@ -115,7 +115,7 @@ class Link:
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
+def _without_ctrl_c() -> Iterator[None]:
     """Let processes that are started inside ignore Ctrl-C, which reaches the whole group; this one decides."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -127,7 +127,7 @@ def _undisturbed() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _module(name: str, package: str, install: str) -> Any:
+def _import(name: str, package: str, install: str) -> Any:
     """Import a package that only clusters need.
 
     Raises:

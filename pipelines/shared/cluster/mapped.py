@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from pipelines.shared.cluster.cluster_config import ClusterChoice
 from pipelines.shared.cluster.link import Link
-from render.running.station import Mismatch
+from render.running.cluster_worker import Mismatch
 from render.shared.errors import InputError
 
 J = TypeVar("J")

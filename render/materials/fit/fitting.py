@@ -74,7 +74,7 @@ class Fitter:
             shadowing=shadowing,
             azimuth=azimuth,
         )
-        fitted = rounded(conserve_energy(fitted))
+        fitted = round_tables(conserve_energy(fitted))
         return dataclasses.replace(fitted, fit_error=round(self.error(fitted, brdf), 4))
 
     def error(self, material: Material, brdf: Brdf) -> float:
@@ -113,7 +113,7 @@ def conserve_energy(material: Material, limit: float = 0.999) -> Material:
     return material
 
 
-def rounded(material: Material) -> Material:
+def round_tables(material: Material) -> Material:
     """Round the tables to the digits that `to_yaml` writes."""
     digits = np.vectorize(lambda value: float(f"{value:.4g}"))
     return dataclasses.replace(

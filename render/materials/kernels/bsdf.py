@@ -1,4 +1,4 @@
-"""The reflectance model inside Dr.Jit kernels: packed materials, and the Mitsuba plugin `ps_material`.
+"""The reflectance model inside Dr.Jit kernels: packed materials.
 
 Importing this module loads mitsuba. The numpy form, slow and plain, is `render.materials.model.evaluate`.
 """
@@ -11,10 +11,7 @@ import numpy as np
 from render.backend.arrays import interleaved, packet, packets
 from render.backend.jit import dr, mi
 from render.materials import model
-from render.materials.kernels import plugin
 from render.materials.kernels.lobes import HalfVectorLobes, cell, half_cell
-from render.materials.kernels.plugin import FamilyBSDF
-from render.materials.library import load
 from render.materials.model import Material
 from render.shared.errors import InputError
 
@@ -23,7 +20,7 @@ _ROW = 8  # floats of an entry of `PackedMaterials.rows`
 
 
 class Coordinates(NamedTuple):
-    """What evaluation needs of a pair of directions, whatever the material; from `PackedMaterials.prepare`."""
+    """What evaluation needs of a pair of directions, for any material; from `PackedMaterials.prepare`."""
 
     corner: Any  # UInt32, first of the four table entries around (theta_h, theta_d)
     weights: tuple  # 4 Float, bilinear weights of the four entries
@@ -138,26 +135,6 @@ def _two_colours(source: "mi.Float", entry: "mi.UInt32", active: "mi.Bool | bool
     """Return the two colours of an entry of eight floats."""
     found = packet(source, entry, 8, active)
     return mi.Color3f(found[0], found[1], found[2]), mi.Color3f(found[4], found[5], found[6])
-
-
-def register() -> None:
-    """Register the Mitsuba BSDF plugin `ps_material` (property `material`: a library name or a YAML path), once."""
-    plugin.register("ps_material", MERLFitBSDF)
-
-
-class MERLFitBSDF(FamilyBSDF):
-    """One-sided Mitsuba BSDF of one `Material`, e.g. `{'type': 'ps_material', 'material': 'chrome'}`."""
-
-    def __init__(self, props: "mi.Properties") -> None:
-        material = load(props["material"])
-        if not isinstance(material, Material):
-            raise InputError(f"{props['material']}: the plugin `ps_material` reads fitted materials (.yaml)")
-        self.material = material
-        super().__init__(props, [PackedMaterials([self.material])])
-
-    def to_string(self) -> str:
-        """Name the material."""
-        return f"MERLFitBSDF[material={self.material.name}]"
 
 
 def _packed_tables(material: Material) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""MERL tables inside Dr.Jit kernels: packed tables, and the Mitsuba plugin `merl`.
+"""MERL tables inside Dr.Jit kernels: packed tables.
 
 Importing this module loads mitsuba. The numpy form, slow and plain, is `render.materials.merl.evaluate`.
 """
@@ -11,10 +11,7 @@ import numpy as np
 from render.backend.arrays import packet, packets
 from render.backend.jit import dr, mi
 from render.materials import merl, model
-from render.materials.kernels import plugin
 from render.materials.kernels.lobes import HalfVectorLobes
-from render.materials.kernels.plugin import FamilyBSDF
-from render.materials.library import load
 from render.materials.merl import MerlTable
 from render.materials.model import Material
 from render.shared.errors import InputError
@@ -27,7 +24,7 @@ MOST_TABLES = ((1 << 32) - 1) // (4 * _ENTRIES)  # the array is indexed by 32 bi
 
 
 class MerlCoordinates(NamedTuple):
-    """What evaluation needs of a pair of directions, whatever the table; from `PackedMerl.prepare`."""
+    """What evaluation needs of a pair of directions, for any table; from `PackedMerl.prepare`."""
 
     entries: tuple  # 2 UInt32, first of the four knots around (theta_h, theta_d) at either of two cells of phi_d
     weights: tuple  # 4 Float, bilinear weights of the four knots
@@ -107,26 +104,6 @@ def coarse_form(table: MerlTable) -> Material:
         shadowing=np.ones((3, model.SHADOWING_KNOTS)),
         azimuth=np.zeros((3, *(count - 1 for count in model.AZIMUTH_KNOTS))),
     )
-
-
-def register() -> None:
-    """Register the Mitsuba BSDF plugin `merl` (property `filename`: a MERL `.binary` file), once."""
-    plugin.register("merl", MerlBSDF)
-
-
-class MerlBSDF(FamilyBSDF):
-    """One-sided Mitsuba BSDF of one MERL table, e.g. `{'type': 'merl', 'filename': 'chrome.binary'}`."""
-
-    def __init__(self, props: "mi.Properties") -> None:
-        table = load(props["filename"])
-        if not isinstance(table, MerlTable):
-            raise InputError(f"{props['filename']}: the plugin `merl` reads MERL tables, files ending in .binary")
-        self.table = table
-        super().__init__(props, [PackedMerl([self.table])])
-
-    def to_string(self) -> str:
-        """Name the file."""
-        return f"MerlBSDF[filename={self.table.path}]"
 
 
 def _cell(coordinate: "mi.Float", cells: int) -> tuple:

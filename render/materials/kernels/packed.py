@@ -98,7 +98,7 @@ class PackedSurfaces:
         return tuple(weights), tuple(normals)
 
     def shares(self, number: int) -> bool:
-        """Tell whether the weights of a surface are the shares of its materials."""
+        """Return whether the weights of a surface are the shares of its materials."""
         return len(self.parts[number]) > 1
 
     def eval(self, number: int, wi: Any, wo: Any, weights: tuple | None, active: Any = True) -> "mi.Color3f":

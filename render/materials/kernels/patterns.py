@@ -63,7 +63,7 @@ class Evaluator:
 
     def _patches(self, position: Any, _: Any) -> list:
         centres, labels = self._parameters["centres"], self._parameters["labels"]
-        moved = _warped(position, self._parameters["warp"])
+        moved = _displace(position, self._parameters["warp"])
         number = opaque(mi.UInt32(dr.width(labels)))
 
         def nearer(i: Any, best: Any, label: Any) -> tuple:
@@ -81,7 +81,7 @@ class Evaluator:
 
     def _stripes(self, position: Any, _: Any) -> list:
         wave = self._parameters["wave"]
-        phase = dr.dot(_vector(wave, 0), _warped(position, self._parameters["warp"])) + _scalar(wave, 3)
+        phase = dr.dot(_vector(wave, 0), _displace(position, self._parameters["warp"])) + _scalar(wave, 3)
         label = mi.UInt32((phase - dr.floor(phase)) * self.count)
         return self._one_hot(dr.minimum(label, self.count - 1))
 
@@ -131,7 +131,7 @@ def part_labels(mesh: TriangleMesh, pattern: Pattern) -> np.ndarray:  # (F,) uin
 
     rng = generator(pattern.seed, "pattern", "parts")
     if mesh.objects is not None:
-        return _dealt(mesh.objects.astype(np.int64), pattern.count, rng)
+        return _deal(mesh.objects.astype(np.int64), pattern.count, rng)
     faces = mesh.faces.astype(np.int64)
     _, weld = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)
     welded = weld.ravel()[faces]  # vertices split for their normals still join their pieces
@@ -140,7 +140,7 @@ def part_labels(mesh: TriangleMesh, pattern: Pattern) -> np.ndarray:  # (F,) uin
     _, piece = connected_components(graph, directed=False)
     piece = piece[welded[:, 0]]
     if piece.max() + 1 >= pattern.count:
-        return _dealt(piece, pattern.count, rng)
+        return _deal(piece, pattern.count, rng)
     centroids = mesh.vertices[faces].mean(1)
     regions = pattern.count * int(rng.integers(1, 3))
     seeds = [int(rng.integers(len(centroids)))]
@@ -152,7 +152,7 @@ def part_labels(mesh: TriangleMesh, pattern: Pattern) -> np.ndarray:  # (F,) uin
     return (distance.argmin(1) % pattern.count).astype(np.uint32)
 
 
-def _dealt(piece: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:  # (F,) uint32
+def _deal(piece: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:  # (F,) uint32
     """Deal materials to pieces numbered from 0, of which each face (F,) has one."""
     names, sizes = np.unique(piece, return_counts=True)
     rank = np.empty(names.max() + 1, np.int64)
@@ -170,7 +170,7 @@ def _warp(rng: np.random.Generator, size: float) -> np.ndarray:  # (3, 5): wave 
     return np.concatenate([waves, rng.uniform(0, 2 * np.pi, (3, 1)), np.full((3, 1), size)], axis=1)
 
 
-def _warped(position: Any, warp: Any) -> Any:
+def _displace(position: Any, warp: Any) -> Any:
     """Displace points by one wave per coordinate, so that edges are not planes."""
     moves = [
         _scalar(warp, 5 * k + 4) * dr.sin(dr.dot(_vector(warp, 5 * k), position) + _scalar(warp, 5 * k + 3))

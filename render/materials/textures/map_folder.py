@@ -86,7 +86,7 @@ def _say(folder: Path, maps: Maps, found: MapFolder) -> None:
 
 
 def _fits_green_down(slopes: np.ndarray) -> bool:
-    """Tell whether slopes (H, W, 2) are those of a height only when the second is turned: mixed derivatives agree."""
+    """Return whether slopes (H, W, 2) are those of a height only when the second is turned: mixed derivatives agree."""
     along_v = np.roll(slopes[..., 0], 1, 0) - np.roll(slopes[..., 0], -1, 0)
     along_u = np.roll(slopes[..., 1], -1, 1) - np.roll(slopes[..., 1], 1, 1)
     up, down = float(np.square(along_v - along_u).mean()), float(np.square(along_v + along_u).mean())

@@ -1,4 +1,4 @@
-"""Which picture of a folder is which PBR map, told by the names that shops and programs give them.
+"""Which picture of a folder is which PBR map, by the names that shops and programs give them.
 
 The kind stands at the end of the name: `Bricks012_2K-JPG_NormalGL`, `brick_nor_gl_4k`, `T_Floor_ORM`,
 `metallicRoughness`. Behind it only resolutions, formats and the like may follow. Case and separators do not matter.
@@ -66,7 +66,7 @@ class Maps:
 
 
 def find(folder: Path) -> Maps:
-    """Tell the pictures of a folder by their names.
+    """Find out by their names which map each picture of a folder is.
 
     A map of its own goes before one that shares its picture with others, as in `_ORM`.
 

@@ -5,7 +5,7 @@
 with DG the GGX distribution and the height-correlated Smith term (Walter et al. 2007; Heitz 2014), F Schlick's Fresnel
 term from 0.04 (dielectric) or the base colour c (metal). T_d = 1 - E_d is what the dielectric's coat lets through to a
 diffuse base (Kelemen and Szirmay-Kalos 2001), T_s = 1 - E_s what single scattering loses at F = 1, given back as in
-Kulla and Conty (2017). So a white material reflects all light, whatever its roughness and metallic, and none reflects
+Kulla and Conty (2017). So a white material reflects all light, at any roughness and metallic, and none reflects
 more; it is reciprocal. This module is the slow, plain numpy form; `render.materials.kernels.textures.gloss` evaluates
 the same in a kernel.
 """
@@ -68,7 +68,7 @@ def evaluate(
     fresnel = zero + (1 - zero) * (1 - np.clip((wi * half).sum(1), 0, 1)[:, None]) ** 5
     lost, mean = _lost(ci, rough) * _lost(co, rough), _mean_lost(rough)
     diffuse = base * (lost[:, :1] / mean[:, :1])
-    again = repeated(base, mean[:, 1:]) * lost[:, 1:] / mean[:, 1:]
+    again = multiple_scattering(base, mean[:, 1:]) * lost[:, 1:] / mean[:, 1:]
     value = single * fresnel + ((1 - metal) * diffuse + metal * again) / np.pi
     return np.where(above[:, None], value, 0.0)
 
@@ -86,7 +86,7 @@ def smith(ci: np.ndarray, co: np.ndarray, alpha: np.ndarray | float) -> np.ndarr
     return 0.5 / (co * first + ci * second)
 
 
-def repeated(base: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def multiple_scattering(base: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Return the colour of light scattered more than once (Kulla and Conty 2017), with mean = 1 - E_avg."""
     average = base + (1 - base) / 21  # of Schlick's term, over the hemisphere
     return average**2 * (1 - mean) / (1 - average * mean)

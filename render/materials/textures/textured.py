@@ -60,7 +60,7 @@ class Textured:
 
 
 def is_textured(name: str) -> bool:
-    """Tell whether a name is one of this module's."""
+    """Return whether a name is one of this module's."""
     head = name.partition(":")[0]
     if head in (PROCEDURAL, MAPS, UV):
         return True
@@ -69,17 +69,17 @@ def is_textured(name: str) -> bool:
 
 
 def is_open(name: str) -> bool:
-    """Tell whether a name leaves the seed, or kind and seed, to be drawn: `procedural`, `procedural:wood`."""
+    """Return whether a name leaves the seed, or kind and seed, to be drawn: `procedural`, `procedural:wood`."""
     kind = name.removeprefix(f"{PROCEDURAL}:")
     return name == PROCEDURAL or (name != kind and kind in KINDS)
 
 
-def drawn(name: str, rng: np.random.Generator) -> str:
+def complete(name: str, rng: np.random.Generator) -> str:
     """Complete an open name by a seed; any other stays as it is."""
     return f"{name}:{int(rng.integers(2**31))}" if is_open(name) else name
 
 
-def unseeded(name: str) -> str:
+def without_seed(name: str) -> str:
     """Leave out the seed of a procedural material without others in it, to count those of a kind together."""
     if not name.startswith(f"{PROCEDURAL}:") or is_open(name):
         return name

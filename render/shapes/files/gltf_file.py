@@ -103,7 +103,7 @@ def _accessors(tree: dict[str, Any], names: tuple[str, ...]) -> Iterator[dict[st
 
 
 def _is_normalised(accessor: dict[str, Any]) -> bool:
-    """Tell whether whole numbers stand for fractions of their range, which trimesh takes for what they are."""
+    """Return whether whole numbers stand for fractions of their range, which trimesh reads as plain numbers."""
     return bool(accessor.get("normalized")) and accessor.get("componentType") != 5126
 
 

@@ -91,8 +91,8 @@ def _quiet() -> Iterator[None]:
         log.setLevel(was)
 
 
-class _Beside(trimesh.resolvers.FilePathResolver):
-    """Finds files beside a mesh also by names that are written for addresses: `my%20mesh.bin`."""
+class _Neighbours(trimesh.resolvers.FilePathResolver):
+    """Finds files next to a mesh also by names that are escaped as in addresses: `my%20mesh.bin`."""
 
     def get(self, name: str) -> bytes:
         """Return a file's content."""
@@ -119,16 +119,16 @@ def _read(path: Path, smooth: bool) -> Corners:
     if kind in ("gltf", "glb"):
         gltf_file.check(data, None if packed else path.parent)
     elif kind == "stl":
-        data = stl_file.checked(data)
+        data = stl_file.check(data)
     found = None if smooth or kind not in _READERS else _READERS[kind](data)
     if found is not None:
         return found
-    beside = None if packed else _Beside(str(path))
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, resolver=beside)
-    return _joined([_corners(part) for part in _placed(scene)])
+    resolver = None if packed else _Neighbours(str(path))
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, resolver=resolver)
+    return _join([_corners(part) for part in _place(scene)])
 
 
-def _placed(scene: Any) -> Iterator[trimesh.Trimesh]:
+def _place(scene: Any) -> Iterator[trimesh.Trimesh]:
     """Yield the meshes of a scene where it places them, with their normals."""
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
@@ -159,7 +159,7 @@ def _corner_uv(mesh: trimesh.Trimesh) -> np.ndarray | None:
     return np.asarray(uv, np.float64)[:, :2][np.asarray(mesh.faces)]
 
 
-def _joined(parts: list[Corners]) -> Corners:
+def _join(parts: list[Corners]) -> Corners:
     """Return parts as one: texture coordinates only when all have them, normals where there are any."""
     if not parts:
         return Corners(np.empty((0, 3)), np.empty((0, 3), np.int64))
@@ -186,7 +186,7 @@ def _mesh(found: Corners, smooth: bool) -> TriangleMesh:
         count = int((~np.isfinite(vertices)).any(1).sum())
         raise InputError(f"{count} of {len(vertices)} vertices are not finite; repair the file")
     vertices = vertices if smooth else _within_float32(vertices)
-    merged, faces = _merged(vertices, faces) if smooth else _welded(vertices, faces)
+    merged, faces = _merge(vertices, faces) if smooth else _weld(vertices, faces)
     kept = with_area(merged, faces)
     if not smooth:
         kept &= _first_of_copies(faces, kept)
@@ -199,7 +199,7 @@ def _mesh(found: Corners, smooth: bool) -> TriangleMesh:
     if smooth:
         return TriangleMesh(vertices=merged, faces=wound, normals=vertex_normals(merged, wound), uv=uv)
     given = None if found.normals is None else np.take_along_axis(found.normals[kept], moved, axis=1)
-    points, split, normals = creases.shaded(merged, wound, given)
+    points, split, normals = creases.shade(merged, wound, given)
     return TriangleMesh(vertices=points, faces=split, normals=normals, uv=uv)
 
 
@@ -220,14 +220,14 @@ def _within_float32(vertices: np.ndarray) -> np.ndarray:
     return vertices
 
 
-def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merge(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge positions that agree to 1e-8, as trimesh does."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices()
     return np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
 
 
-def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge positions that agree to a millionth of the extent; the first of them in the file stays."""
     low = vertices.min(axis=0)
     extent = float((vertices.max(axis=0) - low).max()) or 1.0
@@ -241,7 +241,7 @@ def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _first_of_copies(faces: np.ndarray, among: np.ndarray) -> np.ndarray:  # (F,) bool
-    """Tell which triangles are the first with their corners and winding; of a double-sided mesh, with their corners."""
+    """Mark the triangles that are the first with their corners and winding; in a double-sided mesh, their corners."""
     turned = np.take_along_axis(faces, (faces.argmin(1)[:, None] + np.arange(3)) % 3, axis=1)
     side = turned[:, 1] > turned[:, 2]
     turned[:, 1:].sort(axis=1)

@@ -44,8 +44,8 @@ def read(data: bytes) -> Corners:
         raise InputError(
             f"a face names vertex {table[bad, 0][0]}, but the file holds 1 to {len(vertices)}; repair the file"
         )
-    uv = _looked_up(_numbers("vt", found.vt, 1), table[:, 1])
-    normals = _looked_up(_numbers("vn", found.vn, 3), table[:, 2])
+    uv = _look_up(_numbers("vt", found.vt, 1), table[:, 1])
+    normals = _look_up(_numbers("vn", found.vn, 3), table[:, 2])
     return of_polygons(vertices, table[:, 0] - 1, counts, None if uv is None or np.isnan(uv).any() else uv, normals)
 
 
@@ -90,7 +90,7 @@ def _numbers(keyword: str, rows: list[str], least: int) -> np.ndarray:
     if not rows:
         return np.empty((0, columns))
     if len({len(row.split()) for row in rows}) == 1:
-        values = _parsed(rows, np.float64)
+        values = _parse(rows, np.float64)
         if values is not None:
             table = values.reshape(len(rows), -1)[:, :columns]
             if table.shape[1] >= least:
@@ -125,7 +125,7 @@ def _of_one_form(rows: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
     if joined.count("/") not in (0, 2 * total):
         return None
     columns = 3 if "/" in joined else 1
-    values = _parsed([joined.replace("//", "/0/").replace("/", " ")], np.int64)
+    values = _parse([joined.replace("//", "/0/").replace("/", " ")], np.int64)
     if values is None or len(values) != columns * total:
         return None
     table = values.reshape(-1, columns)
@@ -136,7 +136,7 @@ def _of_any_form(faces: list[list[str]]) -> tuple[np.ndarray, np.ndarray]:
     """Read faces corner by corner."""
     texts = [corner + _MISSING[min(corner.count("/"), 2)] for face in faces for corner in face]
     joined = " ".join(texts).replace("//", "/0/") + " "
-    values = _parsed([joined.replace("/ ", "/0 ").replace("/", " ")], np.int64)
+    values = _parse([joined.replace("/ ", "/0 ").replace("/", " ")], np.int64)
     if values is None or len(values) != 3 * len(texts):
         raise InputError(_malformed(faces))
     return values.reshape(-1, 3), np.array([len(face) for face in faces])
@@ -148,7 +148,7 @@ def _malformed(faces: list[list[str]]) -> str:
     return f"'f {' '.join(face)[:60]}': expected whole numbers, as in f 1 2 3 or f 1/1/1 2/2/1 3/3/1; export it again"
 
 
-def _parsed(rows: list[str], dtype: type) -> np.ndarray | None:
+def _parse(rows: list[str], dtype: type) -> np.ndarray | None:
     """Return all numbers of rows as one array, None when something else is among them."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # numpy warns of what it cannot read, and returns what stands before
@@ -158,7 +158,7 @@ def _parsed(rows: list[str], dtype: type) -> np.ndarray | None:
             return None
 
 
-def _looked_up(values: np.ndarray, index: np.ndarray) -> np.ndarray | None:
+def _look_up(values: np.ndarray, index: np.ndarray) -> np.ndarray | None:
     """Return values by their number (N,), NaN where it is 0 or out of range; None where all are."""
     there = (index >= 1) & (index <= len(values))
     return np.where(there[:, None], values[np.where(there, index - 1, 0)], np.nan) if there.any() else None

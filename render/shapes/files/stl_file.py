@@ -7,7 +7,7 @@ from render.shared.errors import InputError
 _HEADER, _TRIANGLE = 84, 50  # bytes
 
 
-def checked(data: bytes) -> bytes:
+def check(data: bytes) -> bytes:
     """Return an STL file, a binary one without what stands behind its triangles.
 
     Raises:

@@ -26,7 +26,7 @@ def from_strips(part: Any) -> Any:
     ended = [np.append(np.asarray(row, np.int64).ravel(), _SEPARATOR) for row in rows]
     places = np.fromiter(chain.from_iterable(ended), np.int64)
     runs = np.split(places, np.flatnonzero(places == _SEPARATOR) + 1)
-    strips = [run[:-1] for run in runs if len(run) > 3]  # the separator, and fewer than three are no triangle
+    strips = [run[:-1] for run in runs if len(run) > 3]  # the separator, and fewer than three are not a triangle
     if not strips:
         return part
     return trimesh.Trimesh(part.vertices, trimesh.util.triangle_strips_to_faces(strips), process=False)

@@ -87,7 +87,7 @@ class _Grid:
 
     Attributes:
         ahead, facing: The triangles.
-        promise: (C,) the least distance that two triangles of a cell can have, as far as their boxes tell.
+        promise: (C,) the least distance that two triangles of a cell can have, as far as their boxes show.
         order: The cells where both meshes are, those of the least promise first.
     """
 
@@ -103,8 +103,8 @@ class _Grid:
         both = np.flatnonzero((self.counts[0] > 0) & (self.counts[1] > 0))
         self.promise = np.full(count, np.inf)
         if len(both):
-            highest = _reduced(np.maximum, ahead.high[self.numbers[0], 2], self.counts[0])
-            lowest = _reduced(np.minimum, facing.low[self.numbers[1], 2], self.counts[1])
+            highest = _reduce(np.maximum, ahead.high[self.numbers[0], 2], self.counts[0])
+            lowest = _reduce(np.minimum, facing.low[self.numbers[1], 2], self.counts[1])
             self.promise[both] = lowest[both] - highest[both]
         self.order = both[np.argsort(self.promise[both], kind="stable")]
 
@@ -121,7 +121,7 @@ class _Grid:
         return first[meet], second[meet]
 
 
-def _reduced(kind: np.ufunc, values: np.ndarray, counts: np.ndarray) -> np.ndarray:  # (C,)
+def _reduce(kind: np.ufunc, values: np.ndarray, counts: np.ndarray) -> np.ndarray:  # (C,)
     """Reduce values, sorted by cell, to one of each cell; 0 for cells without any."""
     filled = np.flatnonzero(counts)
     found = np.zeros(len(counts))

@@ -31,7 +31,7 @@ class _Fans(NamedTuple):
     apart: np.ndarray  # (2, M) the same at an edge that is sharp
 
 
-def shaded(
+def shade(
     vertices: np.ndarray, faces: np.ndarray, given: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Split vertices at creases and return their normals.
@@ -111,7 +111,7 @@ def _end(edges: np.ndarray) -> np.ndarray:
 
 
 def _specks(vertices: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:  # (N,) bool
-    """Tell which sharp edges belong to no more than a few that hang together, in a tiny part of the mesh."""
+    """Return which sharp edges belong to only a few that hang together, in a tiny part of the mesh."""
     if not len(start):
         return np.empty(0, bool)
     used, place = np.unique(np.concatenate([start, end]), return_inverse=True)

@@ -94,7 +94,7 @@ class TriangleMesh:
         return replace(turned, vertices=turned.vertices * view.scale + np.array([*view.offset, 0.0]))
 
 
-def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+def join(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     """Return meshes as one, in which each is an object of its own; texture coordinates are left out."""
     first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces.astype(np.int64) + start for mesh, start in zip(meshes, first[:-1], strict=True)]
@@ -170,7 +170,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:  # (F,) bool
-    """Tell which triangles have an area."""
+    """Return which triangles have an area."""
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     return distinct & (np.linalg.norm(face_normals(vertices.astype(np.float64), faces), axis=1) > 0)
 

@@ -1,7 +1,7 @@
 """Smooth random fields in space as sums of plane waves.
 
 The spectral representation of a Gaussian random field (Shinozuka and Jan 1972): one matrix product and one
-sine per point and wave, with exact derivatives, no lattice and hence no grid artefacts.
+sine per point and wave, with exact derivatives, no lattice and so no grid artefacts.
 """
 
 from dataclasses import dataclass, replace

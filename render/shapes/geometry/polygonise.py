@@ -38,7 +38,7 @@ def polygonise(field: Field, *, half_size: float, triangles: int = 90_000) -> Tr
     vertices, faces, _, _ = marching_cubes(np.pad(values, 1, constant_values=1.0), 0.0, gradient_direction="descent")
     vertices, faces = largest_component(vertices, faces.astype(np.int64))
     vertices = (vertices - 1) * spacing + low.astype(np.float32)
-    points, normals = _onto_surface(field, np.ascontiguousarray(vertices.T), spacing)
+    points, normals = _move_to_surface(field, np.ascontiguousarray(vertices.T), spacing)
     return TriangleMesh(vertices=points.T, faces=faces, normals=normals)
 
 
@@ -92,14 +92,14 @@ def _evaluate_near_surface(field: Field, low: np.ndarray, spacing: np.float32, b
         values[active] = evaluate(field, points.reshape(3, -1)).reshape(-1, BLOCK**3)
         done |= active
         grid = values.reshape(*blocks, BLOCK, BLOCK, BLOCK).transpose(0, 3, 1, 4, 2, 5).reshape(blocks * BLOCK)
-        active = _crossed(grid < 0, blocks).ravel() & ~done
+        active = _crossing_cells(grid < 0, blocks).ravel() & ~done
     # A value of exactly zero would give triangles without area.
     small = np.float32(1e-4) * spacing
     grid[np.abs(grid) < small] = small
     return grid
 
 
-def _crossed(inside: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+def _crossing_cells(inside: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     """Mark the blocks with a sign change at or across their border: those must be evaluated."""
     marked = np.zeros(blocks, dtype=bool)
     for axis in range(3):
@@ -111,7 +111,7 @@ def _crossed(inside: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     return marked
 
 
-def _onto_surface(field: Field, points: np.ndarray, spacing: np.float32) -> tuple[np.ndarray, np.ndarray]:
+def _move_to_surface(field: Field, points: np.ndarray, spacing: np.float32) -> tuple[np.ndarray, np.ndarray]:
     """Move `points` (3, V) one Newton step towards the zero level; returns them with unit normals (V, 3)."""
     step = np.float32(0.3) * spacing
     steps = step * np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)[:, :, None]

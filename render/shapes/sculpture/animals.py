@@ -27,7 +27,7 @@ def animal(rng: np.random.Generator) -> Field:
     legs = [_leg(rng, hips, chest, girth, reach, stance, side, fore=fore) for side in (1, -1) for fore in (True, False)]
     coat = sdf.union([sdf.union(trunk, 0.15), *legs], rng.uniform(0.05, 0.12))
     coat = sdf.union([coat, _tail(rng, hips, girth)], 0.06)
-    solid = _furred(rng, sdf.union([coat, skull], 0.08))
+    solid = _add_fur(rng, sdf.union([coat, skull], 0.08))
     if rng.random() < 0.4:
         floor = -reach - 0.6 * girth if stance == "stand" else hips[1] - girth
         base = sdf.box([0, floor - 0.05, 0], [half + 0.35, 0.08, girth + 0.2], 0.02)
@@ -113,7 +113,7 @@ def _tail(rng: np.random.Generator, hips: np.ndarray, girth: float) -> Field:
     return sdf.union([sdf.cone(a, b, thick, thick * 0.9) for a, b in pairwise(joints)], 0.05)
 
 
-def _furred(rng: np.random.Generator, solid: Field) -> Field:
+def _add_fur(rng: np.random.Generator, solid: Field) -> Field:
     """Give the animal a skin: lumps of muscle, and over them short fur, tufts or a fleece."""
     solid = sdf.displaced(solid, scalar_waves(rng, 7, 20, count=20), rng.uniform(0.004, 0.014))
     coat = rng.random()

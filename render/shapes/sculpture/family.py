@@ -38,10 +38,10 @@ def sculpture(seed: int) -> TriangleMesh:
     """Build the sculpture of `seed`, closed, upright (y up), within the unit sphere."""
     rng = seeds.generator(seed, "sculpture")
     build, _ = RECIPES[recipe(seed)]
-    return polygonise(weathered(rng, build(rng)), half_size=1.7).normalised()
+    return polygonise(weather(rng, build(rng)), half_size=1.7).normalised()
 
 
-def weathered(rng: np.random.Generator, solid: Field) -> Field:
+def weather(rng: np.random.Generator, solid: Field) -> Field:
     """Deform a shape as a whole and age its surface: a slight warp, a tremor of the chisel, and wear."""
     if rng.random() < 0.5:
         solid = sdf.warped(solid, vector_waves(rng, 1.5, 4), rng.uniform(0.01, 0.05))

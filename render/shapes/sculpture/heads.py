@@ -36,10 +36,10 @@ def head(rng: np.random.Generator, *, hair: bool = True) -> Field:
     face = sdf.union([skull, *features], 0.035)
     # No two faces alike: bend the proportions, which also breaks the mirror symmetry.
     face = sdf.warped(face, vector_waves(rng, 1.5, 4, count=8), rng.uniform(0.0, 0.04))
-    return _with_hair(rng, face) if hair else face
+    return _add_hair(rng, face) if hair else face
 
 
-def _with_hair(rng: np.random.Generator, face: Field) -> Field:
+def _add_hair(rng: np.random.Generator, face: Field) -> Field:
     """Add a cap of hair with strands or curls, perhaps a bun, and perhaps a beard."""
     strand = np.array([rng.normal(0, 0.3), -1, rng.normal(0, 0.5)])
     waves = scalar_waves(rng, 14, 26, count=16, slope=0)

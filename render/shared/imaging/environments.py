@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from render.shared.decoding import check_unpacked, decoding, silenced
+from render.shared.decoding import check_unpacked, decoding, silence
 from render.shared.errors import InputError, unknown
 from render.shared.files import read_bytes
 from render.shared.imaging.exr_colours import read_exr_colours
@@ -40,7 +40,7 @@ def solid_angles(height: int) -> np.ndarray:  # (H, 1) float64
     return (np.pi / height * (edges[:-1] - edges[1:]))[:, None]
 
 
-def turned(radiance: np.ndarray, degrees: float) -> np.ndarray:
+def turn(radiance: np.ndarray, degrees: float) -> np.ndarray:
     """Return the map turned about the vertical y axis, counter-clockwise as seen from above (+z moves to +x).
 
     The angle is rounded to a whole number of columns.
@@ -54,11 +54,11 @@ def load(name: str) -> np.ndarray:  # (H, 2H, 3) float32
     Built-in maps are scaled so that white Lambertian facing the camera has radiance 1; those of files are as they are.
 
     Raises:
-        InputError: an unknown name, or a file that is no map: not twice as wide as high, negative, infinite or NaN.
+        InputError: an unknown name, or a file that is not a map: not twice as wide as high, negative, infinite or NaN.
     """
     require_name(name)
     if is_file(name):
-        return _checked(_read(Path(name)), name)
+        return _check(_read(Path(name)), name)
     kind, _, seed = name.partition(":")
     vectors = directions(HEIGHT)
     radiance = BUILT_IN[kind](vectors, generator(int(seed or 0), "environment", kind))
@@ -67,7 +67,7 @@ def load(name: str) -> np.ndarray:  # (H, 2H, 3) float32
 
 
 def is_file(name: str) -> bool:
-    """Tell whether a name is that of an .hdr or .exr file."""
+    """Return whether a name is that of an .hdr or .exr file."""
     return Path(name).suffix.lower() in SUFFIXES
 
 
@@ -181,10 +181,10 @@ def _read(path: Path) -> np.ndarray:
         with decoding(path, "a Radiance picture", "save it as .hdr or .exr again"):
             if size:
                 check_unpacked(path, 12 * int(size[1]) * int(size[2]), "its pixels")
-                with silenced():
+                with silence():
                     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if pixels is None or pixels.ndim != 3:
-            raise InputError(f"{path}: damaged or no Radiance picture; save it as .hdr or .exr again")
+            raise InputError(f"{path}: damaged or not a Radiance picture; save it as .hdr or .exr again")
         return pixels[..., ::-1]
     pixels = read_exr_colours(path, "save it as .hdr or .exr again").pixels
     if pixels.shape[2] != 3:
@@ -192,8 +192,8 @@ def _read(path: Path) -> np.ndarray:
     return pixels
 
 
-def _checked(pixels: np.ndarray, name: str) -> np.ndarray:
-    """Refuse what is no map; shrink a large one, keeping its light."""
+def _check(pixels: np.ndarray, name: str) -> np.ndarray:
+    """Refuse what is not a map; shrink a large one, keeping its light."""
     height, width = pixels.shape[:2]
     if width != 2 * height:
         raise InputError(f"{name}: is {width}x{height}; a latitude-longitude map is twice as wide as high")

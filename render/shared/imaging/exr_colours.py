@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from render.shared.decoding import decoding, exr_parts, silenced
+from render.shared.decoding import decoding, exr_parts, silence
 from render.shared.errors import InputError
 
 _PRINTING = threading.Lock()
@@ -68,7 +68,7 @@ def read_exr_colours(path: str | Path, remedy: str = "copy it again") -> ExrColo
     Raises:
         InputError: missing, damaged, of a size that such a file cannot hold, or without light in it.
     """
-    with decoding(path, "an EXR picture", remedy), silenced(), _PRINTING, redirect_stdout(io.StringIO()):
+    with decoding(path, "an EXR picture", remedy), silence(), _PRINTING, redirect_stdout(io.StringIO()):
         parts = exr_parts(path, remedy, grouped=False)
         layers = [layer for part in parts for layer in _layers(part, alone=len(parts) == 1)]
         if not layers:
@@ -81,8 +81,8 @@ def read_exr_colours(path: str | Path, remedy: str = "copy it again") -> ExrColo
         alpha = None if chosen.alpha is None else _array(chosen.alpha).astype(pixels.dtype)
         whole = alpha is None or alpha.shape == pixels.shape[:2]
         return ExrColours(
-            _placed(pixels, chosen.header),
-            _placed(alpha, chosen.header) if alpha is not None and whole else None,
+            _place(pixels, chosen.header),
+            _place(alpha, chosen.header) if alpha is not None and whole else None,
             chosen.name,
         )
 
@@ -115,7 +115,7 @@ def _array(channel: Any) -> np.ndarray:  # (H, W) float16 or float32
     return pixels if pixels.dtype.kind == "f" else pixels.astype(np.float32)
 
 
-def _placed(pixels: np.ndarray, header: dict[str, Any]) -> np.ndarray:
+def _place(pixels: np.ndarray, header: dict[str, Any]) -> np.ndarray:
     """Put what the data window holds, (h, w, ...), into the display window; where they do not meet, it stays alone."""
     (left, top), (right, bottom) = (corner.astype(int) for corner in header["dataWindow"])
     (first_x, first_y), (last_x, last_y) = (corner.astype(int) for corner in header["displayWindow"])

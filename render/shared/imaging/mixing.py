@@ -106,7 +106,7 @@ class LightMix:
             name = self.environments[int(rng.integers(len(self.environments)))]
             seed, degrees = int(rng.integers(1000)), float(rng.uniform(-self.turn, self.turn))
             if environments.is_file(name):
-                return stage.under(environments.turned(_map(name), degrees)), {"map": name, "turn": round(degrees, 2)}
+                return stage.under(environments.turn(_map(name), degrees)), {"map": name, "turn": round(degrees, 2)}
             name = name if ":" in name else f"{name}:{seed}"
             return stage.under(_map(name)), {"map": name}
         direction = np.array([*rng.normal(size=2), abs(rng.normal())])  # uniform over the hemisphere

@@ -21,7 +21,7 @@ def check_scale(scale: float) -> float:
     return float(scale)
 
 
-def reduced_shape(shape: tuple[int, int], scale: float) -> tuple[int, int]:
+def smaller_shape(shape: tuple[int, int], scale: float) -> tuple[int, int]:
     """Return the sides (H, W) of a picture once it is reduced.
 
     Raises:
@@ -38,13 +38,13 @@ def reduced_shape(shape: tuple[int, int], scale: float) -> tuple[int, int]:
     return height, width
 
 
-def reduced(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def reduce_image(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Return an image (H, W) or (H, W, C) float32 at a smaller size, every pixel the mean of the area it covers."""
     if image.shape[:2] == shape:
         return image
     return cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA)
 
 
-def reduced_mask(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def reduce_mask(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Return a mask (H, W) bool at a smaller size, true where at least half of a pixel's area is."""
-    return mask if mask.shape == shape else reduced(mask.astype(np.float32), shape) >= 0.5
+    return mask if mask.shape == shape else reduce_image(mask.astype(np.float32), shape) >= 0.5

@@ -74,7 +74,7 @@ class Sensor:
         Args:
             images: (Q, H, W, 3) float32 linear, 1 is full scale at 0 stops.
         """
-        electrons = images.copy() if self.blur <= 0 else _blurred(images, self.blur)
+        electrons = images.copy() if self.blur <= 0 else _blur(images, self.blur)
         np.maximum(electrons, 0.0, out=electrons)
         electrons += np.float32(self.ambient)
         if self.field_angle:
@@ -115,7 +115,7 @@ class Sensor:
         linear = self.develop(self.expose(images, rng))
         if not self.jpeg_quality:
             return linear
-        return np.stack([from_srgb(_decoded(jpeg(image, self.jpeg_quality))) for image in linear])
+        return np.stack([from_srgb(_decode(jpeg(image, self.jpeg_quality))) for image in linear])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +177,7 @@ class SensorModel:
             raise InputError(f"sensor.jpeg must be in [0, 1], got {self.jpeg}")
 
     def draw(self, rng: np.random.Generator) -> Sensor:
-        """Draw a camera; every field costs the same number of draws whatever its range is."""
+        """Draw a camera; every field takes the same number of draws, also one with a fixed value."""
 
         def logarithmic(low: float, high: float) -> float:
             return float(np.exp(rng.uniform(np.log(max(low, 1e-6)), np.log(max(high, 1e-6)))))
@@ -207,7 +207,7 @@ def vignetting(height: int, width: int, angle: float) -> np.ndarray:  # (H, W) f
     return ((1.0 + squared * np.tan(np.radians(angle)) ** 2) ** -2).astype(np.float32)
 
 
-def _blurred(images: np.ndarray, sigma: float) -> np.ndarray:
+def _blur(images: np.ndarray, sigma: float) -> np.ndarray:
     """Convolve each image with a normalised Gaussian that reaches four standard deviations."""
     side = 2 * int(np.ceil(4 * sigma)) + 1
     return np.stack([cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT) for image in images])
@@ -220,7 +220,7 @@ def jpeg(linear: np.ndarray, quality: int) -> bytes:
     return encoded.tobytes()
 
 
-def _decoded(data: bytes) -> np.ndarray:  # (H, W, 3) float32 in [0, 1]
+def _decode(data: bytes) -> np.ndarray:  # (H, W, 3) float32 in [0, 1]
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert pixels is not None  # our own encoder's
     return pixels[..., ::-1].astype(np.float32) / 255

@@ -16,7 +16,7 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from render.shared.decoding import check_picture, check_unpacked, silenced
+from render.shared.decoding import check_picture, check_unpacked, silence
 from render.shared.errors import InputError
 from render.shared.imaging.exr_colours import read_exr_colours
 from sdps.photos.pictures.netpbm import read_netpbm
@@ -83,7 +83,7 @@ def _tiff(path: Path, data: bytes | bytearray) -> Decoded:
 
 
 def _by_opencv(path: Path, data: bytes | bytearray, kind: str, profile: bytes | None, orientation: int) -> Decoded:
-    with silenced():
+    with silence():
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise InputError(f"{path}: damaged or not a {kind}; copy it again or leave it out")

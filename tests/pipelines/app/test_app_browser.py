@@ -1,4 +1,4 @@
-"""Every room of `sdps app` in Chromium, at two widths: it works, without console errors, and axe is content."""
+"""Every page of `sdps app` in Chromium, at two widths: it works, without console errors, and axe is content."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import photo_folders as folders
 import pytest
 from app_data import write_run
-from app_server import serving
+from app_server import eventually, serving
 from browser_pages import WIDTHS, launched, needs_browser, watched
 from sdps_scenes import hemisphere_lights
 
@@ -61,8 +61,7 @@ def test_photographs(page, address: str, tmp_path: Path) -> None:
     page.locator("#chart polyline").wait_for(state="attached")  # flat where the mask was taken away
     before = page.locator("#relit").screenshot()
     page.locator("#relit-light input").first.fill("150")
-    page.wait_for_timeout(200)
-    assert page.locator("#relit").screenshot() != before
+    assert eventually(lambda: page.locator("#relit").screenshot() != before)
     with page.expect_download() as download:
         page.click("#download")
     assert download.value.suggested_filename == "sdps-infer.zip"
@@ -108,8 +107,7 @@ def test_data_and_runs(page, address: str) -> None:
     page.locator("#lamp-card").wait_for()
     before = page.locator("#view").screenshot()
     page.locator("#scrub").fill("2")
-    page.wait_for_timeout(300)
-    assert page.locator("#view").screenshot() != before
+    assert eventually(lambda: page.locator("#view").screenshot() != before)
     page.get_by_role("button", name="run: run").click()
     page.locator("#charts article", has_text="loss").wait_for()
     page.get_by_role("button", name="degrees").click()

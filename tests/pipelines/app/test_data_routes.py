@@ -1,4 +1,4 @@
-"""The room "Data and runs" over HTTP: it shows what lies in its folder, and nothing else."""
+"""The page "Data and runs" over HTTP: it shows what lies in its folder, and nothing else."""
 
 import json
 from pathlib import Path

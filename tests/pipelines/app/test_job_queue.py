@@ -119,7 +119,7 @@ def test_a_worker_that_died_while_idle_costs_no_job(jobs: Jobs) -> None:
 def test_one_that_dies_of_a_job_fails_it_alone(jobs: Jobs) -> None:
     killed, after = jobs.submit("me", "die"), jobs.submit("me", "echo")
     assert killed is not None and after is not None
-    assert state(killed, "failed") and "worker ended" in killed.message
+    assert state(killed, "failed") and "worker stopped" in killed.message
     assert state(after, "done")
 
 

@@ -1,4 +1,4 @@
-"""The room "Photographs" over HTTP: limits, refusals, whose is what, and the way from files to a ZIP."""
+"""The page "Photographs" over HTTP: limits, refusals, whose is what, and the way from files to a ZIP."""
 
 import io
 import json
@@ -114,7 +114,7 @@ def test_uploads_are_limited(address: str, hills: Path) -> None:
     path = client.new_set()
     small = (hills / "1.png").read_bytes()
     assert "cannot be used here" in message(client.send("PUT", f"{path}/uploads/a.exe", small))
-    assert "no picture" in message(client.send("PUT", f"{path}/uploads/a.png", b"nothing"))
+    assert "cannot be read as a picture" in message(client.send("PUT", f"{path}/uploads/a.png", b"nothing"))
     header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)  # a small file of 3.6 billion pixels
     chunk = b"IHDR" + header
     bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
@@ -155,7 +155,7 @@ def test_the_header_of_an_exr_is_read_without_its_library(tmp_path: Path) -> Non
     folders.write(path, np.zeros((40, 50, 3)))
     assert uploads._read_size(path) == (50, 40)
     path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(InputError, match=r"a\.exr: is no picture"):
+    with pytest.raises(InputError, match=r"a\.exr: cannot be read as a picture"):
         uploads.check_pixels(path, uploads.Limits())
 
 
@@ -198,7 +198,7 @@ def test_archives_do_not_explode(address: str, hills: Path) -> None:
     path, small = client.new_set(), (hills / "1.png").read_bytes()
     bomb = archive(**{"a.png": bytes(50_000_000)})
     assert len(bomb) < 100_000
-    assert "too many bytes" in message(client.send("PUT", f"{path}/uploads/bomb.zip", bomb))
+    assert "too large unpacked" in message(client.send("PUT", f"{path}/uploads/bomb.zip", bomb))
     many = archive(**{f"{number}.png": small for number in range(30)})
     assert "more than 20 files" in message(client.send("PUT", f"{client.new_set()}/uploads/many.zip", many))
     assert "cannot be unpacked" in message(client.send("PUT", f"{client.new_set()}/uploads/no.zip", b"PK no"))
@@ -220,7 +220,7 @@ def test_what_is_one_visitors_is_nobody_elses(address: str, hills: Path) -> None
 def test_foreign_pages_and_names_are_refused(address: str) -> None:
     client = Client(address)
     client.origin = "http://elsewhere.example"
-    assert "must come from this page" in message(client.send("POST", "/photographs/sets"), 403)
+    assert "must come from the app" in message(client.send("POST", "/photographs/sets"), 403)
     assert message(client.send("GET", "/photographs", Host="elsewhere.example"), 403)
     client.origin = address
     assert client.post("/photographs/sets")

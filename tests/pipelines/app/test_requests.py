@@ -164,7 +164,7 @@ def test_a_large_manifest_is_read_off_the_event_loop(
 
     monkeypatch.setattr(data_routes, "read_manifest", slow)
     for method, path in (("GET", "scene"), ("POST", "start")):
-        data_routes._manifest.cache_clear()
+        data_routes._index_manifest.cache_clear()
         asking = threading.Thread(target=client.send, args=(method, f"/data/{path}?folder=run/data&id={scene}"))
         asking.start()
         time.sleep(0.1)

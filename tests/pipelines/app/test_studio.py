@@ -1,4 +1,4 @@
-"""The room "Studio": what may be loaded, scenes of it, and files that repeat a scene."""
+"""The page "Studio": what may be loaded, scenes of it, and files that repeat a scene."""
 
 import io
 import json
@@ -33,7 +33,7 @@ def maps(tmp_path: Path) -> Path:
 def test_a_folder_of_maps_is_a_material_and_no_shape(tmp_path: Path, maps: Path) -> None:
     place = tmp_path / "studio"
     place.mkdir()
-    about = studio_tasks.scene(str(place), shape="sphere", material="Test", size=128)
+    about = studio_tasks.render_scene(str(place), shape="sphere", material="Test", size=128)
     assert about["name"].endswith("Test") and (place / "basis.bin").stat().st_size == 60 * 128 * 128 * 3
     with pytest.raises(InputError, match="folder of maps"):
         studio_tasks.check_choice(place, shape="Test", material="chrome")
@@ -43,7 +43,7 @@ def test_a_folder_of_maps_is_a_material_and_no_shape(tmp_path: Path, maps: Path)
 def test_what_is_kept_writes_the_same_shard_again(tmp_path: Path, maps: Path, material: str) -> None:
     place = tmp_path / "studio"
     place.mkdir()
-    assert studio_tasks.keep(str(place), shape="blobby:3", material=material, yaw=30, size=128) == "scene.zip"
+    assert studio_tasks.pack_scene(str(place), shape="blobby:3", material=material, yaw=30, size=128) == "scene.zip"
     unpacked = tmp_path / "elsewhere"
     with zipfile.ZipFile(place / "scene.zip") as opened:
         opened.extractall(unpacked)
@@ -77,12 +77,12 @@ def test_uploads(tmp_path: Path, maps: Path) -> None:
         for name, body, status, text in (
             ("Bricks.zip", archive(picture, "../../a_Color.png", "x/b_Roughness.png"), 200, "Bricks"),
             ("Bricks.zip", archive(picture, "a_Color.png"), 200, "Bricks"),  # in place of the first
-            ("none.zip", archive(picture, "a.exe"), 400, "no pictures in it"),
+            ("none.zip", archive(picture, "a.exe"), 400, "contains no pictures"),
             ("bad.zip", b"PK", 400, "cannot be unpacked"),
             ("big.zip", b"0" * 500_000, 400, "too large"),
             ("own.yaml", b"a: 1", 200, "own.yaml"),
             ("a.exe", b"", 400, "cannot be used here"),
         ):
             answered, found = client.send("PUT", f"/studio/uploads/{name}", body)
-            told = json.loads(found)
-            assert answered == status and text in told["name" if status == 200 else "message"], (name, told)
+            said = json.loads(found)
+            assert answered == status and text in said["name" if status == 200 else "message"], (name, said)

@@ -169,11 +169,11 @@ def test_masks_at_the_same_time_do_not_meet(visitor: Visitor) -> None:
 
 
 def studio(visitor: Visitor) -> set[str]:
-    """Leave files of the other rooms, as their jobs do; return their paths."""
+    """Leave files of the other pages, as their jobs do; return their paths."""
     assert visitor.send("PUT", "/studio/uploads/ball.off", b"OFF")[0] == 200
-    for room in ("studio-", "data-"):
-        (visitor.session.folder / room).mkdir()
-        (visitor.session.folder / room / "basis.bin").write_bytes(b"")
+    for page in ("studio-", "data-"):
+        (visitor.session.folder / page).mkdir()
+        (visitor.session.folder / page / "basis.bin").write_bytes(b"")
     return set(visitor.files())
 
 
@@ -315,7 +315,7 @@ def test_a_body_that_stands_still_is_given_up(tmp_path: Path, monkeypatch: pytes
         async with incoming.open_upload(session, 1000, "0" * 16) as coming:
             await incoming.receive(body(), coming.folder / "a.png", coming)
 
-    with pytest.raises(Refused, match=r"a\.png: nothing came") as refused:
+    with pytest.raises(Refused, match=r"a\.png: nothing arrived") as refused:
         asyncio.run(upload())
     assert refused.value.status == 408 and session.taken == 0 and not list(tmp_path.iterdir())
 

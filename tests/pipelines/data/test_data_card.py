@@ -14,7 +14,7 @@ from data_folders import good_folder, scene_of, sphere_shard, write_folder
 from pipelines.cli import main
 from pipelines.data.data_card import write_card
 from render.planning import provenance
-from render.planning.composition import compose
+from render.planning.plan_counts import count_plan
 from render.planning.provenance import ORIGINAL, UNSTATED, material_terms, mesh_terms
 from render.publishing.croissant import CONFORMS_TO
 from render.records.manifest import read_manifest
@@ -209,7 +209,7 @@ def test_terms_of_materials_and_meshes(tmp_path):
         "Matusik" in terms["chrome"] and terms["brass"] == terms["chrome"] and terms["lambertian:0.5"] == "none needed"
     )
     assert terms["gone.yaml"] == UNSTATED and terms["imported:x"] == ORIGINAL
-    counts = compose([scene_of(sphere_shard(), shape=shape) for shape in ("bunny", "blobby:3", "/home/me/cat.ply")])
+    counts = count_plan([scene_of(sphere_shard(), shape=shape) for shape in ("bunny", "blobby:3", "/home/me/cat.ply")])
     meshes = mesh_terms(counts)
     assert "Stanford" in meshes["bunny"] and "generators" in meshes["blobby"] and meshes["cat.ply"] == UNSTATED
 

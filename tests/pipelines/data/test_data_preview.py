@@ -15,7 +15,7 @@ from pipelines.data.data_preview import ON_PAGE, PER_SHEET, preview
 from pipelines.data.preview import preview_plots
 from pipelines.data.preview.preview_page import BUDGET, gallery
 from pipelines.shared import pictures
-from render.planning.composition import category, components, compose, family, light_directions
+from render.planning.plan_counts import category, components, count_plan, family, light_directions
 from render.records.manifest import View
 
 VOID = {"meta", "img", "br", "link", "path", "use", "rect", "input"}
@@ -192,7 +192,7 @@ def test_composition():
         replace(one, id="c", view=View(scale=0.5), material="missing/file.yaml"),
         replace(one, id="d", shape="meshes/cat.ply", material="lambertian:0.5"),
     ]
-    counts = compose(scenes)
+    counts = count_plan(scenes)
     assert (counts.scenes, counts.images, counts.shapes, counts.views, counts.varying) == (4, 48, 2, 3, 1)
     assert counts.families == {"blobby": 3, "cat.ply": 1} and counts.splits == {"train": 3, "val": 1}
     assert counts.materials["chrome"] == 2 and counts.materials["blue-fabric"] == 1

@@ -223,7 +223,7 @@ def test_damage_in_the_folder_is_named(tmp_path, capsys):
 
 
 def test_non_finite_shards_are_found_on_disk(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(shards, "_checked", lambda array, name: np.ascontiguousarray(array))
+    monkeypatch.setattr(shards, "_check", lambda array, name: np.ascontiguousarray(array))
     shard = sphere_shard()
     write_folder(tmp_path, [images_of(shard, spoil(shard.images, np.nan))])
     assert main(["data", "validate", str(tmp_path)]) == 1
@@ -309,7 +309,7 @@ def test_imported_scenes_of_one_name_are_no_twins(tmp_path):
 
 def test_rendered_scenes_are_sound_and_their_flips_found(tmp_path):
     """Real renders of the hardest materials: mirror-like, black and white with interreflections."""
-    from render.running.worker import render_scenes
+    from render.running.scene_rendering import render_scenes
 
     lights = tuple(tuple(round(float(c), 6) for c in row) for row in light_directions(16))
     base = scene_of(sphere_shard(), shape="blobby:3", lights=lights, bounces=1)

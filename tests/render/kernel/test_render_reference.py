@@ -326,7 +326,7 @@ TEXTURED, MAPS = (next(case for case in CASES if case.material.startswith(kind))
 def test_notices_a_missing_relief(case, material, monkeypatch):
     name = material(case.material)
     truth = expected(case, name)
-    monkeypatch.setattr(cover, "turned", lambda normal, slope, wi: normal)
+    monkeypatch.setattr(cover, "turn", lambda normal, slope, wi: normal)
     assert p_value(ours(case, name), truth) < 1e-4
 
 

@@ -153,7 +153,7 @@ def test_white_stays_white_up_to_the_horizon():
     np.testing.assert_allclose(merl.evaluate(table, wi, wo), 1 / np.pi, rtol=1e-6)
 
 
-def test_what_was_not_measured_takes_its_neighbours_colour_and_is_told_apart(blank):
+def test_what_was_not_measured_takes_its_neighbours_colour_and_is_marked(blank):
     blank[:] = np.arange(90).reshape(90, 1, 1) + 1
     blank[1, 60:] = -0.5  # one bad channel spoils the entry
     blank[:, :, 50] = -1
@@ -164,7 +164,7 @@ def test_what_was_not_measured_takes_its_neighbours_colour_and_is_told_apart(bla
     wi, wo = pairs()
     theta_h, theta_d, _ = angles(wi, wo)
     row, column = np.sqrt(theta_h * 2 / np.pi) * 90, np.degrees(theta_d)
-    known = merl.measured(table, wi, wo)
+    known = merl.is_measured(table, wi, wo)
     assert known[(row < 59) & (column < 49)].all()
     assert not known[row > 60.5].any() and not known[np.abs(column - 50.5) < 0.9].any()
     np.testing.assert_array_equal(np.isnan(merl.as_brdf(table)(wi, wo)).any(1), ~known)

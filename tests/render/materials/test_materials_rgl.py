@@ -188,7 +188,7 @@ def test_packed_files_evaluate_as_their_plugin(packed, files, number):
     assert packed.names == NAMES and len(packed) == 3
 
 
-def test_highlights_are_told_from_matt_materials(packed):
+def test_highlights_are_distinguished_from_matt_materials(packed):
     chrome, plastic, fabric = packed.highlight
     assert packed.highlight.dtype == np.float64
     assert 1 > chrome > plastic > fabric >= 0 and chrome > 0.5 and fabric < 0.1

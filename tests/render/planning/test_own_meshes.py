@@ -8,12 +8,12 @@ import pytest
 import trimesh
 
 from render import shapes
-from render.planning import composition
+from render.planning import plan_counts
 from render.planning.mesh_family import MeshFamily, mesh_files
 from render.planning.plan import DataConfig, plan
 from render.planning.provenance import UNSTATED, mesh_terms
 from render.records.manifest import SceneSpec, read_manifest
-from render.running.worker import render_scenes
+from render.running.scene_rendering import render_scenes
 from render.shared.config import build, to_plain
 from render.shared.errors import InputError
 
@@ -147,7 +147,7 @@ def test_a_mesh_that_cannot_be_framed_is_named(folder):
         plan(config(folder, 1, min_foreground={"meshes": 0.9}))
 
 
-def test_a_changed_or_moved_file_is_told(folder, tmp_path):
+def test_a_changed_or_moved_file_is_refused(folder, tmp_path):
     path = folder / "box0.obj"
     (scene,) = plan(config(path, 1))
     path.write_text(path.read_text() + "# touched\n")
@@ -165,7 +165,7 @@ def test_a_changed_or_moved_file_is_told(folder, tmp_path):
 
 
 def test_counted_as_one_family_with_its_terms(folder):
-    counts = composition.compose(plan(config(folder, 3)))
+    counts = plan_counts.count_plan(plan(config(folder, 3)))
     assert counts.families == {"meshes": 3} and counts.shapes == 3
     assert mesh_terms(counts) == {"meshes": UNSTATED} and mesh_terms(counts, "CC0") == {"meshes": "CC0"}
 

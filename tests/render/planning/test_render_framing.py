@@ -9,7 +9,7 @@ from render.planning.framing import measure, rasterise, tile_view
 from render.planning.plan import DataConfig, random_view
 from render.records.manifest import SceneSpec, View
 from render.records.shards import read_shard
-from render.running import worker
+from render.running import scene_rendering
 from render.shapes import load
 from render.shapes.geometry.mesh import TriangleMesh
 from render.shared.seeds import generator
@@ -35,7 +35,7 @@ def test_estimate_equals_a_real_render(shape, tiles, camera, tmp_path):
             id=f"s{number}", seed=0, split="test", shape=shape, material="lambertian:0.5",
             view=tile_view(view, int(row), int(column), tiles), lights=((0.0, 0.0, 1.0),), size=64, spp=4, bounces=0,
         ))  # fmt: skip
-    worker.render_scenes(scenes, tmp_path)
+    scene_rendering.render_scenes(scenes, tmp_path)
     for scene, (foreground, spread) in zip(scenes, expected, strict=True):
         shard = read_shard(tmp_path / scene.file, scene)
         mean = np.linalg.norm(shard.normals[shard.mask].mean(0))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from render.materials import surfaces
-from render.planning import composition, light_sets
+from render.planning import light_sets, plan_counts
 from render.planning.framing import measure
 from render.planning.plan import DataConfig, is_validation, material_pool, plan
 from render.records.manifest import SceneSpec, View, read_manifest, write_manifest
@@ -91,7 +91,7 @@ def test_impossible_distances_are_refused(change, message):
 def test_a_prefix_changes_names_and_nothing_else():
     plain, named = plan(SMALL), plan(replace(SMALL, prefix="a-"))
     assert [replace(scene, id=f"a-{scene.id}") for scene in plain] == named
-    with pytest.raises(InputError, match="is no name of a file"):
+    with pytest.raises(InputError, match="cannot name a file"):
         replace(SMALL, prefix="../")
 
 
@@ -342,8 +342,8 @@ def test_streams_are_independent_and_stable():
     assert first(0, "a") == first(0, "a")
     keys = [(0,), (1,), (0, "a"), (0, "b"), (0, "a", 1), (0, "a", 2), (0, "a", "1"), (1, "a", 1), (0, 0, "a")]
     assert len({first(*key) for key in keys}) == len(keys)
-    assert 0 <= seeds.derived_seed(0, "blobby", 3) < 2**31
-    assert seeds.derived_seed(0, "blobby", 3) == STREAM
+    assert 0 <= seeds.derive_seed(0, "blobby", 3) < 2**31
+    assert seeds.derive_seed(0, "blobby", 3) == STREAM
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -449,7 +449,7 @@ def test_held_out_materials_are_seen_in_validation_only() -> None:
             assert scene == before[scene.id]
 
 
-def test_procedural_materials_are_drawn_anew_for_every_scene():
+def test_procedural_materials_are_drawn_again_for_every_scene():
     config = DataConfig(families={"blobby": 12}, materials=("procedural",), spatially_varying=0.5, validation=0)
     names = [scene.material for scene in plan(config)]
     assert all(name.startswith("procedural:") for name in names)
@@ -459,13 +459,13 @@ def test_procedural_materials_are_drawn_anew_for_every_scene():
         surfaces.load(name)
 
 
-def test_procedural_materials_beside_others_are_weighed_and_stay_unmixed():
+def test_procedural_materials_among_others_are_weighed_and_stay_unmixed():
     pool = ("metal", "procedural:wood", "lambertian:0.5")
     config = DataConfig(families={"blobby": 40}, materials=pool, material_weights={"procedural": 20}, validation=0,
                         spatially_varying=0.8)  # fmt: skip
     names = [scene.material for scene in plan(config)]
     textured = [name for name in names if "procedural" in name]
     assert len(textured) > 60 and all(name.startswith("procedural:wood:") for name in textured)
-    counted = composition.compose(plan(config))
+    counted = plan_counts.count_plan(plan(config))
     assert counted.categories["procedural-wood"] == len(textured)
     assert counted.materials["procedural:wood"] == len(textured)

@@ -12,7 +12,7 @@ from pipelines.cli import main
 from render.checks.validate import validate
 from render.records import mirror
 from render.records.manifest import SceneSpec, read_manifest
-from render.records.mirror import finished, opened, shard_path
+from render.records.mirror import open_folder, select_rendered, shard_path
 from render.records.packs import PACK, plan_tars
 from render.shared.errors import InputError
 
@@ -75,19 +75,19 @@ def test_webdataset_reads_the_tars(folder: Path, tmp_path: Path) -> None:
 def test_a_packed_set_is_read_as_the_folder_it_holds(folder: Path, tmp_path: Path) -> None:
     pack(folder, tmp_path / "tars")
     scenes = read_manifest(folder)
-    with opened(tmp_path / "tars") as place:
-        assert finished(place, scenes) == scenes
+    with open_folder(tmp_path / "tars") as place:
+        assert select_rendered(place, scenes) == scenes
         assert validate(place).statistics == validate(folder).statistics
         for scene in scenes:
             assert shard_path(place, scene).read_bytes() == (folder / scene.file).read_bytes()
     with pytest.raises(InputError, match="holds a packed set, which is only read"):
-        opened(tmp_path / "tars", purpose="run").__enter__()
+        open_folder(tmp_path / "tars", purpose="run").__enter__()
 
 
 def test_the_cache_keeps_to_its_limit(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pack(folder, tmp_path / "tars")
     monkeypatch.setattr(mirror, "_IN_USE", -1.0)
-    with opened(tmp_path / "tars", cache_gb=100e-6) as place:
+    with open_folder(tmp_path / "tars", cache_gb=100e-6) as place:
         for scene in read_manifest(folder):
             assert shard_path(place, scene).is_file()
             assert sum(path.stat().st_size for path in (place / "shards").iterdir()) <= 100_000
@@ -100,12 +100,15 @@ def test_a_damaged_tar_is_named(folder: Path, tmp_path: Path, how: slice | str) 
         data = (tmp_path / name).read_bytes()
         wrong = data[:9000] + b"0123456789" + data[9010:] if isinstance(how, str) else data[how]
         (tmp_path / name).write_bytes(wrong)
-    with opened(tmp_path) as place, pytest.raises(InputError, match=r"train-00000\d.tar: truncated or altered; remove"):
+    with (
+        open_folder(tmp_path) as place,
+        pytest.raises(InputError, match=r"train-00000\d.tar: truncated or altered; remove"),
+    ):
         shard_path(place, read_manifest(folder)[0])
     (tmp_path / names[0]).write_bytes(b"")
     (tmp_path / PACK).write_text("[]")
-    with pytest.raises(InputError, match=r"pack\.json: is no list of tars"), opened(tmp_path) as place:
-        finished(place, read_manifest(folder))
+    with pytest.raises(InputError, match=r"pack\.json: not a list of tars"), open_folder(tmp_path) as place:
+        select_rendered(place, read_manifest(folder))
 
 
 def test_what_is_not_rendered_is_not_packed(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -122,8 +125,8 @@ def test_what_is_not_rendered_is_not_packed(folder: Path, tmp_path: Path, capsys
     assert not list((tmp_path / "tars").rglob("*.tar"))
     torn.write_bytes(data)
     assert main([*command, "--skip-missing"]) == 0
-    with opened(tmp_path / "tars") as place:
-        assert len(finished(place, read_manifest(place))) == 10
+    with open_folder(tmp_path / "tars") as place:
+        assert len(select_rendered(place, read_manifest(place))) == 10
 
 
 def test_scenes_of_a_shape_are_spread_over_the_tars(folder: Path) -> None:
@@ -145,7 +148,7 @@ def test_a_packed_set_on_a_web_server_needs_no_listing(
     monkeypatch.setattr(SimpleHTTPRequestHandler, "log_message", lambda *_: None)
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=tmp_path)) as web:
         threading.Thread(target=web.serve_forever, daemon=True).start()
-        with opened(f"http://127.0.0.1:{web.server_port}/tars") as place:
+        with open_folder(f"http://127.0.0.1:{web.server_port}/tars") as place:
             scene = read_manifest(place)[0]
             assert shard_path(place, scene).read_bytes() == (folder / scene.file).read_bytes()
         web.shutdown()

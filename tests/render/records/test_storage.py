@@ -26,7 +26,7 @@ from render.checks.validate import validate
 from render.records import manifest, mirror
 from render.records.ledger import now, read_runs, survey
 from render.records.manifest import read_manifest
-from render.records.mirror import finished, opened, publish, shard_path
+from render.records.mirror import open_folder, publish, select_rendered, shard_path
 from render.records.sending import WAITING
 from render.records.shards import read_shard
 from render.running.supervisor import RunOptions, render_supervised
@@ -67,7 +67,7 @@ def s3(server: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> ObjectStore:
 
 def render(url: str, options: RunOptions = ONE) -> list[str]:
     """Render pretended scenes into a store; return the ids rendered now."""
-    with opened(url, purpose="run") as folder:
+    with open_folder(url, purpose="run") as folder:
         manifest.claim(folder, SCENES)
         publish(folder)
         return [line["id"] for line in render_supervised(SCENES, folder, options, serve=pretend).lines]
@@ -94,7 +94,7 @@ def test_a_run_leaves_every_shard_and_one_line_of_each_in_the_store_and_nothing_
 
 
 def test_what_a_killed_run_left_here_is_sent_by_the_next(url: str, tmp_path: Path) -> None:
-    with opened(url, purpose="run") as folder:
+    with open_folder(url, purpose="run") as folder:
         manifest.claim(folder, SCENES)
         publish(folder)
         for number, scene in enumerate(SCENES[:3]):
@@ -104,16 +104,16 @@ def test_what_a_killed_run_left_here_is_sent_by_the_next(url: str, tmp_path: Pat
             with open(folder / WAITING, "a", encoding="utf-8") as handle:  # the third was torn off
                 handle.write(json.dumps(line)[: None if number < 2 else 20] + ("\n" if number < 2 else ""))
     assert render(url) == ["a-2", "a-3", "a-4", "a-5"]
-    with opened(url) as folder:
+    with open_folder(url) as folder:
         assert sum(len(lines) for lines in read_runs(folder)) == 6
         assert len(survey(folder, read_manifest(folder)).done) == 6
 
 
 def test_a_second_run_of_this_machine_is_refused_as_is_another_plan(url: str) -> None:
-    with opened(url, purpose="run"), pytest.raises(InputError, match="another run on this machine"):
+    with open_folder(url, purpose="run"), pytest.raises(InputError, match="another run on this machine"):
         render(url)
     render(url)
-    with opened(url, purpose="run") as folder, pytest.raises(InputError, match="holds another plan"):
+    with open_folder(url, purpose="run") as folder, pytest.raises(InputError, match="holds another plan"):
         manifest.claim(folder, SCENES[:2])
 
 
@@ -124,21 +124,21 @@ def filled(tmp_path: Path) -> tuple[str, list[manifest.SceneSpec]]:
 def test_readers_see_in_a_store_what_lies_in_a_folder(tmp_path: Path) -> None:
     url, scenes = filled(tmp_path)
     here, there = SceneStore(tmp_path / "good", cache=True), validate(tmp_path / "good")
-    with opened(url) as folder:
-        assert finished(folder, scenes) == scenes
+    with open_folder(url) as folder:
+        assert select_rendered(folder, scenes) == scenes
         assert validate(folder).statistics == there.statistics and validate(folder, workers=2).sound
         away = SceneStore(folder, cache=True)
         for scene in [*scenes, *scenes]:  # decoded, then from the cache
             assert np.array_equal(away.load(scene).images[:], here.load(scene).images[:])
 
 
-def test_the_cache_keeps_to_its_limit_and_forgets_what_was_written_anew(
+def test_the_cache_keeps_to_its_limit_and_forgets_what_was_written_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url, scenes = filled(tmp_path)
     size = max((tmp_path / "good" / scene.file).stat().st_size for scene in scenes)
     monkeypatch.setattr(mirror, "_IN_USE", -1.0)
-    with opened(url, cache_gb=2.5 * size / 1e9) as folder:
+    with open_folder(url, cache_gb=2.5 * size / 1e9) as folder:
         for scene in scenes:
             read_shard(shard_path(folder, scene), scene)
             kept = [path.stat().st_size for path in (folder / "shards").iterdir()]
@@ -147,7 +147,7 @@ def test_the_cache_keeps_to_its_limit_and_forgets_what_was_written_anew(
     changed = tmp_path / "good" / scenes[-1].file
     changed.write_bytes(changed.read_bytes())
     os.utime(changed, (later := time.time() + 10, later))  # a clock may stand still for some milliseconds
-    with opened(url) as folder:
+    with open_folder(url) as folder:
         assert not (folder / scenes[-1].file).exists() and shard_path(folder, scenes[-1]).is_file()
 
 
@@ -155,7 +155,7 @@ def test_a_damaged_shard_is_named_by_its_address(tmp_path: Path) -> None:
     url, scenes = filled(tmp_path)
     path = tmp_path / "good" / scenes[1].file
     path.write_bytes(path.read_bytes()[:-10] + b"0123456789")
-    with opened(url) as folder:
+    with open_folder(url) as folder:
         assert len(survey(folder, scenes).done) == len(scenes) - 1
         with pytest.raises(InputError, match=rf"{url}/{scenes[1].file}: truncated or altered"):
             shard_path(folder, scenes[1])
@@ -236,7 +236,7 @@ def strict(s3: ObjectStore) -> Iterator[None]:
 
 
 def commands(place: str, out: Path) -> list[list[str]]:
-    """Return every command that takes an address, told to use one."""
+    """Return every command that takes an address, with one to use."""
     train = ["train", "--preset", "smoke", "--out"]
     return [
         *(["data", verb, place] for verb in ("status", "validate", "preview", "card")),
@@ -305,9 +305,9 @@ def test_a_web_server_is_read_by_its_checksums(tmp_path: Path, monkeypatch: pyte
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=tmp_path)) as web:
         threading.Thread(target=web.serve_forever, daemon=True).start()
         url = f"http://127.0.0.1:{web.server_port}/good"
-        with pytest.raises(InputError, match=r"no checksums\.txt there"), opened(url):
+        with pytest.raises(InputError, match=r"no checksums\.txt there"), open_folder(url):
             pass
         assert main(["data", "card", str(tmp_path / "good")]) == 0
-        with opened(url) as folder:
-            assert finished(folder, scenes) == scenes and validate(folder).sound
+        with open_folder(url) as folder:
+            assert select_rendered(folder, scenes) == scenes and validate(folder).sound
         web.shutdown()

@@ -1,7 +1,6 @@
 """Rendering without storing: the scenes of the shards, in a seeded order, from a process that ends when it should."""
 
 import os
-import queue
 import signal
 import subprocess
 import sys
@@ -15,15 +14,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pretend_stream import busy, listed, pretend
+from pretend_renderer import busy, listed, pretend
 
 from pipelines.shared.stream_config import StreamConfig
-from pipelines.train.streaming import RenderStream, open_streamed, streamed
+from pipelines.train.streaming import open_streamed, streamed
 from render.planning.plan import DataConfig, plan
 from render.records.manifest import SceneSpec, View, write_manifest
 from render.records.shards import read_shard
-from render.running import rendered, worker
-from render.running.scene_stream import StreamWorkerConfig, _render, rendered_scenes, serve, stream_order
+from render.running import rendered_view, scene_rendering
+from render.running.protocol import Failure, Result, WorkerConfig
+from render.running.scene_stream import RenderedStream, stream_chunks
+from render.running.worker_process import ChunkRenderer, serve
 from render.shared.errors import InputError
 from sdps.data.augment import Augmentation
 from sdps.data.dataset import SampleOptions
@@ -50,7 +51,7 @@ def planned(*materials: str) -> list[SceneSpec]:
 
 
 def ids(scenes: list[SceneSpec], count: int, **options) -> list[str]:
-    order = (scene.id for group, skip in stream_order(scenes, **options) for scene in group[skip:])
+    order = (scene.id for chunk in stream_chunks(scenes, **options) for scene in chunk.scenes())
     return list(islice(order, count))
 
 
@@ -59,8 +60,8 @@ def opened() -> Iterator:
     """Yield what opens a stream, closing it in the end."""
     streams = []
 
-    def open_stream(scenes: list[SceneSpec], serve=pretend, start: int = 0, **config) -> RenderStream:
-        streams.append(RenderStream(scenes, 0, start, StreamConfig(**config), serve))
+    def open_stream(scenes: list[SceneSpec], serve=pretend, **options) -> RenderedStream:
+        streams.append(RenderedStream(scenes, seed=0, serve=serve, **options))
         return streams[-1]
 
     yield open_stream
@@ -105,7 +106,7 @@ def simple() -> list[SceneSpec]:
 @pytest.fixture(scope="module")
 def shards(simple, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("shards")
-    worker.render_scenes(simple, folder)
+    scene_rendering.render_scenes(simple, folder)
     return folder
 
 
@@ -118,8 +119,8 @@ def assert_is_shard(folder: Path, scene: SceneSpec, arrays) -> None:
 
 
 @pytest.mark.parametrize("start", [0, 3])  # 3 lies inside of a view
-def test_streamed_scenes_are_the_shards(simple, shards, start):
-    streamed = list(islice(rendered_scenes(simple, seed=0, start=start), 8 - start))  # beyond one pass
+def test_streamed_scenes_are_the_shards(simple, shards, opened, start):
+    streamed = list(islice(opened(simple, serve=serve, start=start, threads=1), 8 - start))  # beyond one pass
     assert [scene.id for scene, _ in streamed] == ids(simple, 8, seed=0)[start:]
     for scene, arrays in streamed:
         assert_is_shard(shards, scene, arrays)
@@ -140,10 +141,18 @@ def test_batches_are_made_of_what_a_process_renders(simple, shards):
         assert sum(found) == 1
 
 
+def render_in_place(scenes: list[SceneSpec]) -> list:
+    """Render the first chunk of the stream as its process would; return the results and failures."""
+    sent: list = []
+    config = WorkerConfig(folder=None, number=0, threads=1, variant="", llvm=None, errors=Path("errors"))
+    ChunkRenderer(sent.append, next(stream_chunks(scenes, seed=0)), config).run()
+    return [message for message in sent if isinstance(message, Result | Failure)]
+
+
 def test_images_that_are_not_finite_are_refused(simple, monkeypatch):
-    monkeypatch.setattr(rendered, "to_half", lambda stack: np.full(stack.shape, np.nan, np.float16))
-    with pytest.raises(InputError, match=f"scene {ids(simple, 1, seed=0)[0]}: the images have infinite or NaN"):
-        next(rendered_scenes(simple, seed=0))
+    monkeypatch.setattr(rendered_view, "to_half", lambda stack: np.full(stack.shape, np.nan, np.float16))
+    (first, *_) = render_in_place(simple)
+    assert first.reason == f"scene {ids(simple, 1, seed=0)[0]}: the images have infinite or NaN values"
 
 
 # ---- The process -----------------------------------------------------------------------------------
@@ -159,11 +168,9 @@ def test_defects_in_the_renderer_are_one_line(simple, monkeypatch):
     def defect(*_):
         raise RuntimeError("drjit: first line\nsecond line")
 
-    monkeypatch.setattr(worker, "build", defect)
-    config = StreamWorkerConfig(scenes=simple, seed=0, start=0, count=1, depth=1, threads=1)
-    kind, reason = _render(config, queue.Queue())
-    assert kind == "failed"
-    assert reason.startswith("the renderer failed (RuntimeError: drjit: first line); `sdps render-data`")
+    monkeypatch.setattr(scene_rendering, "build", defect)
+    (failure,) = render_in_place(simple)
+    assert failure.reason == "RuntimeError: drjit: first line" and "in defect" in failure.traceback
 
 
 @pytest.mark.parametrize(
@@ -175,12 +182,12 @@ def test_death_of_the_renderer_is_one_line(opened, material, reason):
     stream = opened(scenes)
     for id in order[: order.index("s1")]:
         assert next(stream)[0].id == id
-    with pytest.raises(InputError, match=rf"the renderer died \({reason}\) at scene {order.index('s1')}; run `sdps"):
+    with pytest.raises(InputError, match=rf"scene s1: worker died, {reason}; `sdps render-data`"):
         next(stream)
 
 
 def test_hanging_renderer_is_given_up(opened):
-    with pytest.raises(InputError, match=r"no scene within 0\.2 s; raise stream\.timeout"):
+    with pytest.raises(InputError, match=r"scene s0: timed out after 0\.2 s; raise stream\.timeout"):
         next(opened(planned("hang"), timeout=0.2))
     assert not active_children()
 
@@ -196,8 +203,7 @@ def test_closed_stream_stays_closed(opened):
     stream.close()
     stream.close()
     with pytest.raises(InputError):
-        for _ in range(5):  # what was sent before may still be read
-            next(stream)
+        next(stream)
     assert not active_children()
 
 
@@ -217,18 +223,17 @@ def alive(pid: int) -> bool:
 
 
 PARENT = """
-import multiprocessing, time
-from pretend_stream import busy
-from render.running.scene_stream import StreamWorkerConfig
+import time
+from pretend_renderer import busy
+from render.records.manifest import SceneSpec, View
+from render.running.scene_stream import RenderedStream
 
 if __name__ == "__main__":
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    config = StreamWorkerConfig(scenes=[None], seed=0, start=0, count=9, depth=1, threads=1)
-    process = context.Process(target=busy, args=(theirs, config), daemon=True)
-    process.start()
-    ours.poll(None)
-    print(process.pid, flush=True)
+    scene = SceneSpec(id="s0", seed=0, split="train", shape="blobby:0", material="ok", view=View(),
+                      lights=((0.0, 0.0, 1.0),), size=16, spp=2, bounces=0)
+    stream = RenderedStream([scene], seed=0, serve=busy)
+    next(stream)
+    print(stream._pool.workers[0].process.pid, flush=True)
     time.sleep(60)
 """
 
@@ -253,12 +258,13 @@ def test_renderer_ends_with_a_killed_parent(tmp_path):
 def test_interrupt_is_left_to_the_parent(opened):
     stream = opened(planned("ok"), serve=busy)
     next(stream)
-    os.kill(stream._process.pid, signal.SIGINT)
-    stream._process.join(0.3)
-    assert stream._process.is_alive()
-    os.kill(stream._process.pid, signal.SIGTERM)
-    stream._process.join(20)
-    assert not stream._process.is_alive()
+    process = stream._pool.workers[0].process
+    os.kill(process.pid, signal.SIGINT)
+    process.join(0.3)
+    assert process.is_alive()
+    os.kill(process.pid, signal.SIGTERM)
+    process.join(20)
+    assert not process.is_alive()
 
 
 # ---- The source ------------------------------------------------------------------------------------

@@ -21,8 +21,8 @@ from render.records import ledger
 from render.records.ledger import Ledger
 from render.records.manifest import SceneSpec, View
 from render.records.shards import file_hash
-from render.running.crew import LocalCrew
 from render.running.supervisor import RunOptions, render_supervised
+from render.running.worker_pool import LocalPool
 from render.shared import temporary
 from render.shared.errors import InputError
 from render.shared.temporary import temporary_path
@@ -55,18 +55,18 @@ def failures(folder: Path) -> list[dict]:
 
 
 class Waiting:
-    """A crew that waits for a while and then has done its only scene."""
+    """A pool that waits for a while and then has done its only scene."""
 
     slots = count = 1
     chunk_bytes, note = 0, ""
 
-    def give(self, chunks) -> None:
+    def submit(self, chunks) -> None:
         self.notes = ["waits for workers"] * 3 + ["", ""]
 
     def busy(self) -> bool:
         return bool(self.notes)
 
-    def step(self) -> list:
+    def poll(self) -> list:
         self.note = self.notes.pop(0)
         return []
 
@@ -74,8 +74,8 @@ class Waiting:
         pass
 
 
-def test_what_a_crew_waits_for_is_told_once_and_taken_back(tmp_path, capsys):
-    render_supervised(planned([["ok"]]), tmp_path, crew=Waiting())
+def test_what_a_pool_waits_for_is_shown_once_and_taken_back(tmp_path, capsys):
+    render_supervised(planned([["ok"]]), tmp_path, pool=Waiting())
     said = capsys.readouterr().err
     assert said.count("waits for workers") == 1 and "waits" not in said.rpartition("render:")[2]
 
@@ -270,13 +270,13 @@ def test_another_machines_half_written_shards_go_by_the_clock_of_the_file_server
 # ---- The real renderer -----------------------------------------------------------------------------
 
 
-def test_real_processes_write_the_bytes_of_a_plain_run_whatever_fails_beside_them(tmp_path, monkeypatch):
+def test_real_processes_write_the_bytes_of_a_plain_run_whatever_else_fails(tmp_path, monkeypatch):
     """Two processes; one scene's material file is missing, another one blocks its process, which is then killed."""
-    from render.running import rendered
-    from render.running.worker import render_scenes
+    from render.running import rendered_view
+    from render.running.scene_rendering import render_scenes
 
     commit = "0" * 40  # a file of the checkout that changes meanwhile would show in the headers
-    monkeypatch.setattr(rendered, "_stamped", commit)
+    monkeypatch.setattr(rendered_view, "_commit", commit)
     config = DataConfig(families={"blobby": 4}, views=1, materials_per_view=2, light_count=4, size=24, spp=4)
     scenes = plan(config)
     assert render_scenes(scenes, tmp_path / "plain") == 8
@@ -295,7 +295,7 @@ def test_real_processes_write_the_bytes_of_a_plain_run_whatever_fails_beside_the
 
     helper = threading.Thread(target=kill_the_blocked_one, daemon=True)
     helper.start()
-    summary = render_supervised(mixed, tmp_path, crew=LocalCrew(tmp_path, tmp_path, workers=2, commit=commit))
+    summary = render_supervised(mixed, tmp_path, pool=LocalPool(tmp_path, tmp_path, workers=2, commit=commit))
     helper.join()
     assert (summary.done, len(summary.failed)) == (4, 4)
     reasons = {line["id"]: line["reason"] for line in summary.failed}

@@ -11,8 +11,8 @@ from render.planning.chunks import Chunk, view_groups
 from render.planning.plan import DataConfig, plan
 from render.records.manifest import SceneSpec, View
 from render.records.shards import Shard, file_hash, is_whole, read_shard
-from render.running import isolation, worker
-from render.running.messages import Begun, Done, Failed, Message, WorkerConfig
+from render.running import scene_rendering, worker_process
+from render.running.protocol import Failure, Message, Result, Started, WorkerConfig
 from render.shared.errors import InputError
 
 CONFIG = DataConfig(
@@ -33,7 +33,7 @@ def scenes() -> list[SceneSpec]:
 def whole(scenes, tmp_path_factory) -> dict[str, str]:
     """Render the plan without a break; return the hash of every shard."""
     folder = tmp_path_factory.mktemp("whole")
-    assert worker.render_scenes(scenes, folder) == len(scenes)
+    assert scene_rendering.render_scenes(scenes, folder) == len(scenes)
     return hashes(folder)
 
 
@@ -57,17 +57,17 @@ def stop_after(count: int):
 def test_interrupted_and_resumed_equals_uninterrupted(scenes, whole, tmp_path, count):
     """Views have three materials, so 1, 5 and 11 stop in the middle of a group that shares rays."""
     with pytest.raises(Stopped):
-        worker.render_scenes(scenes, tmp_path, on_shard=stop_after(count))
+        scene_rendering.render_scenes(scenes, tmp_path, on_shard=stop_after(count))
     first = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "shards").iterdir()}
     assert len(first) == count
-    assert worker.render_scenes(scenes, tmp_path) == len(scenes) - count
+    assert scene_rendering.render_scenes(scenes, tmp_path) == len(scenes) - count
     assert hashes(tmp_path) == whole
     assert all((tmp_path / "shards" / name).stat().st_mtime_ns == time for name, time in first.items())
-    assert worker.render_scenes(scenes, tmp_path) == 0
+    assert scene_rendering.render_scenes(scenes, tmp_path) == 0
 
 
 def test_damaged_and_foreign_shards_are_rendered_again(scenes, whole, tmp_path):
-    worker.render_scenes(scenes[:3], tmp_path)
+    scene_rendering.render_scenes(scenes[:3], tmp_path)
     first, second, third = (tmp_path / scene.file for scene in scenes[:3])
     first.write_bytes(first.read_bytes()[:-500])
     data = bytearray(second.read_bytes())
@@ -75,12 +75,12 @@ def test_damaged_and_foreign_shards_are_rendered_again(scenes, whole, tmp_path):
     second.write_bytes(data)
     third.unlink()
     assert [is_whole(tmp_path / scene.file, scene) for scene in scenes[:3]] == [False, False, False]
-    assert worker.render_scenes(scenes[:3], tmp_path) == 3
+    assert scene_rendering.render_scenes(scenes[:3], tmp_path) == 3
     assert hashes(tmp_path) == {name: whole[name] for name in hashes(tmp_path)}
 
 
 def test_shard_holds_what_the_manifest_says(scenes, whole, tmp_path):
-    worker.render_scenes(scenes[:3], tmp_path)
+    scene_rendering.render_scenes(scenes[:3], tmp_path)
     shard = read_shard(tmp_path / scenes[1].file, scenes[1])
     assert shard.images.shape == (6, 24, 24, 3) and shard.mask.any()
     assert not shard.images[:, shard.coverage == 0].any()
@@ -105,23 +105,23 @@ def test_lights_brighten_the_side_they_stand_on(tmp_path):
         id="sphere", seed=0, split="test", shape="sphere", material="lambertian:0.8", view=View(scale=0.9),
         lights=lights, size=32, spp=16, bounces=1,
     )  # fmt: skip
-    worker.render_scenes([scene], tmp_path)
+    scene_rendering.render_scenes([scene], tmp_path)
     shard = read_shard(tmp_path / scene.file, scene)
     expected = 0.8 * np.maximum(np.einsum("hwc,lc->lhw", shard.normals, shard.light_directions), 0)
     inner = shard.normals[..., 2] > 0.4
     np.testing.assert_allclose(shard.images[..., 1].astype(np.float32)[:, inner], expected[:, inner], atol=0.02)
 
 
-def test_object_outside_the_frame_is_told(scenes, tmp_path):
+def test_object_outside_the_frame_is_refused(scenes, tmp_path):
     lost = replace(scenes[0], view=View(scale=0.05, offset=(4.0, 0.0)))
     with pytest.raises(InputError, match=r"outside the frame; check view\.scale"):
-        worker.render_scenes([lost], tmp_path)
+        scene_rendering.render_scenes([lost], tmp_path)
     assert not (tmp_path / "shards").exists() or not any((tmp_path / "shards").iterdir())
 
 
 def test_scenes_that_are_not_square_are_refused(scenes, tmp_path):
     with pytest.raises(InputError, match="size is 16x24; only square images"):
-        worker.render_scenes([replace(scenes[0], size=(16, 24))], tmp_path)
+        scene_rendering.render_scenes([replace(scenes[0], size=(16, 24))], tmp_path)
 
 
 # ---- Spatially-varying scenes -----------------------------------------------------------------------
@@ -137,7 +137,7 @@ def varying(kind: str, folder: Path, **changes) -> tuple[Shard, list[Shard]]:
         lights=((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (-0.28, 0.6, 0.7493998)),
     )  # fmt: skip
     scenes = [replace(spec, id=str(number), material=name, **changes) for number, name in enumerate(names)]
-    assert worker.render_scenes(scenes, folder) == 3
+    assert scene_rendering.render_scenes(scenes, folder) == 3
     first, *others = (read_shard(folder / scene.file, scene) for scene in scenes)
     return first, others
 
@@ -172,7 +172,7 @@ def test_a_pattern_of_one_material_twice_is_that_material(tmp_path):
     )  # fmt: skip
     plain = replace(spec, id="b", material="pink-felt")
     for scene in (spec, plain):
-        worker.render_scenes([scene], tmp_path)
+        scene_rendering.render_scenes([scene], tmp_path)
     twice, once = (read_shard(tmp_path / scene.file, scene) for scene in (spec, plain))
     assert twice.materials == ("pink-felt", "pink-felt")
     np.testing.assert_allclose(twice.images.astype(np.float32), once.images.astype(np.float32), rtol=5e-3, atol=2e-3)
@@ -187,42 +187,42 @@ def test_bounces_add_light_to_a_varying_surface(tmp_path):
     np.testing.assert_array_equal(bounced.weights, direct.weights)
 
 
-def test_an_unknown_part_of_a_pattern_is_told(scenes, tmp_path):
+def test_an_unknown_part_of_a_pattern_is_refused(scenes, tmp_path):
     with pytest.raises(InputError, match="did you mean 'chrome'"):
-        worker.render_scenes([replace(scenes[0], material="stripes:1:crome+nylon")], tmp_path)
+        scene_rendering.render_scenes([replace(scenes[0], material="stripes:1:crome+nylon")], tmp_path)
 
 
 # ---- One process's work, isolated ------------------------------------------------------------------
 
 
 def work(scenes: list[SceneSpec], folder: Path) -> tuple[bool, list[Message]]:
-    """Render one chunk as a rendering process does; return whether it is still sound, and what it told."""
+    """Render one chunk as a rendering process does; return whether it is still sound, and what it sent."""
     groups = tuple(tuple(group) for group in view_groups(scenes))
     chunk = Chunk(scenes[0].shape, groups, frozenset(scene.id for scene in scenes))
-    told: list[Message] = []
+    sent: list[Message] = []
     config = WorkerConfig(folder=folder, number=3, threads=1, variant="", llvm=None, errors=folder / "errors")
-    return isolation.Work(told.append, chunk, config).run(), told
+    return worker_process.ChunkRenderer(sent.append, chunk, config).run(), sent
 
 
 def fail_writing(monkeypatch: pytest.MonkeyPatch, scene: SceneSpec, error: Exception) -> None:
     """Let the shard of one scene fail to be written."""
-    real = worker.write_shard
+    real = scene_rendering.write_shard
 
     def write(path: Path, shard) -> None:
         if shard.scene_id == scene.id:
             raise error
         real(path, shard)
 
-    monkeypatch.setattr(worker, "write_shard", write)
+    monkeypatch.setattr(scene_rendering, "write_shard", write)
 
 
 def test_a_scene_that_fails_leaves_the_bytes_of_its_neighbours(scenes, whole, tmp_path, monkeypatch):
     fail_writing(monkeypatch, scenes[1], InputError("the image has infinite values"))
-    sound, told = work(scenes[:3], tmp_path)
-    assert sound and [type(message) for message in told] == [Begun, Begun, Done, Failed, Begun, Done]
-    assert (told[3].ids, told[3].reason) == ((scenes[1].id,), "the image has infinite values")
+    sound, sent = work(scenes[:3], tmp_path)
+    assert sound and [type(message) for message in sent] == [Started, Started, Result, Failure, Started, Result]
+    assert (sent[3].ids, sent[3].reason) == ((scenes[1].id,), "the image has infinite values")
     assert hashes(tmp_path) == {f"{scenes[k].id}.exr": whole[f"{scenes[k].id}.exr"] for k in (0, 2)}
-    line = told[2].line
+    line = sent[2].line
     assert line["id"] == scenes[0].id and line["spec"] == scenes[0].digest() and line["worker"] == 3
     assert line["bytes"] == (tmp_path / scenes[0].file).stat().st_size
     assert line["seconds"] == pytest.approx(sum(line["stages"].values()), abs=1e-3)
@@ -230,22 +230,22 @@ def test_a_scene_that_fails_leaves_the_bytes_of_its_neighbours(scenes, whole, tm
 
 def test_a_defect_ends_the_process_with_a_traceback(scenes, tmp_path, monkeypatch):
     fail_writing(monkeypatch, scenes[0], RuntimeError("internal"))
-    sound, told = work(scenes[:3], tmp_path)
-    assert not sound and [type(message) for message in told] == [Begun, Begun, Failed]
-    assert told[-1].reason == "RuntimeError: internal" and "in write" in told[-1].traceback
+    sound, sent = work(scenes[:3], tmp_path)
+    assert not sound and [type(message) for message in sent] == [Started, Started, Failure]
+    assert sent[-1].reason == "RuntimeError: internal" and "in write" in sent[-1].traceback
 
 
 def test_a_disk_that_refuses_concerns_the_whole_run(scenes, tmp_path):
     (tmp_path / "shards").write_text("")  # a file where the folder should be
-    with pytest.raises(worker.Unwritable, match="cannot be written"):
+    with pytest.raises(scene_rendering.Unwritable, match="cannot be written"):
         work(scenes[:3], tmp_path)
 
 
 def test_shapes_and_views_that_fail_take_their_scenes_along(scenes, tmp_path):
-    sound, told = work([replace(scene, shape="gone.obj") for scene in scenes[:3]], tmp_path)
-    assert sound and told[-1].ids == tuple(scene.id for scene in scenes[:3]) and "gone.obj" in told[-1].reason
+    sound, sent = work([replace(scene, shape="gone.obj") for scene in scenes[:3]], tmp_path)
+    assert sound and sent[-1].ids == tuple(scene.id for scene in scenes[:3]) and "gone.obj" in sent[-1].reason
     lost = View(scale=0.05, offset=(4.0, 0.0))
-    sound, told = work([replace(scenes[0], view=lost, id="a"), scenes[3]], tmp_path)
-    (failed,) = [message for message in told if isinstance(message, Failed)]
+    sound, sent = work([replace(scenes[0], view=lost, id="a"), scenes[3]], tmp_path)
+    (failed,) = [message for message in sent if isinstance(message, Failure)]
     assert sound and failed.ids == ("a",) and "outside the frame" in failed.reason
     assert (tmp_path / scenes[3].file).is_file()

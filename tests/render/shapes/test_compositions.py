@@ -18,11 +18,11 @@ from render.planning import plan as planning
 from render.planning.data_config import DataConfig
 from render.records.manifest import SceneSpec, View
 from render.records.shards import read_shard, write_shard
-from render.running.rendered import rendered_views
+from render.running.rendered_view import rendered_views
 from render.shapes import compositions
 from render.shapes.files.mesh_file import from_trimesh
 from render.shapes.geometry.contact import CLEARANCE, free_path
-from render.shapes.geometry.mesh import TriangleMesh, joined
+from render.shapes.geometry.mesh import TriangleMesh, join
 from render.shared.errors import InputError
 from render.shared.seeds import generator
 
@@ -80,9 +80,9 @@ def test_edges_corners_and_faces_meet_exactly():
     assert free_path(box((1, 1, 1), diagonal, (0, 4, 0)), cube, DOWN) == pytest.approx(
         3.5 - np.sqrt(0.5) - CLEARANCE, abs=1e-6
     )
-    beside = box((1, 1, 1), at=(1.5, 0.2, 0))
-    assert free_path(beside, cube, np.array([-1.0, 0, 0])) == pytest.approx(0.5 - CLEARANCE, abs=1e-6)
-    assert free_path(beside, cube, np.array([1.0, 0, 0])) == np.inf
+    other = box((1, 1, 1), at=(1.5, 0.2, 0))
+    assert free_path(other, cube, np.array([-1.0, 0, 0])) == pytest.approx(0.5 - CLEARANCE, abs=1e-6)
+    assert free_path(other, cube, np.array([1.0, 0, 0])) == np.inf
 
 
 def test_every_kind_is_drawn():
@@ -204,6 +204,6 @@ def test_the_shard_keeps_the_ids(built, tmp_path):
 
 def test_joined_meshes_keep_their_faces():
     first, second = support.plane(), support.ball(0.5, (0, 0, 1))
-    whole = joined([first, second])
+    whole = join([first, second])
     np.testing.assert_array_equal(np.bincount(whole.objects), [len(first.faces), len(second.faces)])
     np.testing.assert_allclose(whole.vertices[whole.faces[2:]], second.vertices[second.faces])

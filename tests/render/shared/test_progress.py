@@ -3,41 +3,41 @@
 import pytest
 
 from render.shared import progress
-from render.shared.progress import bars, listening, repeat, share, stage, together
+from render.shared.progress import bars, repeat, report_to, share, share_out, stage
 
 
-def test_stages_are_told_to_who_listens_and_to_nobody_else() -> None:
-    told: list[tuple[str, float]] = []
+def test_stages_are_reported_to_who_listens_and_to_nobody_else() -> None:
+    reported: list[tuple[str, float]] = []
     stage("nobody hears", 1, 2)
-    with listening(lambda *values: told.append(values)):
+    with report_to(lambda *values: reported.append(values)):
         stage("reading", 1, 4)
         with repeat(1, 2):
             stage("lights", 1, 2)
     stage("nobody hears", 1, 2)
-    assert told == [("reading", 0.25), ("lights", 0.75)]
+    assert reported == [("reading", 0.25), ("lights", 0.75)]
 
 
 def test_stages_of_a_job_are_shares_of_it() -> None:
-    told: list[tuple[str, float]] = []
-    with listening(lambda *values: told.append(values)), together({"lights": 1.0, "normals": 3.0}):
+    reported: list[tuple[str, float]] = []
+    with report_to(lambda *values: reported.append(values)), share_out({"lights": 1.0, "normals": 3.0}):
         stage("lights", 1, 2)
         stage("something else")
         stage("normals", 1, 3)
         stage("normals", 3, 3)
-    assert told == [("lights", 0.125), ("normals", 0.5), ("normals", 1.0)]
-    with together({"lights": 1.0}):
+    assert reported == [("lights", 0.125), ("normals", 0.5), ("normals", 1.0)]
+    with share_out({"lights": 1.0}):
         stage("lights")
 
 
 def test_parts_of_a_stage_may_be_nested() -> None:
-    told: list[tuple[str, float]] = []
-    with listening(lambda *values: told.append(values)), repeat(1, 4):
+    reported: list[tuple[str, float]] = []
+    with report_to(lambda *values: reported.append(values)), repeat(1, 4):
         with share(0.0, 0.5), repeat(1, 2):
             stage("normals", 1, 2)
         with share(0.5, 1.0):
             stage("normals", 1, 1)
     stage("normals")
-    assert told == [("normals", 0.25 + 0.25 * 0.375), ("normals", 0.5)]
+    assert reported == [("normals", 0.25 + 0.25 * 0.375), ("normals", 0.5)]
 
 
 def test_long_stages_have_a_bar_with_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

@@ -31,7 +31,7 @@ def of_another_machine(path: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["a", "a.exr", ".a", "a.b.c", "a[1-3]*?.exr", "\u0101" * 120 + ".json", "x" * 250])
 @pytest.mark.parametrize("suffix", [False, True])
-def test_a_name_is_told_from_others_keeps_its_suffix_and_fits(name: str, suffix: bool, tmp_path: Path) -> None:
+def test_a_name_differs_from_others_keeps_its_suffix_and_fits(name: str, suffix: bool, tmp_path: Path) -> None:
     path = tmp_path / name
     made = temporary_path(path, suffix=suffix)
     made.write_text("")

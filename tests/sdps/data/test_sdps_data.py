@@ -353,7 +353,7 @@ def test_a_camera_changes_no_other_draw_of_a_sample(folder: Path, exposure: str)
 # --- mixed light ---
 
 
-def test_mixed_light_is_drawn_anew_and_the_same_from_shards_and_cache(tmp_path: Path) -> None:
+def test_mixed_light_is_drawn_again_and_the_same_from_shards_and_cache(tmp_path: Path) -> None:
     write_stage(tmp_path)
     alone = LightMix(environments=("constant",), environment=1.0, directional=0.0, lamp=0.0, area=0.0)
     config = options(augmentation=replace(PLAIN, mixed=alone), images=5, size=24)

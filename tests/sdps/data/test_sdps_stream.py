@@ -194,12 +194,12 @@ def test_identity_holds_what_decides_the_batches() -> None:
         ({"world": 3}, "cannot be shared by 3 processes"),
     ],
 )
-def test_bad_settings_are_told(changes: dict, message: str) -> None:
+def test_bad_settings_are_refused(changes: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         source(**changes)
 
 
-def test_unusable_plans_and_places_are_told() -> None:
+def test_unusable_plans_and_places_are_refused() -> None:
     with pytest.raises(InputError, match="no scene to train on"):
         StreamedScenes([], Rendered, OPTIONS, batch=4, window=6, fresh=1)
     with pytest.raises(InputError, match="set images to 2 or less"):

@@ -62,9 +62,9 @@ def test_the_mean_of_views_is_expected_to_err_less_by_what_averages_out() -> Non
     noise = torch.randn(8, 1, 4000, 2, generator=rng) * torch.deg2rad(torch.tensor(own)) / 2**0.5
     noise[..., 0] += torch.deg2rad(torch.tensor(common))
     directions = torch.nn.functional.normalize(torch.cat([noise, torch.ones(8, 1, 4000, 1)], dim=-1), dim=-1)
-    gains, told = torch.ones(1, 4000), torch.full((1, 4000), 5.0)
+    gains, each_error = torch.ones(1, 4000), torch.full((1, 4000), 5.0)
     views = zip(SYMMETRIES, directions, strict=True)
-    mean = mean_lights([(each, Lights(each.vectors(one), gains, expected_error=told)) for each, one in views])
+    mean = mean_lights([(each, Lights(each.vectors(one), gains, expected_error=each_error)) for each, one in views])
     made = angle_degrees(mean.directions.numpy(), np.array([0.0, 0.0, 1.0]))
     assert mean.expected_error is not None
     assert float(mean.expected_error.square().mean().sqrt()) == pytest.approx(

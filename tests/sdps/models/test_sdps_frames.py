@@ -102,13 +102,13 @@ def test_a_frame_has_the_normal_along_z_and_the_view_in_its_xz_plane():
 def test_what_a_pixel_is_told_does_not_change_when_it_turns_about_the_view():
     values, lights, errors = torch.rand(20, 9, 3), unit(20, 9), torch.rand(20, 9)
     turned = rotate_about_view(lights, 1.1)
-    told = []
+    inputs = []
     for directions in (lights, turned):
         first, scale, error = first_normals(values, directions)
         axes = frames(first)
         start = (axes @ first[..., None])[..., 0]
-        told.append(pixel_inputs(Pixels(values, directions, errors), axes, start, scale, error))
-    for one, other in zip(*told, strict=True):
+        inputs.append(pixel_inputs(Pixels(values, directions, errors), axes, start, scale, error))
+    for one, other in zip(*inputs, strict=True):
         torch.testing.assert_close(one, other, atol=2e-3, rtol=1e-3)
 
 
@@ -209,7 +209,7 @@ def _batch():
                  torch.ones(1, 6), torch.zeros(1, 2, dtype=torch.int64), torch.tensor([5]))  # fmt: skip
 
 
-def test_the_network_knows_which_lights_to_doubt(trained):
+def test_the_errors_of_lights_make_a_difference(trained):
     seen, errors = observations(9), torch.full((1, 9), 8.0)
     with torch.no_grad():
         exact, zero, doubtful = (
@@ -231,7 +231,7 @@ def test_a_variant_goes_through_its_weights_file(tmp_path: Path) -> None:
     metadata = {"config": {"augmentation": to_plain(Augmentation())}}
     file = tmp_path / "own.safetensors"
     save_weights(file, TrainedModel(stage.model, stage.network, stage.options, metadata))
-    loaded, seen = load_weights(file, "normals"), observations(3)
+    loaded, seen = load_weights(file), observations(3)
     assert loaded.options == {"width": 16, "blocks": 1}
     assert parameter_count(loaded.network) < MODELS["frames"].parameters
     with torch.no_grad():

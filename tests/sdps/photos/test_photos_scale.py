@@ -8,7 +8,7 @@ import pytest
 from sdps_scenes import hemisphere_lights
 
 from render.shared.errors import InputError
-from render.shared.imaging.reducing import reduced_shape
+from render.shared.imaging.reducing import smaller_shape
 from sdps.photos import check, load, scaling
 
 LIGHTS = hemisphere_lights(5, np.random.default_rng(0))
@@ -96,6 +96,6 @@ def test_pictures_that_would_fill_the_memory(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_scale_that_leaves_nothing() -> None:
-    assert reduced_shape((100, 200), 1.0) == (100, 200)
+    assert smaller_shape((100, 200), 1.0) == (100, 200)
     with pytest.raises(InputError, match="leaves 4x2 pixels of pictures of 200x100"):
-        reduced_shape((100, 200), 0.02)
+        smaller_shape((100, 200), 0.02)

@@ -1,4 +1,4 @@
-"""Model cards: what they say comes from the files, the rest is not recorded, and what they tell to run runs."""
+"""Model cards: what they say comes from the files, the rest is not recorded, and the commands on them run."""
 
 import json
 import re
@@ -87,9 +87,9 @@ def test_a_card_of_weights_with_nonsense_in_them_is_refused(values: dict, tmp_pa
 
 
 def test_errors_of_lights_are_those_of_lights_that_were_found(tmp_path: Path) -> None:
-    told = render_card(write_run(tmp_path / "told", None))
+    given = render_card(write_run(tmp_path / "given", None))
     found = render_card(write_run(tmp_path / "found", None, lights="lcnet"))
-    assert "direction_mae" not in told and "intensity_error" not in told
+    assert "direction_mae" not in given and "intensity_error" not in given
     assert "| direction_mae | 5.5 | degrees" in found and "| intensity_error | 0.125 |" in found
     shipped = (pretrained.shipped_folder() / "psfcn.md").read_text()
     assert "direction_mae" not in shipped and "intensity_error" not in shipped and "normal_mae" in shipped

@@ -132,15 +132,15 @@ def test_given_directions_stay_and_intensities_are_found() -> None:
     normals, mask = bumpy()
     images, lights, intensities = lit(normals, 16, seed=4)
     start = turned(normals, 10.0, seed=2) * mask[..., None]
-    told = intensities * np.random.default_rng(3).uniform(0.9, 1.1, 16)
-    found = refine(images, mask, start, lights, told, directions_given=True, config=QUICK)
+    given = intensities * np.random.default_rng(3).uniform(0.9, 1.1, 16)
+    found = refine(images, mask, start, lights, given, directions_given=True, config=QUICK)
     assert np.allclose(found.light_directions, lights, atol=1e-6)
     share = found.intensities.mean(axis=1) / intensities
-    assert np.std(share) / np.mean(share) < 0.01 < 0.04 < np.std(told / intensities)
+    assert np.std(share) / np.mean(share) < 0.01 < 0.04 < np.std(given / intensities)
     assert errors(found, normals, mask, lights)[0] < 1.0
 
 
-def test_a_corrupted_image_among_good_ones_does_not_matter_and_is_told() -> None:
+def test_a_corrupted_image_among_good_ones_hardly_matters_and_is_found() -> None:
     normals, mask = bumpy()
     images, lights, _ = lit(normals, 24, seed=5, gloss=1.0)
     images[7] = images[7][::-1, ::-1]

@@ -1,6 +1,7 @@
 """The reflectance of refinement: its text, number by number; NumPy and torch; no modes."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -11,8 +12,8 @@ from sdps.refinement.reflectance import LEAST_COSINE, MODES, evaluate_factor, me
 
 RNG = np.random.default_rng(0)
 NORMALS, LIGHTS = (unit_normals(hemisphere_lights(count, RNG).astype(np.float64)) for count in (30, 8))
-PIXELS = RNG.uniform(0.2, 1.0, (30, 3)), RNG.uniform(0.1, 1.0, 30)
-NUMBERS = {
+SURFACE = {
+    "albedo": RNG.uniform(0.2, 1.0, (30, 3)), "strength": RNG.uniform(0.1, 1.0, 30),
     "body": np.array([0.1, -0.2, 0.05, 0.3]), "amplitudes": np.array([0.5, 1.0]), "sharpness": np.array([20.0, 200.0]),
     "modes": np.array([0.1, -0.2, 0.2, 0.1, -0.3, 0.05]),
 }  # fmt: skip
@@ -20,7 +21,7 @@ NUMBERS = {
 
 def write_out(n: np.ndarray, light: np.ndarray, rho: float, s: float) -> float:
     """Return the radiance of one channel of one pixel as the module's text says, in plain numbers."""
-    b, a, kappa, m = NUMBERS.values()
+    b, a, kappa, m = list(SURFACE.values())[2:]
     h = light + np.array([0.0, 0.0, 1.0])
     h = h / math.sqrt(h @ h)
     nl, nv = max(n @ light, LEAST_COSINE), max(n[2], LEAST_COSINE)
@@ -34,18 +35,18 @@ def write_out(n: np.ndarray, light: np.ndarray, rho: float, s: float) -> float:
 
 
 def test_radiance_is_what_the_text_says() -> None:
-    found = shade(NORMALS, LIGHTS, *PIXELS, **NUMBERS)
+    found = shade(NORMALS, LIGHTS, SimpleNamespace(**SURFACE))
     expected = [
         [[write_out(n, light, rho, s) for light in LIGHTS] for rho in albedo]
-        for n, albedo, s in zip(NORMALS, *PIXELS, strict=True)
+        for n, albedo, s in zip(NORMALS, SURFACE["albedo"], SURFACE["strength"], strict=True)
     ]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_tensors_and_arrays_reflect_alike() -> None:
-    tensors = [torch.from_numpy(np.asarray(part)) for part in (NORMALS, LIGHTS, *PIXELS)]
-    found = shade(*tensors, **{name: torch.from_numpy(value) for name, value in NUMBERS.items()})
-    np.testing.assert_allclose(found.numpy(), shade(NORMALS, LIGHTS, *PIXELS, **NUMBERS), rtol=1e-12)
+    surface = SimpleNamespace(**{name: torch.from_numpy(value) for name, value in SURFACE.items()})
+    found = shade(torch.from_numpy(NORMALS), torch.from_numpy(LIGHTS), surface)
+    np.testing.assert_allclose(found.numpy(), shade(NORMALS, LIGHTS, SimpleNamespace(**SURFACE)), rtol=1e-12)
 
 
 def test_nothing_is_added_without_modes_and_where_light_and_camera_face_the_surface() -> None:

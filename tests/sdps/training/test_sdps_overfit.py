@@ -88,7 +88,7 @@ def test_lcnet_learns_the_light_directions_of_a_few_scenes(tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_lcnet_learns_the_light_intensities_of_a_few_scenes(tmp_path: Path) -> None:
-    # Intensities are drawn anew on every access, so these are learned rather than remembered, which takes longer.
+    # Intensities are drawn again on every access, so these are learned rather than remembered, which takes longer.
     before, after = overfit_lcnet(tmp_path, 600, INPUT_SIZE)
     assert before["intensity_error"] > 0.25
     assert after["intensity_error"] < 0.15

@@ -26,7 +26,7 @@ from sdps.training.training_config import NormalTraining
 
 @pytest.fixture(autouse=True)
 def forgotten() -> Iterator[None]:
-    """Let every test, and what follows, measure anew."""
+    """Let every test, and what follows, measure again."""
     yield
     precision._resolved.cache_clear()
     precision._speed.cache_clear()
@@ -69,8 +69,8 @@ def test_unknown_precisions_are_one_line(capsys: pytest.CaptureFixture, tmp_path
     with pytest.raises(InputError, match="unknown precision 'bfloat'; did you mean 'bfloat16'"):
         arithmetic("bfloat")
     assert main(["infer", str(tmp_path), "--precision", "float33"]) == 2
-    told = capsys.readouterr().err
-    assert "did you mean 'float32'" in told and told.count("\n") == 1
+    message = capsys.readouterr().err
+    assert "did you mean 'float32'" in message and message.count("\n") == 1
 
 
 @pytest.mark.parametrize(("capability", "chosen"), [((7, 5), "float32"), ((8, 0), "bfloat16"), ((9, 0), "bfloat16")])

@@ -17,7 +17,7 @@ from sdps_scenes import errors, write_data
 
 from pipelines.cli import main
 from render.records import mirror
-from render.records.mirror import opened
+from render.records.mirror import open_folder
 from render.shared.config import build
 from render.shared.errors import InputError
 from sdps.data.dataset import SampleKey, SceneDataset, collate
@@ -103,7 +103,7 @@ def tars(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_packed_set_gives_the_losses_of_the_folder(folder: Path, tars: Path, uninterrupted: tuple) -> None:
-    with opened(tars) as data:
+    with open_folder(tars) as data:
         train(NormalStage(replace(QUICK, workers=1)), data, tars / "run", loggers=[StopAt(3)])
         train(NormalStage(QUICK), data, tars / "run")
     assert_same_run(uninterrupted[0], tars / "run")
@@ -115,7 +115,7 @@ def test_a_packed_set_larger_than_its_cache_goes_on_as_if_uninterrupted(
 ) -> None:
     monkeypatch.setattr(mirror, "_IN_USE", -1.0 if workers == 0 else 0.5)
     config = replace(QUICK, workers=workers, shuffle_window=1, steps=12)  # five scenes, in pairs
-    with opened(tars, cache_gb=75e-6) as data:
+    with open_folder(tars, cache_gb=75e-6) as data:
         train(NormalStage(config), data, tmp_path / "whole")
         assert not list(data.glob("cache/sphere_00[0-4]*"))  # decoded, they would leave it before they are used again
         assert train(NormalStage(config), data, tmp_path / "parts", loggers=[StopAt(5)]).interrupted
@@ -124,7 +124,7 @@ def test_a_packed_set_larger_than_its_cache_goes_on_as_if_uninterrupted(
         assert_same_run(tmp_path / "whole", tmp_path / "parts")
         with pytest.raises(InputError, match=r"of another run \(shuffle_window was 1, now 2\)"):
             train(NormalStage(replace(config, shuffle_window=2)), data, tmp_path / "parts")
-    with opened(tars, cache_gb=20e-6) as data, pytest.raises(InputError, match="shuffling among 1 scenes keeps"):
+    with open_folder(tars, cache_gb=20e-6) as data, pytest.raises(InputError, match="shuffling among 1 scenes keeps"):
         train(NormalStage(config), data, tmp_path / "none")
 
 
@@ -302,7 +302,7 @@ def test_stage_two_leaves_the_lighting_network_as_it_is(folder: Path, tmp_path: 
     stage = NormalStage(replace(QUICK, steps=2, lights="lcnet"), lighting)
     result = train(stage, folder, tmp_path)
     assert all(torch.equal(tensor, before[name]) for name, tensor in lighting.network.state_dict().items())
-    assert load_weights(result.weights["nenet"], "normals").metadata["lighting"]["data"] == "d"
+    assert load_weights(result.weights["nenet"]).metadata["lighting"]["data"] == "d"
     # NENet is given class centres, not the true lights.
     dataset = SceneDataset(folder, "train", stage.sample_options())
     lights = stage.lights(collate([dataset.sample(SampleKey(0, 0, 0))]))
@@ -340,7 +340,7 @@ def test_validation_may_see_more_images_than_training(folder: Path, tmp_path: Pa
 
 
 def test_weights_carry_their_origin(uninterrupted: tuple) -> None:
-    model = load_weights(uninterrupted[1].weights["nenet"], "normals")
+    model = load_weights(uninterrupted[1].weights["nenet"])
     assert model.metadata["step"] == 8
     assert len(model.metadata["data"]) == 64
     assert build(NormalTraining, model.metadata["config"]) == QUICK
@@ -352,7 +352,7 @@ def test_half_precision_weights_load_as_float32(tmp_path: Path) -> None:
     save_weights(tmp_path / "whole.safetensors", model)
     save_weights(tmp_path / "half.safetensors", model, half=True)
     assert (tmp_path / "half.safetensors").stat().st_size < 0.51 * (tmp_path / "whole.safetensors").stat().st_size
-    loaded = load_weights(tmp_path / "half.safetensors", "normals").network
+    loaded = load_weights(tmp_path / "half.safetensors").network
     for name, tensor in loaded.state_dict().items():
         assert tensor.dtype == torch.float32
         torch.testing.assert_close(tensor, model.network.state_dict()[name], atol=1e-3, rtol=1e-3)
@@ -383,13 +383,12 @@ def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path
     save_weights(headless, TrainedModel("nenet", create("nenet"), {}, {}))
     save_weights(foreign, TrainedModel("nenet2", create("nenet"), {}, {"config": {"augmentation": {}}}))
     cases = [
-        (weights, "lighting", "holds 'nenet', a model for 'normals'"),
-        (cut, "normals", "damaged or not a safetensors"),
-        (text, "normals", "damaged or not a safetensors"),
-        (tmp_path / "none.safetensors", "normals", "no such weights"),
-        (misfit, "lighting", "do not fit"),
-        (headless, "normals", "damaged header"),
-        (foreign, "normals", "a model this version does not know"),
+        (cut, "damaged or not a safetensors"),
+        (text, "damaged or not a safetensors"),
+        (tmp_path / "none.safetensors", "no such weights"),
+        (misfit, "do not fit"),
+        (headless, "damaged header"),
+        (foreign, "a model this version does not know"),
     ]
     for number, (options, message) in enumerate((
         ("abc", "damaged header"), ({"direction_classes": 10**12}, "do not fit"), ({"use_mask": {}}, "damaged header"),
@@ -397,10 +396,10 @@ def test_unusable_weights_are_refused_in_one_line(uninterrupted: tuple, tmp_path
     )):  # fmt: skip
         odd = tmp_path / f"odd{number}.safetensors"
         save_weights(odd, TrainedModel("lcnet", create("lcnet"), options, {"config": {"augmentation": {}}}))
-        cases.append((odd, "lighting", message))
-    for path, role, message in cases:
+        cases.append((odd, message))
+    for path, message in cases:
         with pytest.raises(InputError, match=message) as error:
-            load_weights(path, role)
+            load_weights(path)
         assert "\n" not in str(error.value)
 
 
@@ -439,7 +438,7 @@ def test_configuration_is_checked(values: dict, message: str) -> None:
         build(LightingTraining, values, "training")
 
 
-def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
+def test_a_run_takes_start_and_lights_of_others(tmp_path: Path) -> None:
     settings = {"runs": {"psfcn-late": {"base": "psfcn", "start": "nenet", "steps": 1}}}
     run = recipes.run("psfcn-late", {}, settings["runs"])
     assert run.requires == {"start": "nenet"}
@@ -450,3 +449,6 @@ def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
     other = TrainedModel("upsfcn", create("upsfcn"), {}, {"config": {"augmentation": {}}})
     with pytest.raises(InputError, match=r"runs.psfcn-late.start: 'upsfcn' has another network"):
         create_stage("psfcn-late", run.model, run.config, {"start": other})
+    run = recipes.run("nenet", {}, {"nenet": {"lights": "shipped:psfcn"}})
+    with pytest.raises(InputError, match=r"runs.nenet.lights: 'upsfcn' finds no lights; name a lighting model"):
+        create_stage("nenet", "nenet", run.config, {"lighting": other})

@@ -74,7 +74,7 @@ class Cover:
             values: Any = look
         else:
             values, slope = self._from_pattern(place)
-        normal = turned(place.normal, slope, wi)
+        normal = turn(place.normal, slope, wi)
         if isinstance(values, Appearance):
             values = Gloss.prepare(values, dr.dot(normal, wi))
         return values, normal
@@ -135,7 +135,7 @@ class Cover:
         return Appearance(mi.Color3f(red, green, blue), rough, metal), slope
 
 
-def turned(normal: Any, slope: Any, wi: Any) -> Any:
+def turn(normal: Any, slope: Any, wi: Any) -> Any:
     """Return the normals of a surface with relief, n - (g - (g.n) n) normalised (Blinn 1978).
 
     A facet that would turn away from the viewer is hidden behind others in the world; it is turned until it is seen

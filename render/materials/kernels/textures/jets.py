@@ -128,7 +128,7 @@ def noise(x: Jet, y: Jet, z: Jet, seed: Any, octaves: Any) -> Jet:
     return Jet(value, gradient)
 
 
-def hashed(first: Any, second: Any, seed: Any) -> Any:
+def hash_bits(first: Any, second: Any, seed: Any) -> Any:
     """Return 32 well mixed bits of two integers."""
     bits = mi.UInt32(first) * mi.UInt32(0x8DA6B343) ^ mi.UInt32(second) * mi.UInt32(0xD8163841) ^ seed
     bits = (bits ^ (bits >> 15)) * mi.UInt32(0x2C1B3C6D)
@@ -152,7 +152,7 @@ def _octave(place: Any, seed: Any) -> tuple:
     for number in range(8):
         ends = [(number >> axis) & 1 for axis in range(3)]
         away = inside - mi.Vector3f(*ends)
-        bits = hashed(cell.x + ends[0], hashed(cell.y + ends[1], cell.z + ends[2], seed), seed)
+        bits = hash_bits(cell.x + ends[0], hash_bits(cell.y + ends[1], cell.z + ends[2], seed), seed)
         tilt = mi.Vector3f(*(uniform(bits, part) for part in range(3))) * 2 - 1
         weights = [t[axis] if ends[axis] else 1 - t[axis] for axis in range(3)]
         rates = [dt[axis] if ends[axis] else -dt[axis] for axis in range(3)]

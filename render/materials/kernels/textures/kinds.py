@@ -18,7 +18,7 @@ from render.materials.kernels.textures.jets import (
     choose,
     exp,
     fraction,
-    hashed,
+    hash_bits,
     larger,
     noise,
     root,
@@ -177,7 +177,7 @@ def flat_tiles(u: Jet, v: Jet, side: int, n: Numbers) -> Layers:
     ratio = n["down"] / n["across"]
     edges = [absolute(along - 0.5) * -1.0 + 0.5 for along in (across, down)]
     profile = step(edges[0] * ratio, gap, wide) * step(edges[1], gap, wide)
-    bits = hashed(column, row, n.seed + side)
+    bits = hash_bits(column, row, n.seed + side)
     tilt = [(uniform(bits, part) - 0.5) * 0.5 for part in (0, 1)]
     ripple = noise(u * 6.0, v * 6.0, Jet.of(side * 3.7), n.seed + 1, _octaves(2))
     face = (across - 0.5) * tilt[0] + (down - 0.5) * tilt[1] + ripple * n["ripple"] + 1.0
@@ -213,7 +213,7 @@ def flat_weave(u: Jet, v: Jet, side: int, n: Numbers) -> Layers:
     # A plain cloth has warp and weft of its two colours; a checked one has bands of either colour both ways.
     second = dr.select(n["plain"] > 0.5, ~on_top, dr.select(on_top, coloured[0], coloured[1]))
     hollow = 1 - step(top, 0.2, 0.55).value
-    bits = hashed(dr.select(on_top, i, j), dr.select(on_top, 1, 2), n.seed)
+    bits = hash_bits(dr.select(on_top, i, j), dr.select(on_top, 1, 2), n.seed)
     tone = (0.85 + 0.3 * uniform(bits)) * (0.9 + 0.12 * strand.value)
     return Layers(dr.select(second, 1.0, 0.0), hollow, tone, mi.Float(0), (top + strand * 0.04) * n["relief"])
 
@@ -265,7 +265,7 @@ def flat_scratches(u: Jet, v: Jet, side: int, n: Numbers) -> Layers:
         along, across = u * cosine + v * sine, v * cosine - u * sine
         (_, lane) = fraction(along * 0.8 + mi.Float(k) * 0.37)
         middle, row = fraction(across * n["rows"])
-        bits = hashed(row, lane + mi.Int32(k) * 71, n.seed + side)
+        bits = hash_bits(row, lane + mi.Int32(k) * 71, n.seed + side)
         there = mi.Float(mi.UInt32(bits >> 30) < 2)
         # A scratch lies anywhere in its row, a little askew, and thins out towards its ends.
         place, askew = 0.25 + 0.5 * uniform(bits, 0), (uniform(bits, 1) - 0.5) * 0.4

@@ -58,8 +58,8 @@ class Pictures:
         y = (dr.floor(v) + 1 - v) * mi.Float(self._size.y) - 0.5
         left, top = dr.floor(x), dr.floor(y)
         a, b = x - left, y - top
-        columns = [_wrapped(mi.Int32(left) + k, self._size.x) for k in (0, 1)]
-        rows = [_wrapped(mi.Int32(top) + k, self._size.y) for k in (0, 1)]
+        columns = [_wrap(mi.Int32(left) + k, self._size.x) for k in (0, 1)]
+        rows = [_wrap(mi.Int32(top) + k, self._size.y) for k in (0, 1)]
         total: list = [mi.Float(0)] * self._channels
         for row, wy in zip(rows, (1 - b, b), strict=True):
             for column, wx in zip(columns, (1 - a, a), strict=True):
@@ -97,7 +97,7 @@ class Unwrapped:
         return u, v, mi.Vector3f(*values[6:9]), mi.Vector3f(*values[9:])
 
 
-def _wrapped(index: Any, size: Any) -> Any:
+def _wrap(index: Any, size: Any) -> Any:
     """Bring an index from -1 to `size` into the picture."""
     last = mi.Int32(size) - 1
     return mi.UInt32(dr.select(index < 0, last, dr.select(index > last, 0, index)))

@@ -33,7 +33,7 @@ def test_turning_moves_the_camera_side_to_the_right_hand():
     radiance = np.zeros((36, 72, 3), np.float32)
     radiance[10, 36] = 1.0  # near +z
     vectors = environments.directions(36)
-    there = vectors[environments.turned(radiance, 90.0)[..., 0] > 0][0]
+    there = vectors[environments.turn(radiance, 90.0)[..., 0] > 0][0]
     before = vectors[10, 36]
     np.testing.assert_allclose(there, [before[2], before[1], -before[0]], atol=1e-9)
 
@@ -82,7 +82,7 @@ def test_what_is_no_map_is_refused_in_one_line(tmp_path):
     write_exr(tmp_path / "grey.exr", [("map", {}, {"Y": good[..., 0]})])
     refused("grey.exr", "needs R, G and B")
     (tmp_path / "text.hdr").write_text("no picture")
-    refused("text.hdr", "no Radiance picture")
+    refused("text.hdr", "not a Radiance picture")
     (tmp_path / "text.exr").write_text("no picture")
     refused("text.exr", "not an EXR picture")
     refused("missing.hdr", "no such environment map")
@@ -93,4 +93,4 @@ def test_what_is_no_map_is_refused_in_one_line(tmp_path):
     bad = good.copy()
     bad[2, 3, 1] = np.nan
     with pytest.raises(InputError, match="NaN, infinite or negative at column 3, row 2"):
-        environments._checked(bad, "map.hdr")
+        environments._check(bad, "map.hdr")

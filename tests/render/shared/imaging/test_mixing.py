@@ -127,7 +127,7 @@ def test_bad_mixtures_are_refused(values, words):
         LightMix(**values)
 
 
-def test_light_from_behind_is_told():
+def test_light_from_behind_is_reported():
     radiance = np.zeros((32, 64, 3), np.float32)
     radiance[16, 32] = 1.0
     assert mixing.share_behind(radiance) == 0
