@@ -14,10 +14,12 @@ from pipelines.evaluate.report.sections import Section, SectionWriter, Table, Ti
 from pipelines.shared import pictures, using
 from render.shared.errors import InputError
 from render.shared.progress import bars, stage
+from sdps.core.intensities import grey, scale_to_mean
 
 if TYPE_CHECKING:
     from sdps.api import Inference
     from sdps.photos import Finding
+    from sdps.refinement.trust import RefinedEstimate
 
 _MARKS = {"error": "!!", "warning": "! ", "note": "- "}
 _MOST_LISTED = 6
@@ -161,8 +163,8 @@ def _section(result: "Inference") -> SectionWriter:
     writer.strip("The surface from the left, the front and the right", [("", strip(result.depth, 360))], wide=True)
     relit = [(name.replace("-", " "), pictures.tone_map(result.relit_view(name, box))) for name in RELIT]
     writer.strip("Under lights of our choice (matt, with cast shadows)", relit)
-    if "refined" in result.estimate.diagnostics:
-        writer.strip("Refinement", _refinement_pictures(result, box))
+    if result.refinement is not None:
+        writer.strip("Refinement", _refinement_pictures(result.refinement, box, mask[box]))
     elif result.expected_error is not None:
         writer.strip("How sure the network is", [_expected_picture(result.expected_error[box], mask[box])])
     return writer
@@ -177,16 +179,15 @@ def _box(mask: np.ndarray) -> tuple[slice, slice]:
     return rows, columns
 
 
-def _refinement_pictures(result: "Inference", box: tuple[slice, slice]) -> list[Tile]:
+def _refinement_pictures(found: "RefinedEstimate", box: tuple[slice, slice], mask: np.ndarray) -> list[Tile]:
     """Return how far normals moved, the error to expect, and what the model did not explain."""
     from sdps.core.metrics import angle_degrees
 
-    found, mask = result.estimate.diagnostics, result.photos.mask[box]
-    moved = angle_degrees(found["refined"].normals[box], found["start"].normals[box])
-    residual, expected = found["refined"].pixel_residual[box], found["trust"].normals[box]
+    moved = angle_degrees(found.refined.normals[box], found.start.normals[box])
+    residual, expected = found.refined.pixel_residual[box], found.trust.normals[box]
     most = float(np.percentile(residual[mask], 99))
     return [
-        Tile("normals before", pictures.normal_map(found["start"].normals[box], mask), "normals"),
+        Tile("normals before", pictures.normal_map(found.start.normals[box], mask), "normals"),
         Tile("moved (yellow: 20 degrees)", pictures.error_map(np.where(mask, moved, np.nan), 20.0)),
         _expected_picture(expected, mask),
         Tile(f"not explained (yellow: {most:.2f})", pictures.error_map(np.where(mask, residual, np.nan), most)),
@@ -237,11 +238,10 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
     note = f"Terms of the weights: {facts['terms']}." if facts["terms"] else ""
     tables = [checks, Table(title="Figures", header=("what", "value"), rows=tuple(rows), note=note)]
     if len(result.light_directions):
-        gains = result.gains
-        gains = gains if gains.ndim == 1 else gains.mean(1)
+        relative = scale_to_mean(grey(result.gains))
         body: tuple[tuple[str, ...], ...] = tuple(
-            (name, *(f"{value:.3f}" for value in direction), f"{gain / gains.mean():.3f}")
-            for name, direction, gain in zip(result.photos.files, result.light_directions, gains, strict=True)
+            (name, *(f"{value:.3f}" for value in direction), f"{gain:.3f}")
+            for name, direction, gain in zip(result.photos.files, result.light_directions, relative, strict=True)
         )
         header: tuple[str, ...] = ("photograph", "x", "y", "z", "intensity / mean")
         if "refined" in facts:

@@ -36,7 +36,7 @@ from sdps.methods.parse import parse, uses_networks, with_refinement
 from sdps.methods.runner import Runner
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load
-from sdps.photos.doubts import ANYWAY
+from sdps.photos.faults import ANYWAY
 from sdps.photos.light_files.light_advice import advise
 from sdps.refinement.trust import FEWEST_IMAGES
 from sdps.surface.inferred import Inference, check_out
@@ -96,7 +96,7 @@ def infer(
     began = time.perf_counter()
     intensities = photos.intensities
     if photos.light_directions is not None:  # after what costs nothing: it reads every photograph twice
-        intensities, more = _questioned(photos, models, config)
+        intensities, more = _question_lights(photos, models, config)
         findings = (*findings, *more)
         _stop(photos, findings, anyway)
     found = runner.estimate(photos, photos.mask, photos.light_directions, intensities, saturation=photos.saturation)
@@ -161,7 +161,7 @@ def available_methods(models: str | Path | None = None) -> dict[str, str]:
     Two of them may be joined, lights before normals, as in `lcnet+psfcn`.
 
     Args:
-        models: Folder of trained runs (`out` of `train`) whose weights count beside the pretrained ones.
+        models: Folder of trained runs (`out` of `train`) whose weights count as well as the pretrained ones.
     """
     about = {name: item.summary for items in (COMBINATIONS, MODELS) for name, item in items.items()}
     about |= {name: f"{entry.summary} ({entry.paper})" for name, entry in classical.METHODS.items()}
@@ -213,11 +213,11 @@ def train(
     run = recipes.run(model, {}, {model: settings})
     needed = {use: load_weights(pretrained.require(name, out)) for use, name in run.requires.items()}
     stage = create_stage(run.name, run.model, run.config, needed)
-    loggers = [] if on_log is None else [_Told(on_log)]
+    loggers = [] if on_log is None else [_ProgressLogger(on_log)]
     return trainer.train(stage, data, out / pretrained.MODELS_FOLDER / model, device=device, loggers=loggers)
 
 
-class _Told:
+class _ProgressLogger:
     """A logger that calls a function."""
 
     def __init__(self, tell: Callable[[int, dict[str, float]], None]) -> None:
@@ -237,13 +237,13 @@ def _finder(models: str | Path | None) -> Callable[[str], Path]:
 
 
 def _stop(photos: Photographs, findings: tuple[Finding, ...], anyway: bool) -> None:
-    """Stop at the first grave finding, unless told to go on."""
+    """Stop at the first grave finding, unless asked to go on."""
     grave = next((finding for finding in findings if finding.level == "error"), None)
     if grave is not None and not anyway:
         raise InputError(f"{photos.folder}: {grave.text} ({ANYWAY})")
 
 
-def _questioned(
+def _question_lights(
     photos: Photographs, models: str | Path | None, config: InferenceConfig | None
 ) -> tuple[np.ndarray, tuple[Finding, ...]]:
     """Ask a network about lights that are given: return intensities, found where none are given, and what it says."""
@@ -265,20 +265,20 @@ def _runner(
     """Return the method of an expression with its networks; `known`: light directions, intensities."""
     find = _finder(models)
     plain = method.removesuffix(f"+{REFINE}")
-    chosen = _adapted(_automatic(known[0], find) if plain == AUTO else plain, known, find)
+    chosen = _adapt(_automatic(known[0], find) if plain == AUTO else plain, known, find)
     if refine is None:
         refine = uses_networks(chosen) and images >= FEWEST_IMAGES
     return Runner(with_refinement(chosen) if refine or plain != method else chosen, find, config)
 
 
-def _adapted(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> Method:
+def _adapt(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> Method:
     """Return the method of an expression that uses what is known of the lights."""
     directions, intensities = known
     if not directions:
         method = parse(text, find)
         if TRUE_LIGHTS in (method.lights, method.intensities):
             raise InputError(
-                f"--method {text}: is told the lights; give them with --lights, or put a lighting model before it, "
+                f"--method {text} needs the lights; give them with --lights, or put a lighting model before it, "
                 f"as in lcnet+{text}"
             )
         if intensities and not uses_networks(method):
@@ -297,7 +297,7 @@ def _automatic(lit: bool, find: Callable[[str], Path]) -> str:
     """Return the best method whose weights are there."""
     for name in _CALIBRATED if lit else _LEARNED:
         try:
-            _adapted(name, (lit, False), find)
+            _adapt(name, (lit, False), find)
         except InputError:
             continue
         return name

@@ -145,7 +145,7 @@ def test_a_plan_is_rendered_once(tmp_path):
         (lambda: render.render_plan([], "nowhere"), "the plan is empty"),
         (lambda: sdps.train("lcnett", "data", "out"), "did you mean 'lcnet'"),
         (lambda: sdps.train("lcnet", "data", "out", step=3), "did you mean"),
-        (lambda: sdps.estimate(np.ones((4, 8, 8, 3)), np.ones((8, 8), bool), "least-squares"), "is told the lights"),
+        (lambda: sdps.estimate(np.ones((4, 8, 8, 3)), np.ones((8, 8), bool), "least-squares"), "needs the lights"),
     ],
 )
 def test_mistakes_are_one_line(call, message):

@@ -24,7 +24,7 @@ FOLDERS = [
     "render",
     *(f"sdps.{name}" for name in (
         "core", "data", "models", "training", "publishing", "inference", "refinement", "classical.common", "classical",
-        "methods", "photos.light_files", "photos.pictures", "photos.evidence", "photos",
+        "methods", "photos.light_files", "photos.pictures", "photos.analysis", "photos",
         "surface",
     )),
     "sdps",

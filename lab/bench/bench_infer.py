@@ -151,7 +151,7 @@ def _work(folder: Path, method: str, models: Path | None, config: InferenceConfi
         "seconds": marks[-1] - marks[0],
         "peak_gib": peak_gib(),
         "pixels": int(photos.mask.sum()),
-        "precision": result.estimate.diagnostics.get("precision", "-"),
+        "precision": result.estimate.precision or "-",
     }
 
 

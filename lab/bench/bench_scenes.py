@@ -15,8 +15,8 @@ from render.planning import light_sets
 from render.records.manifest import SceneSpec, View, write_manifest
 from render.records.shards import Shard, to_half, write_shard
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import half_vectors
 from render.shared.seeds import generator
-from sdps.classical.common.isotropy import half_vectors
 
 LIGHTS = 64
 _SHININESS = 40.0

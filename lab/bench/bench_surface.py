@@ -26,7 +26,7 @@ from sdps.classical import registry
 from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import normal_mae
 from sdps.surface.meshing import mesh, write_mesh
-from sdps.surface.relight import fit_albedo, lit, relit, residuals
+from sdps.surface.relight import fit_albedo, relit, residuals, trace_light
 from sdps.surface.views import strip
 
 GRAZING, DARK = 0.1, 0.5
@@ -116,7 +116,7 @@ def _shadows(shard: Shard, albedo: np.ndarray) -> dict[str, dict[str, float]]:
             shading = shard.normals @ direction
             facing = shard.mask & (shading > GRAZING)
             dark = facing & (image.mean(-1) < DARK * (albedo.mean(-1) * shading))
-            said = facing & ~lit(depth, direction) if depth is not None else np.zeros_like(dark)
+            said = facing & ~trace_light(depth, direction) if depth is not None else np.zeros_like(dark)
             counts += dark.sum(), (said & dark).sum(), (said & ~dark).sum()
             picture = relit(shard.normals, albedo, direction, depth=depth)
             off += float(((picture - image)[shard.mask] ** 2).sum(dtype=np.float64))

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import half_vectors, unit
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
 from sdps.photos.response import display
@@ -87,8 +88,7 @@ def _relief(rows: slice, config: LargeConfig) -> tuple[np.ndarray, np.ndarray, n
     dome = np.sqrt(np.maximum(reach**2 - x**2 - y**2, 1e-4))
     waves = 0.15 * np.cos(40 * x + 9 * np.sin(11 * y)), 0.15 * np.cos(31 * y + 7 * np.sin(17 * x))
     slopes = (-x / dome + waves[0], -y / dome + waves[1])
-    normals = np.stack([-slopes[0], -slopes[1], np.ones_like(dome)], axis=-1)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = unit(np.stack([-slopes[0], -slopes[1], np.ones_like(dome)], axis=-1))
     cells = (np.floor(14 * x) + np.floor(14 * y)) % 2
     colours = np.array([[0.3, 0.4, 0.5], [0.6, 0.3, 0.2]], np.float32)
     return normals, colours[cells.astype(int)], mask
@@ -98,8 +98,7 @@ def _shaded(
     rows: slice, light: np.ndarray, gain: float, config: LargeConfig, rng: np.random.Generator
 ) -> np.ndarray:  # (h, W, 3) uint8
     normals, albedo, mask = _relief(rows, config)
-    half = light + np.array([0.0, 0.0, 1.0])
-    half /= np.linalg.norm(half)
+    half = half_vectors(light)
     shading = np.maximum(normals @ light.astype(np.float32), 0.0)[..., None]
     gloss = np.maximum(normals @ half.astype(np.float32), 0.0)[..., None] ** _SHININESS
     linear = np.where(mask[..., None], gain * (albedo + _GLOSS * gloss) * shading, _GROUND)

@@ -20,14 +20,14 @@ from tqdm import tqdm
 from render.materials.fit.fitting import Brdf, Fitter, to_yaml
 from render.shared.errors import InputError, unknown
 from render.shared.files import write_text
+from render.shared.imaging.vectors import unit
 
 _LAYERS = (("fc1", (6, 21)), ("b1", (21,)), ("fc2", (21, 21)), ("b2", (21,)), ("fc3", (21, 3)), ("b3", (3,)))
 
 
 def half_difference(wi: np.ndarray, wo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the half vector turned to azimuth zero and the difference vector, each (N, 3), of unit (N, 3) vectors."""
-    half = wi + wo
-    half = half / np.linalg.norm(half, axis=1, keepdims=True)
+    half = unit(wi + wo)
     sine, cosine = np.hypot(half[:, 0], half[:, 1]), half[:, 2]
     azimuth = np.arctan2(half[:, 1], half[:, 0])
     turned_x = np.cos(azimuth) * wi[:, 0] + np.sin(azimuth) * wi[:, 1]

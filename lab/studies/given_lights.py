@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter
 
 import sdps
 from render.records.shards import read_shard
+from render.shared.imaging.vectors import half_vectors
 from render.shared.seeds import generator
 from sdps.methods.given_lights import AXES, LightFit, compare_lights, find_intensities, reduce_images
 from sdps.methods.light_witness import see_lights
@@ -130,8 +131,7 @@ def _relief(kind: str, draw: np.random.Generator, size: int = 128) -> Scene:
     lights = draw.normal(size=(int(draw.integers(6, 24)), 3))
     lights[:, 2] = np.abs(lights[:, 2]) + 0.6
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
-    half = lights + np.array([0.0, 0.0, 1.0])
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    half = half_vectors(lights)
     albedo = 0.6 * np.exp(gaussian_filter(draw.normal(size=(size, size)), 2))
     lit = albedo[..., None] * np.maximum(normals @ lights.T, 0)
     lit += draw.choice([0, 0.3]) * np.maximum(normals @ half.T, 0) ** 40

@@ -25,6 +25,7 @@ from render.materials.fit.fitting import Brdf, Fitter
 from render.materials.fit.spheres import Samples, radiance_limit, sphere_error
 from render.shared.errors import InputError
 from render.shared.files import read_text
+from render.shared.imaging.vectors import unit
 from render.shared.templates import markdown_table
 
 _FIT_PAIRS = 6000
@@ -42,8 +43,7 @@ class Angles:
 
 def angles(wi: np.ndarray, wo: np.ndarray) -> Angles:
     """Return the cosines of (N, 3) directions, kept off the horizon by 1e-3."""
-    half = wi + wo
-    half = half / np.linalg.norm(half, axis=1, keepdims=True)
+    half = unit(wi + wo)
     light, view = np.maximum(wi[:, 2], 1e-3), np.maximum(wo[:, 2], 1e-3)
     return Angles(light, view, np.minimum(half[:, 2], 1), np.clip((wi * half).sum(1), 0, 1))
 

@@ -26,7 +26,7 @@ from pipelines.shared.text_tables import render_text
 from render.records.manifest import read_manifest
 from render.records.shards import read_shard
 from sdps import photos
-from sdps.photos.evidence.motion import Tracker, second_look
+from sdps.photos.analysis.motion import Tracker, second_look
 from sdps.photos.response import brightness
 
 _MARGIN, _NOISE, _WHOLE = 8, 0.003, 0.97

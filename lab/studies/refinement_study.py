@@ -39,7 +39,6 @@ from sdps.refinement.trust import NORMAL, Trust, features, trust
 
 _PRESET = Path(__file__).with_suffix(".yaml")
 _NARROW = np.cos(np.radians(50.0))
-_TOLD = "expected_error"
 _LOSS = 0.3  # degrees; what counts as losing
 _OFFSET = 0.05  # degrees, added before the logarithm
 
@@ -107,8 +106,8 @@ def _refined(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> t
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             begun = {"normals": start.normals, "lights": start.light_directions, "gains": gains}
-            if _TOLD in start.diagnostics:
-                begun |= {_TOLD: start.diagnostics[_TOLD]}
+            if start.expected_error is not None:
+                begun["expected_error"] = start.expected_error
             np.savez(file, **{f"start_{name}": value for name, value in begun.items()}, **vars(found))
     return kept(path)
 
@@ -118,7 +117,7 @@ def kept(path: Path) -> tuple[Estimate, Refined]:
     with np.load(path) as archive:
         begun = Estimate(
             *(archive[f"start_{name}"] for name in ("normals", "lights", "gains")),
-            {_TOLD: archive[f"start_{_TOLD}"]} if f"start_{_TOLD}" in archive else {},
+            expected_error=archive.get("start_expected_error"),
         )
         return begun, Refined(**{name: archive[name] for name in Refined.__dataclass_fields__})
 

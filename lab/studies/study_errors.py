@@ -49,7 +49,7 @@ def _scores(scene: Scene, runner: Runner) -> dict[str, float]:
     found = runner.estimate(scene.images, scene.mask, scene.lights, scene.gains, {})
     scores = runner.score(found, scene.mask, scene.normals, scene.lights, scene.gains)
     kept = {metric: scores[metric] for metric in _METRICS if metric in scores}
-    expected = found.diagnostics.get("expected_light_error")
+    expected = found.expected_light_error
     return kept if expected is None else kept | {"expected_light_error": float(np.mean(expected))}
 
 

@@ -222,11 +222,11 @@ class Evaluation:
         return {
             "scores": scores,
             "reason": "",
-            "seconds": float(estimate.diagnostics.get("seconds", 0.0)),
+            "seconds": estimate.seconds,
             "normals": bool(estimate.normals.size),
             "lights": np.round(np.asarray(estimate.light_directions, np.float64), 6).tolist(),
             "gains": np.round(np.asarray(estimate.intensities, np.float64), 6).tolist(),
-            "notes": {name: estimate.diagnostics[name] for name in _NOTES if name in estimate.diagnostics},
+            "notes": {name: value for name in _NOTES if (value := getattr(estimate.notes, name)) is not None},
         }
 
 

@@ -15,6 +15,7 @@ from pipelines.shared.charts import light_disc
 from render.records.manifest import SceneSpec
 from render.records.mirror import shard_path
 from render.records.shards import Shard, read_shard
+from sdps.core.intensities import grey
 from sdps.photos.response import display
 
 T = TypeVar("T")
@@ -124,10 +125,9 @@ def light_plot(directions: np.ndarray, intensities: np.ndarray, truth: np.ndarra
         intensities: (L,) or (L, 3).
         truth: (L, 3) true directions, or None.
     """
-    grey = intensities if intensities.ndim == 1 else intensities.mean(1)
     figure = Figure(figsize=(3.4, 2.8), dpi=130, layout="tight")
     axes = figure.add_subplot()
-    points = light_disc(axes, directions, grey, truth)
+    points = light_disc(axes, directions, grey(intensities), truth)
     figure.colorbar(points, ax=axes, shrink=0.7, label="intensity / strongest")
     return figure
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import unit
 
 VERSION = 1
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear RGB, ITU-R BT.709
@@ -141,8 +142,7 @@ def coordinates(wi: np.ndarray, wo: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     would lose the sub-degree peaks of mirror-like metals in float32. e follows from the projections of wi and wo,
     cos_o - cos_i = 2 sin(theta_h) sin(theta_d) cos(phi_d), without any angle.
     """
-    half = wi + wo  # (N, 3)
-    half = half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
+    half = unit(wi + wo)  # (N, 3)
     sin2_h = half[:, 0] ** 2 + half[:, 1] ** 2
     cos_d = np.minimum((wi * half).sum(1), 1)
     product = sin2_h * (1 - cos_d**2)

@@ -7,6 +7,8 @@ the same set. Angles are degrees from the viewing axis.
 
 import numpy as np
 
+from render.shared.imaging.vectors import unit
+
 GRID_EDGE = (35.0, 45.0)  # of the outermost bulb; DiLiGenT's lights (Shi et al., PAMI 2019) all lie within 45 degrees
 RING_ANGLES = (15.0, 75.0)
 DOME_EDGE = (60.0, 85.0)
@@ -32,7 +34,7 @@ def grid(count: int, rng: np.random.Generator) -> np.ndarray:  # (count, 3)
     board = board @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     furthest = max(np.linalg.norm(board, axis=1).max(), 1e-9)
     board *= np.tan(np.radians(rng.uniform(*GRID_EDGE))) / furthest
-    return _unit(np.concatenate([board, np.ones((count, 1))], axis=1))
+    return unit(np.concatenate([board, np.ones((count, 1))], axis=1))
 
 
 def rings(count: int, rng: np.random.Generator) -> np.ndarray:  # (count, 3)
@@ -59,7 +61,7 @@ def dome(count: int, rng: np.random.Generator) -> np.ndarray:  # (count, 3)
     turn = rng.uniform(0.0, 2.0 * np.pi) + _GOLDEN * np.arange(count)
     spacing = np.sqrt(2.0 * np.pi * (1.0 - edge) / count)
     vectors = _from_angles(np.arccos(z), turn) + rng.normal(0.0, 0.05 * spacing, (count, 3))
-    return _above(_unit(vectors))
+    return _above(unit(vectors))
 
 
 def hand_held(count: int, rng: np.random.Generator) -> np.ndarray:  # (count, 3)
@@ -97,11 +99,7 @@ def _from_angles(angle: np.ndarray, turn: np.ndarray) -> np.ndarray:  # (N, 3)
     return np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=1)
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
 def _above(vectors: np.ndarray) -> np.ndarray:
     """Keep vectors a degree above the horizon."""
     vectors[:, 2] = np.maximum(vectors[:, 2], np.sin(np.radians(1.0)))
-    return _unit(vectors)
+    return unit(vectors)

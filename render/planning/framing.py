@@ -9,6 +9,7 @@ import numpy as np
 
 from render.records.manifest import View
 from render.shapes.geometry.mesh import TriangleMesh
+from render.shared.imaging.vectors import unit
 
 CELLS = 32  # cells along a frame; along a tile, half as many
 _MOST_CELLS = 1 << 22  # cells of all triangles' boxes together that are tested at once
@@ -40,7 +41,7 @@ def measure(mesh: TriangleMesh, view: View, tiles: int = 1) -> Framing:
     face = rasterise(mesh, view, per_tile * tiles).reshape(tiles, per_tile, tiles, per_tile).swapaxes(1, 2)
     hit = face >= 0
     normals = mesh.normals[mesh.faces[face]].sum(-2) * hit[..., None]  # spread does not depend on the rotation
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    normals = unit(normals)
     count = hit.sum((2, 3))
     mean = np.linalg.norm(normals.sum((2, 3)), axis=-1) / np.maximum(count, 1)
     spread = np.degrees(np.arccos(np.minimum(mean, 1))) * (count > 0)

@@ -21,12 +21,13 @@ from scipy import ndimage
 from skimage.morphology import local_maxima
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import unit
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
 from sdps.classical.common.factorisation import Factors
 from sdps.classical.common.front_end import Front, conclude, prepare
 from sdps.classical.common.gbr import Gbr
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, Notes
 
 _log = logging.getLogger(__name__)
 
@@ -74,9 +75,7 @@ def diffuse_maxima(
         seed: Seed of that choice.
 
     Returns:
-        Normals, light directions and intensities; diagnostics `gbr` (mu, nu, lambda), `candidates` and `intersections`
-        (numbers), `gbr_spread` (half the interquartile ranges of the crossings), `candidate_map` (H, W) int16: in which
-        image the pixel is a maximum, -1 in none.
+        Normals, light directions and intensities; notes `candidates`, `intersections` and `candidate_map`.
 
     Raises:
         InputError: degenerate input (see `prepare`), no maximum, or no two maxima that agree on any transformation.
@@ -85,16 +84,14 @@ def diffuse_maxima(
     maxima = find_maxima(prepared.cleaned, prepared.mask, smoothing=smoothing)
     crossings, lambdas = intersect(prepared.factors, maxima, limit=limit, seed=seed)
     gbr = median_gbr(crossings, lambdas)
-    spread = [np.diff(np.percentile(values, [25, 75]))[0] / 2 for values in (*crossings.T, lambdas)]
     found = np.full(int(prepared.mask.sum()), -1)
     found[maxima.pixels] = maxima.images
-    diagnostics = {
-        "gbr_spread": tuple(float(value) for value in spread),
-        "candidates": len(maxima.pixels),
-        "intersections": len(crossings),
-        "candidate_map": prepared.observations.to_map(found, -1).astype(np.int16),
-    }
-    return conclude(prepared, gbr, diagnostics)
+    notes = Notes(
+        candidates=len(maxima.pixels),
+        intersections=len(crossings),
+        candidate_map=prepared.observations.to_map(found, -1).astype(np.int16),
+    )
+    return conclude(prepared, gbr, notes)
 
 
 def find_maxima(profiles: np.ndarray, mask: np.ndarray, *, smoothing: float = 2.0) -> Maxima:
@@ -198,8 +195,7 @@ def _segments(factors: Factors, maxima: Maxima) -> tuple[np.ndarray, np.ndarray]
     three depends on the bas-relief transformation.
     """
     normals = factors.normals()[maxima.pixels]
-    lights = factors.lights.T[maxima.images]
-    lights = lights / np.maximum(np.linalg.norm(lights, axis=1, keepdims=True), 1e-300)
+    lights = unit(factors.lights.T[maxima.images])
     facing = (normals * lights).sum(1)
     slant = (lights[:, :2] ** 2).sum(1)
     valid = (np.abs(normals[:, 2]) > 1e-9) & (slant > 1e-18) & (facing > 0.0)

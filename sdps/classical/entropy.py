@@ -14,7 +14,7 @@ from render.shared.seeds import generator
 from sdps.classical.common.factorisation import Factors
 from sdps.classical.common.front_end import Front, conclude, prepare
 from sdps.classical.common.gbr import Gbr
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, Notes
 
 _log = logging.getLogger(__name__)
 
@@ -59,9 +59,8 @@ def entropy(
         seed: Root seed of that draw.
 
     Returns:
-        Normals, lights and intensities; diagnostics `gbr` from the prepared factors, `entropy` in bits at the answer,
-        `evaluations`, and `minima`: the best descents as rows (entropy, mu, nu, lambda) from the standard form on.
-        Minima of nearly equal entropy that lie apart mean that the answer is not to be trusted.
+        Normals, lights and intensities; notes `energy`, the entropy in bits at the answer, and `minima`, the best
+        descents. Minima of nearly equal entropy that lie apart mean that the answer is not to be trusted.
 
     Raises:
         InputError: parameters out of range, or degenerate input; see `prepare`.
@@ -72,12 +71,11 @@ def entropy(
     standard = standard_form(prepared.factors)
     surface = prepared.factors.transformed(standard).surface
     surface = generator(seed, "entropy").permutation(surface)[:samples]
-    minima, evaluations = _search(surface, starts)
+    minima = _search(surface, starts)
     best = Gbr(*minima[0, 1:])
     if max(abs(best.mu), abs(best.nu)) > 0.99 * _BOX or abs(np.log(best.lam)) > 0.99 * np.log(_BOX):
         _log.warning("the lowest entropy lies on the edge of the search (%s); expect large errors", best)
-    diagnostics = {"entropy": float(minima[0, 0]), "evaluations": evaluations, "minima": minima}
-    return conclude(prepared, standard.then(best), diagnostics)
+    return conclude(prepared, standard.then(best), Notes(energy=float(minima[0, 0]), minima=minima))
 
 
 def standard_form(factors: Factors) -> Gbr:
@@ -104,11 +102,9 @@ class _Cost:
         # |B G|^2 is linear in the six products of columns, so that one matrix product serves a whole batch.
         products = (first**2 + second**2, 2.0 * first * third, 2.0 * second * third, third**2)
         self._products = np.stack(products).astype(np.float32)  # (4, P)
-        self.evaluations = 0
 
     def __call__(self, parameters: np.ndarray, step: float) -> np.ndarray:
         """Return entropies in bits, (N,), at rows (mu, nu, log lambda), smoothed as befits a grid of `step`."""
-        self.evaluations += len(parameters)
         batch = max(_BATCH_VALUES // self._products.shape[1], 1)
         parts = [parameters[begin : begin + batch] for begin in range(0, len(parameters), batch)]
         return np.concatenate([self._entropies(part, step) for part in parts])
@@ -127,8 +123,8 @@ class _Cost:
         return -(shares * np.log2(np.maximum(shares, 1e-12))).sum(1)
 
 
-def _search(surface: np.ndarray, starts: int) -> tuple[np.ndarray, int]:
-    """Return rows (entropy, mu, nu, lambda) of the minima found, best first, (N, 4), and the number of evaluations."""
+def _search(surface: np.ndarray, starts: int) -> np.ndarray:  # (N, 4)
+    """Return rows (entropy, mu, nu, lambda) of the minima found, best first."""
     coarse, fine = _Cost(surface[:_COARSE_SAMPLES]), _Cost(surface)
     limit = np.array([_BOX, _BOX, np.log(_BOX)])
     found = np.stack([_descend(coarse, centre, limit, _COARSEST, _MIDDLE) for centre in _cells(coarse, starts, limit)])
@@ -136,7 +132,7 @@ def _search(surface: np.ndarray, starts: int) -> tuple[np.ndarray, int]:
     found = np.stack([_descend(fine, centre, limit, _MIDDLE, _FINEST) for centre in found])
     values = fine(found, _FINEST)
     rows = np.column_stack([values, found[:, :2], np.exp(found[:, 2])])
-    return rows[np.argsort(values, kind="stable")], coarse.evaluations + fine.evaluations
+    return rows[np.argsort(values, kind="stable")]
 
 
 def _cells(cost: _Cost, count: int, limit: np.ndarray) -> np.ndarray:  # (N, 3)

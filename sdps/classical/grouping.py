@@ -14,7 +14,7 @@ from render.shared.seeds import generator
 from sdps.classical.common.front_end import Front, Prepared, conclude, prepare
 from sdps.classical.common.gbr import Gbr
 from sdps.classical.entropy import standard_form
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, Notes
 
 _log = logging.getLogger(__name__)
 
@@ -57,9 +57,8 @@ def grouping(
         seed: Root seed of the groups and choices.
 
     Returns:
-        Normals, lights and intensities; diagnostics `gbr` from the prepared factors, `albedo_groups` kept, `cells`
-        (pairs of groups that have a pixel), `valid_draws`, and `residual`, the median relative deviation of squared
-        albedo from its group's.
+        Normals, lights and intensities; notes `albedo_groups` kept, and `residual`, the median relative deviation of
+        squared albedo from its group's.
 
     Raises:
         InputError: grey images, parameters out of range, no draw that gives a real transformation, or degenerate
@@ -73,21 +72,20 @@ def grouping(
     rng = generator(seed, "grouping")
     pixels, albedo, normal = _groups(prepared, rng)
     standard = standard_form(prepared.factors)
-    best, found = _best_draw(prepared.factors.transformed(standard).surface[pixels], albedo, normal, draws, rng)
-    return conclude(prepared, standard.then(best), found)
+    best, residual = _best_draw(prepared.factors.transformed(standard).surface[pixels], albedo, normal, draws, rng)
+    return conclude(prepared, standard.then(best), Notes(albedo_groups=int(albedo.max()) + 1, residual=residual))
 
 
 def _best_draw(
     surface: np.ndarray, albedo: np.ndarray, normal: np.ndarray, draws: int, rng: np.random.Generator
-) -> tuple[Gbr, dict[str, float]]:
-    """Solve draws of one pixel per pair of groups; return the transformation of least residual, and diagnostics."""
-    best, residual, valid = None, np.inf, 0
+) -> tuple[Gbr, float]:
+    """Solve draws of one pixel per pair of groups; return the transformation of least residual, and that residual."""
+    best, residual = None, np.inf
     for _ in range(draws):
         chosen = _one_per_cell(albedo, normal, rng)
         found = solve_groups(surface[chosen], albedo[chosen])
         if found is None:
             continue
-        valid += 1
         spread = _residual(found, surface, albedo)
         if spread < residual:
             best, residual = found, spread
@@ -96,8 +94,7 @@ def _best_draw(
             f"none of {draws} draws gives a real bas-relief transformation; the albedos of one colour differ "
             "too much or too few normals share one (small object, shadows, highlights); use another method"
         )
-    cells = len(np.unique(albedo * (normal.max() + 1) + normal))
-    return best, {"albedo_groups": int(albedo.max()) + 1, "cells": cells, "valid_draws": valid, "residual": residual}
+    return best, residual
 
 
 def solve_groups(surface: np.ndarray, groups: np.ndarray) -> Gbr | None:

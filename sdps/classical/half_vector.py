@@ -10,13 +10,13 @@ solution at a subset of pixels, from which its difference to the diffuse fit is 
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import spatial
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import unit
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
 from sdps.classical.common.bas_relief_search import minimise_over_bas_reliefs
@@ -27,7 +27,8 @@ from sdps.classical.common.observations import MEAN, Observations
 from sdps.classical.common.separation import diffuse_surface
 from sdps.classical.least_squares import calibrate
 from sdps.classical.plain import equal_intensity
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import NO_NOTES, Estimate, Notes
+from sdps.core.intensities import grey, scale_to_mean
 
 _log = logging.getLogger(__name__)
 
@@ -63,9 +64,8 @@ def half_vector(
         seed: Root seed of the draw of pixels.
 
     Returns:
-        Normals and lights; diagnostics `energy` (H, W) per pixel, 0 for perfect symmetry, `solved` (pixels) and
-        `carried` (share of pixels where the solution beats the diffuse fit); uncalibrated also `gbr`,
-        `bas_relief_energy`, `energy_of_equal_intensities`, `evaluations` and `highlights`.
+        Normals and lights; note `solved`; uncalibrated also `gbr`, `highlights`, and `energy` and `equal_energy` of the
+        bas-relief transformation.
 
     Raises:
         InputError: fewer than 10 images, lights that do not fit them, or degenerate input; see `prepare`.
@@ -78,14 +78,15 @@ def half_vector(
     if _FEWEST <= len(images) < _ENOUGH:
         _log.warning("half-vector symmetry wants %d images or more, got %d; expect rough normals", _ENOUGH, len(images))
     if light_directions is None:
-        scene, start, info = _uncalibrated(images, mask, seed)
+        scene, start, notes = _uncalibrated(images, mask, seed)
     else:
         known = calibrate(images, mask, light_directions, intensities, weights=MEAN, minimum=_FEWEST)
-        lights = known.directions / np.linalg.norm(known.directions, axis=1, keepdims=True)
+        lights = unit(known.directions)
         scene = _Scene(known.observations, known.profiles, lights, np.ones(len(lights)))
-        start, info = diffuse_surface(scene.profiles, scene.lights), {}
-    normals, strengths, more = _normals(scene, _visible(start), samples, 0 if given else updates, seed)
-    return scene.estimate(normals, known.intensities.mean(1) if given else strengths, info | more)
+        start, notes = diffuse_surface(scene.profiles, scene.lights), NO_NOTES
+    normals, strengths, solved = _normals(scene, _visible(start), samples, 0 if given else updates, seed)
+    notes = replace(notes, solved=solved)
+    return scene.estimate(normals, grey(known.intensities) if given else strengths, notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,16 +98,18 @@ class _Scene:
     lights: np.ndarray
     intensities: np.ndarray
 
-    def estimate(self, normals: np.ndarray, intensities: np.ndarray, diagnostics: dict[str, Any]) -> Estimate:
+    def estimate(self, normals: np.ndarray, intensities: np.ndarray, notes: Notes) -> Estimate:
         """Return normals (P, 3), the lights and intensities (L,) of mean 1 as an estimate."""
-        relative = (intensities / intensities.mean()).astype(np.float32)
-        return Estimate(self.observations.to_map(normals), self.lights.astype(np.float32), relative, diagnostics)
+        relative = scale_to_mean(intensities).astype(np.float32)
+        return Estimate(self.observations.to_map(normals), self.lights.astype(np.float32), relative, notes=notes)
 
 
 def _normals(
     scene: _Scene, start: np.ndarray, samples: int, updates: int, seed: int
-) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-    """Solve some pixels, carry the outcome to all and keep it where it is better; also returns intensities."""
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Solve some pixels, carry the outcome to all and keep it where it is better; return normals, intensities and how
+    many were solved.
+    """
     lights = np.asarray(scene.lights, np.float64)
     chosen = np.sort(generator(seed, "half_vector").permutation(len(start))[:samples])
     first = scene.intensities.astype(np.float64)
@@ -114,29 +117,26 @@ def _normals(
     values = log_values(scene.profiles, intensities)
     carried = _carry(start, chosen, solved, scene.observations.mask)
     before, after = asymmetries(values, start, lights), asymmetries(values, carried, lights)
-    better = after < before
-    energy = scene.observations.to_map(np.where(better, after, before))
-    info = {"energy": energy, "solved": len(chosen), "carried": float(better.mean())}
-    return np.where(better[:, None], carried, start), intensities, info
+    return np.where((after < before)[:, None], carried, start), intensities, len(chosen)
 
 
-def _uncalibrated(images: np.ndarray, mask: np.ndarray, seed: int) -> tuple[_Scene, np.ndarray, dict[str, Any]]:
-    """Choose the bas-relief transformation by the asymmetry of some pixels; return lights, normals (P, 3) and facts."""
+def _uncalibrated(images: np.ndarray, mask: np.ndarray, seed: int) -> tuple[_Scene, np.ndarray, Notes]:
+    """Choose the bas-relief transformation by the asymmetry of some pixels; return lights, normals (P, 3) and notes."""
     prepared = prepare(images, mask, front="diffuse", minimum=_FEWEST, seed=seed)
     start = equal_intensity(prepared.factors)
     glossy = np.flatnonzero(prepared.specular().sum(1) > 0.05 * prepared.profiles.sum(1))
     gbr = start
-    info: dict[str, Any] = {"highlights": len(glossy) >= 30}
-    if info["highlights"]:
+    notes = Notes(highlights=len(glossy) >= 30)
+    if notes.highlights:
         pixels = generator(seed, "half_vector lights").permutation(glossy)[:150]
         energy = _bas_relief_energy(prepared, pixels)
-        gbr, lowest, count = minimise_over_bas_reliefs(energy, [start, Gbr()])
-        info |= {"bas_relief_energy": lowest, "energy_of_equal_intensities": energy(start), "evaluations": count}
+        gbr, lowest = minimise_over_bas_reliefs(energy, [start, Gbr()])
+        notes = replace(notes, energy=lowest, equal_energy=energy(start))
     else:
         _log.warning("only %d pixels show highlights; taking equal light intensities for granted", len(glossy))
-    found = conclude(prepared, gbr, info)
+    found = conclude(prepared, gbr, notes)
     scene = _Scene(prepared.observations, prepared.profiles, found.light_directions, found.intensities)
-    return scene, found.normals[prepared.mask], found.diagnostics
+    return scene, found.normals[prepared.mask], found.notes
 
 
 def _bas_relief_energy(prepared: Prepared, pixels: np.ndarray) -> Callable[[Gbr], float]:
@@ -145,7 +145,7 @@ def _bas_relief_energy(prepared: Prepared, pixels: np.ndarray) -> Callable[[Gbr]
     def energy(gbr: Gbr) -> float:
         vectors, sources = gbr.apply(surface, prepared.factors.lights)
         strength = np.maximum(np.linalg.norm(sources, axis=0), 1e-12)
-        normals = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+        normals = unit(vectors)
         if normals[:, 2].mean() < 0.0:
             return np.inf
         found = asymmetry(log_values(profiles, strength), normals, (sources / strength).T)
@@ -186,8 +186,7 @@ def _refine(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Descend on the hemisphere: the eight neighbours at each step size (degrees), twice."""
     for step in progress_bar([size for size in steps for _ in range(2)], desc="normals", unit="step"):
-        first = np.cross(best, [0.0, 1.0, 0.0])
-        first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
+        first = unit(np.cross(best, [0.0, 1.0, 0.0]))
         second = np.cross(best, first)
         centre, size = best, np.tan(np.radians(step))
         for turn in np.arange(8) * np.pi / 4.0:
@@ -198,9 +197,8 @@ def _refine(
 
 def _visible(normals: np.ndarray) -> np.ndarray:  # (P, 3)
     """Return unit normals that do not turn away from the camera, of vectors (P, 3) of any length."""
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    normals = np.column_stack([normals[:, :2], np.maximum(normals[:, 2], 0.02)])
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(normals)
+    return unit(np.column_stack([normals[:, :2], np.maximum(normals[:, 2], 0.02)]))
 
 
 def _carry(start: np.ndarray, chosen: np.ndarray, solved: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (P, 3)

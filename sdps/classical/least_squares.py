@@ -1,8 +1,7 @@
 """Calibrated least squares (Woodham 1980): Lambert's law solved per pixel under known lights."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,10 +9,11 @@ from render.shared.errors import InputError
 from sdps.classical.common.geometry import MIN_CONDITION, unit_normals
 from sdps.classical.common.observations import REC601, Observations, observe
 from sdps.classical.common.weighted import solve_weighted
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import NO_NOTES, Estimate, Notes
+from sdps.core.intensities import grey
 
 _CHUNK_VALUES = 2_000_000
-"""Observations solved at a time: 16 MB per float64 array of them, whatever the size of the object."""
+"""Observations solved at a time: 16 MB per float64 array of them, however large the object."""
 
 
 def least_squares(
@@ -35,8 +35,8 @@ def least_squares(
             dropped, as long as three remain (0: keep all; 0.05 to 0.1 is usual).
 
     Returns:
-        Normals; the given lights; diagnostics `albedo` (H, W) float32, relative to a white Lambertian
-        surface when the intensities are absolute.
+        Normals; the given lights; note `albedo`, relative to a white Lambertian surface when the intensities are
+        absolute.
 
     Raises:
         InputError: fewer than three images, lights that are coplanar or zero, an empty mask, images that are black or
@@ -79,15 +79,15 @@ class Calibrated:
         parts = (slice(begin, begin + step) for begin in range(0, pixels, step))
         return np.concatenate([solve(self.profiles[part], start[part]) for part in parts])
 
-    def conclude(self, vectors: np.ndarray, diagnostics: dict[str, Any] | None = None) -> Estimate:
+    def conclude(self, vectors: np.ndarray, notes: Notes = NO_NOTES) -> Estimate:
         """Turn vectors (P, 3), albedo times normal, into an estimate with the given lights."""
         albedo = np.linalg.norm(vectors, axis=1)
         to_map = self.observations.to_map
         return Estimate(
             normals=to_map(unit_normals(vectors)),
             light_directions=self.directions.astype(np.float32),
-            intensities=self.intensities.mean(1).astype(np.float32),
-            diagnostics={"albedo": to_map(albedo)} | (diagnostics or {}),
+            intensities=grey(self.intensities).astype(np.float32),
+            notes=replace(notes, albedo=to_map(albedo)),
         )
 
 
@@ -117,7 +117,7 @@ def calibrate(
     if intensities.shape not in ((count, 1), (count, channels)):
         raise InputError(f"intensities of shape {intensities.shape} do not fit images of {channels} channel(s)")
     if not (np.isfinite(directions).all() and np.isfinite(intensities).all()):
-        raise InputError("light directions or intensities hold NaN or infinite values; repair them first")
+        raise InputError("light directions or intensities contain NaN or infinite values; repair them first")
     if (intensities <= 0.0).any():
         raise InputError("light intensities must be positive")
     if not directions.any(axis=1).all():

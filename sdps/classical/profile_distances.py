@@ -11,20 +11,20 @@ and the lights.
 """
 
 import logging
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
 from scipy.sparse import csgraph, csr_matrix, linalg
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import spiral, unit
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
 from sdps.classical.common.geometry import outward_gradient
 from sdps.classical.common.observations import observe
 from sdps.classical.common.weighted import normal_equations
-from sdps.classical.profile_lights import CLIP, POWER, Lights, fibonacci, find_lights
-from sdps.core.estimate import Estimate
+from sdps.classical.profile_lights import CLIP, POWER, Lights, find_lights
+from sdps.core.estimate import Estimate, Notes
 
 _log = logging.getLogger(__name__)
 
@@ -63,11 +63,8 @@ def profile_distances(
         seed: Seed of the samples.
 
     Returns:
-        Normals, light directions, intensities of mean 1 (0 for black images), and diagnostics: `beta` (the slope used),
-        `beta_contour`, `beta_distribution`, `contour_correlation` (of distance and angle along the contour),
-        `trusted_pairs`, `residual` (rms of the trusted cosines), `spectrum` (of the cosines, relative), `samples`,
-        `light_mean` (length of the mean direction: 0 all around, 0.5 a hemisphere) and `curve` (brightness
-        over cosine).
+        Normals, light directions, intensities of mean 1 (0 for black images); notes `residual`, the root mean square
+        of the trusted cosines, and `light_mean`.
 
     Raises:
         InputError: fewer than 10 images, bad options, no contour, profiles that vary along one direction only
@@ -78,15 +75,15 @@ def profile_distances(
     profiles = np.maximum(observations.grey(), 0.0).astype(np.float32)
     rng, inverse = generator(seed, "profile_distances"), _first_inverse(profiles)
     for _ in progress_bar(range(rounds), desc="profile distances", unit="round", disable=rounds < 2):
-        shapes = compressed(profiles * inverse)
-        rows, normals, diagnostics = _embed_samples(shapes, observations.mask, samples, slope, rng)
+        shapes = compress(profiles * inverse)
+        rows, normals, residual = _embed_samples(shapes, observations.mask, samples, slope, rng)
         lights = find_lights(profiles[rows], shapes[rows], normals)
         gains = lights.intensities
         inverse = np.where(gains > 0.0, 1.0 / np.maximum(gains, 1e-3), 1.0).astype(np.float32)
     mean = _mean_direction(lights)
     directions, intensities = lights.directions.astype(np.float32), lights.intensities.astype(np.float32)
-    maps = observations.to_map(_spread(normalised(shapes), rows, normals))
-    return Estimate(maps, directions, intensities, diagnostics | {"light_mean": mean, "curve": lights.curve})
+    maps = observations.to_map(_spread(normalise(shapes), rows, normals))
+    return Estimate(maps, directions, intensities, notes=Notes(residual=residual, light_mean=mean))
 
 
 def _check(images: int, samples: int, slope: str, rounds: int) -> None:
@@ -110,17 +107,16 @@ def _mean_direction(lights: Lights) -> float:
     return mean
 
 
-def compressed(profiles: np.ndarray) -> np.ndarray:  # (P, L)
+def compress(profiles: np.ndarray) -> np.ndarray:  # (P, L)
     """Cut each profile (P, L) at its upper quantile, bring it to a largest value of 1 and compress it."""
     top = np.quantile(profiles, CLIP, axis=1, keepdims=True)
     top = np.where(top > 0.0, top, profiles.max(1, keepdims=True))  # lit in too few images for the quantile
     return np.minimum(profiles / np.maximum(top, 1e-30), 1.0) ** POWER
 
 
-def normalised(profiles: np.ndarray) -> np.ndarray:  # (P, L)
+def normalise(profiles: np.ndarray) -> np.ndarray:  # (P, L)
     """Return rows of zero mean and unit length: what albedo does not change."""
-    centred = profiles - profiles.mean(1, keepdims=True)
-    return centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-12)
+    return unit(profiles - profiles.mean(1, keepdims=True))
 
 
 def contour(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +150,7 @@ def distribution_slope(shapes: np.ndarray, step: float = 0.15) -> float:
     """
     curve = np.sort(shapes, axis=1).mean(0)  # (L,)
     heights = (np.arange(len(curve)) + 0.5) / len(curve) * 2.0 - 1.0
-    lights = fibonacci(4000)
+    lights = spiral(4000)
     first = np.interp(lights[:, 2], heights, curve)
     second = np.interp(lights @ [np.sin(step), 0.0, np.cos(step)], heights, curve)
     return float(step / max(np.arccos(np.clip(np.corrcoef(first, second)[0, 1], -1.0, 1.0)), 1e-6))
@@ -171,14 +167,14 @@ def decompose(angles: np.ndarray, start: np.ndarray | None = None, limit: int = 
     for _ in range(limit):
         matrices, targets = normal_equations(normals, cosines, weights)
         solved = np.linalg.solve(matrices + 1e-6 * np.eye(3), targets[..., None])[..., 0]
-        moved = _unit(_unit(solved) + normals)  # half steps: all rows move at once
+        moved = unit(unit(solved) + normals)  # half steps: all rows move at once
         change, normals = float(np.abs(moved - normals).max()), moved
         if change < 5e-4:
             break
     return normals
 
 
-def oriented(normals: np.ndarray, rows: np.ndarray, outward: np.ndarray) -> np.ndarray:  # (S, 3)
+def orient(normals: np.ndarray, rows: np.ndarray, outward: np.ndarray) -> np.ndarray:  # (S, 3)
     """Rotate and reflect normals (S, 3) so that `rows` of them lean along `outward` (Q, 2) and most face the camera."""
     targets = np.concatenate([outward, np.zeros((len(outward), 1))], axis=1)
     left, _, right = np.linalg.svd(normals[rows].T @ targets)
@@ -186,16 +182,12 @@ def oriented(normals: np.ndarray, rows: np.ndarray, outward: np.ndarray) -> np.n
     return turned * [1.0, 1.0, np.sign(turned[:, 2].mean()) or 1.0]
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
-
-
 def _scaled(cosines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return classical scaling to three dimensions, (S, 3) unit, and the four largest eigenvalues, relative."""
     values, vectors = linalg.eigsh(cosines, k=4, which="LA", v0=np.ones(len(cosines)))
     order = np.argsort(values)[::-1]
     values, vectors = np.maximum(values[order], 1e-12), vectors[:, order]
-    return _unit(vectors[:, :3] * np.sqrt(values[:3])), values / values[0]
+    return unit(vectors[:, :3] * np.sqrt(values[:3])), values / values[0]
 
 
 def _first_inverse(profiles: np.ndarray) -> np.ndarray:  # (L,)
@@ -223,9 +215,9 @@ def _spread_samples(unit: np.ndarray, usable: np.ndarray, count: int, rng: np.ra
 
 def _embed_samples(
     shapes: np.ndarray, mask: np.ndarray, count: int, slope: str, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-    """Return the rows of samples (S,), their normals (S, 3) in the camera frame, and diagnostics."""
-    unit = normalised(shapes)
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the rows of samples (S,), their normals (S, 3) in the camera frame, and the residual of these."""
+    unit = normalise(shapes)
     usable = np.flatnonzero(shapes.std(1) > 1e-3)
     edge, outward = contour(mask)
     keep = np.isin(edge, usable)
@@ -246,14 +238,13 @@ def _embed_samples(
     rows, ways = rows[joined], ways[np.ix_(joined, joined)]
     known = np.isin(edge[picked], rows)
     places, outward = np.searchsorted(rows, edge[picked][known]), outward[picked][known]
-    normals, diagnostics = _solve(ways, places, outward, distribution_slope(shapes[rows]), slope, mask)
-    return rows, normals, diagnostics
+    return rows, *_solve(ways, places, outward, distribution_slope(shapes[rows]), slope, mask)
 
 
 def _solve(
     ways: np.ndarray, places: np.ndarray, outward: np.ndarray, distribution: float, slope: str, mask: np.ndarray
-) -> tuple[np.ndarray, dict[str, Any]]:
-    """Turn geodesics (S, S) into oriented normals (S, 3)."""
+) -> tuple[np.ndarray, float]:
+    """Turn geodesics (S, S) into oriented normals (S, 3); also return how far their cosines are off."""
     along, correlation = _contour_slope(ways[np.ix_(places, places)], outward)
     if correlation < 0.5:
         raise InputError(
@@ -264,7 +255,7 @@ def _solve(
     spectrum = _scaled(np.cos(np.minimum(beta * ways, np.pi)))[1]
     if spectrum[2] < 0.02:
         raise InputError("the profiles vary along one direction only; coplanar lights or a cylindrical object")
-    normals = oriented(decompose(beta * ways), places, outward)
+    normals = orient(decompose(beta * ways), places, outward)
     if slope == "contour":
         # The rim alone is a poor ruler: distances along and across it differ on glossy surfaces. Instead its normals
         # must come out a right angle off the view, less what a pixel centre half a pixel inside a disc of this area is.
@@ -272,24 +263,14 @@ def _solve(
         for _ in range(3):
             polar = np.arccos(np.clip(normals[places, 2], -1.0, 1.0)).mean()
             beta *= float(np.clip(target / polar, 0.7, 1.4))
-            normals = oriented(decompose(beta * ways, normals), places, outward)
+            normals = orient(decompose(beta * ways, normals), places, outward)
     if not 1 / 1.6 < beta / distribution < 1.6:
         _log.warning(
             "slope %.2f (%s) against %.2f by the distribution of intensities: the lights do not surround the object "
-            "or its contour is no occluding one", beta, slope, distribution,
+            "or its contour is not an occluding one", beta, slope, distribution,
         )  # fmt: skip
     trusted = beta * ways < _TRUSTED
-    residual = float(np.sqrt(np.mean((normals @ normals.T - np.cos(beta * ways))[trusted] ** 2)))
-    return normals, {
-        "beta": beta,
-        "beta_contour": along,
-        "beta_distribution": distribution,
-        "contour_correlation": correlation,
-        "trusted_pairs": int(np.triu(trusted, 1).sum()),
-        "residual": residual,
-        "spectrum": spectrum,
-        "samples": len(ways),
-    }
+    return normals, float(np.sqrt(np.mean((normals @ normals.T - np.cos(beta * ways))[trusted] ** 2)))
 
 
 def _contour_slope(ways: np.ndarray, outward: np.ndarray) -> tuple[float, float]:
@@ -302,14 +283,14 @@ def _contour_slope(ways: np.ndarray, outward: np.ndarray) -> tuple[float, float]
     return float(slope), float(np.corrcoef(angles[near], ways[near])[0, 1])
 
 
-def _spread(unit: np.ndarray, rows: np.ndarray, normals: np.ndarray, nearest: int = 6) -> np.ndarray:  # (P, 3)
+def _spread(vectors: np.ndarray, rows: np.ndarray, normals: np.ndarray, nearest: int = 6) -> np.ndarray:  # (P, 3)
     """Give every profile the mean normal of the samples with the nearest profiles, the nearer the more."""
-    sampled = unit[rows]
-    result = np.empty((len(unit), 3), np.float64)
-    for start in progress_bar(range(0, len(unit), 8192), desc="normals of all pixels", unit="block", leave=False):
-        cosine = unit[start : start + 8192] @ sampled.T  # (B, S)
+    sampled = vectors[rows]
+    result = np.empty((len(vectors), 3), np.float64)
+    for start in progress_bar(range(0, len(vectors), 8192), desc="normals of all pixels", unit="block", leave=False):
+        cosine = vectors[start : start + 8192] @ sampled.T  # (B, S)
         best = np.argpartition(cosine, -nearest, axis=1)[:, -nearest:]
         distance = np.maximum(1.0 - np.take_along_axis(cosine, best, axis=1), 0.0)
         weight = 1.0 / (distance + 1e-4)
         result[start : start + 8192] = (weight[..., None] * normals[best]).sum(1)
-    return _unit(result)
+    return unit(result)

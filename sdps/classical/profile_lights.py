@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import isotonic_regression
 
+from render.shared.imaging.vectors import spiral, unit
+
 CLIP, POWER = 0.85, 0.7
 """Quantile of a profile above which brightness is cut, and the exponent on the rest: highlights must not rule."""
 
@@ -35,14 +37,6 @@ class Lights:
     directions: np.ndarray
     intensities: np.ndarray
     curve: np.ndarray
-
-
-def fibonacci(count: int) -> np.ndarray:  # (count, 3)
-    """Return unit directions spread evenly over the whole sphere."""
-    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
-    angle = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
-    flat = np.sqrt(1.0 - z * z)
-    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=-1)
 
 
 def find_lights(profiles: np.ndarray, shapes: np.ndarray, normals: np.ndarray) -> Lights:
@@ -79,7 +73,7 @@ def _search(
     values: np.ndarray, normals: np.ndarray, heights: np.ndarray, curve: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the best direction (L, 3) and gain (L,) of each image: on a grid, then around its best point."""
-    grid = fibonacci(2500)
+    grid = spiral(2500)
     cost, gain = _costs(values.T, np.interp(normals @ grid.T, heights, curve).T)  # (L, G)
     best = cost.argmin(1)
     directions, gains = grid[best], gain[np.arange(len(best)), best]
@@ -88,7 +82,7 @@ def _search(
         for k, centre in enumerate(directions):
             across = np.linalg.svd(centre[None])[2][1:]  # two directions at right angles
             near = centre + radius * disc @ across
-            near /= np.linalg.norm(near, axis=1, keepdims=True)
+            near = unit(near)
             cost, gain = _costs(values[:, k][None], np.interp(normals @ near.T, heights, curve).T)
             directions[k], gains[k] = near[cost[0].argmin()], gain[0, cost[0].argmin()]
     return directions, gains

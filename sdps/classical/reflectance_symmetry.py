@@ -10,17 +10,18 @@ theta_h and comparing neighbours (the ratio of von Neumann, 1941), and searched 
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import half_vectors, unit
 from render.shared.seeds import generator
 from sdps.classical.common.bas_relief_search import minimise_over_bas_reliefs
 from sdps.classical.common.front_end import Front, Prepared, conclude, prepare
 from sdps.classical.common.gbr import Gbr
-from sdps.classical.common.isotropy import half_vectors
 from sdps.classical.plain import equal_intensity
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, Notes
 
 _log = logging.getLogger(__name__)
 
@@ -62,8 +63,7 @@ def reflectance_symmetry(
         seed: Root seed of the draw of pixels.
 
     Returns:
-        Normals, lights; diagnostics `gbr` (mu, nu, lambda), `energy`, `energy_of_equal_intensities`, `evaluations`,
-        `specular_share`, `highlights` (whether there were enough), `views`.
+        Normals, lights; notes `highlights`, `energy`, `equal_energy`.
 
     Raises:
         InputError: degenerate input; see `prepare`.
@@ -73,8 +73,8 @@ def reflectance_symmetry(
     prepared = prepare(images, mask, front=front, minimum=6, seed=seed)
     start = gbr = equal_intensity(prepared.factors)
     share, chosen = highlight_images(prepared)
-    diagnostics = {"specular_share": share, "views": len(chosen), "highlights": share >= _GLOSS and len(chosen) >= 3}
-    if not diagnostics["highlights"]:
+    notes = Notes(highlights=bool(share >= _GLOSS and len(chosen) >= 3))
+    if not notes.highlights:
         _log.warning(
             "the specular part is %.1f %% of the light, seen in %d images: no highlights to go by; taking equal light "
             "intensities for granted", 100.0 * share, len(chosen),
@@ -82,11 +82,11 @@ def reflectance_symmetry(
     else:
         pixels = generator(seed, "reflectance_symmetry").permutation(len(prepared.profiles))[:samples]
         energy = symmetry_energy(prepared, pixels, chosen, _PRIOR)
-        gbr, lowest, count = minimise_over_bas_reliefs(energy, [start, Gbr()])
+        gbr, lowest = minimise_over_bas_reliefs(energy, [start, Gbr()])
         if lowest > _POOR:
             _log.warning("the highlights keep an energy of %.2f: they are not symmetric, expect large errors", lowest)
-        diagnostics |= {"energy": lowest, "energy_of_equal_intensities": energy(start), "evaluations": count}
-    return conclude(prepared, gbr, diagnostics)
+        notes = replace(notes, energy=lowest, equal_energy=energy(start))
+    return conclude(prepared, gbr, notes)
 
 
 def highlight_images(prepared: Prepared) -> tuple[float, np.ndarray]:
@@ -106,7 +106,7 @@ def symmetry_energy(prepared: Prepared, pixels: np.ndarray, chosen: np.ndarray, 
 
     def energy(gbr: Gbr) -> float:
         vectors, sources = gbr.apply(surface, lights)
-        normals = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+        normals = unit(vectors)
         strength = np.maximum(np.linalg.norm(sources, axis=0), 1e-12)
         if normals[:, 2].mean() < 0.0:
             return np.inf

@@ -23,7 +23,7 @@ class ClassicalMethod:
         function: Its function.
         paper: Authors, venue and year.
         summary: One line.
-        calibrated: Whether it is told the lights; otherwise it finds them.
+        calibrated: Whether it is given the lights; otherwise it finds them.
         by_pixel: Whether what it finds of a pixel depends on no other.
         minimum: Fewest images it works with.
         options: Fixed options of the function.
@@ -79,7 +79,7 @@ def run(
         options: Options of the method's function.
 
     Returns:
-        Normals, lights and intensities, with the seconds it took in the diagnostics.
+        Normals, lights and intensities, and the seconds it took.
 
     Raises:
         InputError: an unknown name, degenerate input, or a calibrated method without lights.
@@ -90,5 +90,4 @@ def run(
     given = (lights, intensities) if entry.calibrated else ()
     start = time.perf_counter()
     estimate = entry.load()(images, mask, *given, **(entry.options | options))
-    seconds = time.perf_counter() - start
-    return replace(estimate, diagnostics=estimate.diagnostics | {"seconds": seconds})
+    return replace(estimate, seconds=time.perf_counter() - start)

@@ -6,6 +6,7 @@ law; they differ in which observations they believe.
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from render.shared.errors import InputError
 from sdps.classical.common.rpca import robust_low_rank
 from sdps.classical.common.weighted import solve_weighted
 from sdps.classical.least_squares import Calibrated, calibrate, solve_plain
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import NO_NOTES, Estimate, Notes
 
 _log = logging.getLogger(__name__)
 
@@ -38,8 +39,8 @@ def position_threshold(
         drop_highest: The same at the bright end.
 
     Returns:
-        As `least_squares`; diagnostics `kept`, the number of observations per pixel, and `unresolved`, the share of
-        pixels whose kept lights are coplanar, where all observations are used.
+        As `least_squares`; notes `kept`, and `unresolved`, pixels whose kept lights are coplanar, where all
+        observations are used.
 
     Raises:
         InputError: shares that leave fewer than three observations, or degenerate input as in `least_squares`.
@@ -59,7 +60,7 @@ def position_threshold(
         np.put_along_axis(weights, order, 1.0, axis=1)
         return solve_weighted(known.directions, profiles, weights, start)
 
-    return _conclude(known, solve, {"kept": last - first})
+    return _conclude(known, solve, Notes(kept=last - first))
 
 
 def robust_least_squares(
@@ -82,8 +83,8 @@ def robust_least_squares(
         floor: Residual, as a share of the pixel's brightest intensity, below which the weight grows no more.
 
     Returns:
-        As `least_squares`; diagnostics `unresolved`, the share of pixels whose lit observations are coplanar, where
-        plain least squares is used.
+        As `least_squares`; note `unresolved`, pixels whose lit observations are coplanar, where plain least squares is
+        used.
 
     Raises:
         InputError: parameters out of range, or degenerate input as in `least_squares`.
@@ -91,7 +92,7 @@ def robust_least_squares(
     if not (iterations >= 1 and floor > 0.0):
         raise InputError(f"robust least squares needs iterations >= 1 and floor > 0, got {iterations} and {floor}")
     known = calibrate(images, mask, light_directions, intensities)
-    return _conclude(known, lambda rows, start: _least_absolute(known.directions, rows, start, iterations, floor), {})
+    return _conclude(known, lambda rows, start: _least_absolute(known.directions, rows, start, iterations, floor))
 
 
 def _least_absolute(
@@ -125,8 +126,7 @@ def low_rank_least_squares(
         images, mask, light_directions, intensities: As for `least_squares`.
 
     Returns:
-        As `least_squares`; diagnostics `rank` of the low-rank part, and `sparse`, the mean absolute sparse part over
-        the mean intensity.
+        As `least_squares`.
 
     Raises:
         InputError: degenerate input, as in `least_squares`.
@@ -137,12 +137,11 @@ def low_rank_least_squares(
     rank = int((spectrum > 1e-3 * spectrum[-1]).sum())
     if rank < 3:
         _log.warning("the low-rank part has rank %d of 3: it lost shading with the highlights", rank)
-    sparse = float(np.abs(known.profiles - low).mean() / max(float(known.profiles.mean()), 1e-300))
-    return known.conclude(solve_plain(known.directions, low), {"rank": rank, "sparse": sparse})
+    return known.conclude(solve_plain(known.directions, low))
 
 
 def _conclude(
-    known: Calibrated, solve: Callable[[np.ndarray, np.ndarray], np.ndarray], diagnostics: dict[str, object]
+    known: Calibrated, solve: Callable[[np.ndarray, np.ndarray], np.ndarray], notes: Notes = NO_NOTES
 ) -> Estimate:
     """Solve from NaN on; use plain least squares where it stays, and say so when that is much of the object."""
     vectors = known.in_chunks(solve, np.full((len(known.profiles), 3), np.nan))
@@ -153,4 +152,4 @@ def _conclude(
         _log.warning(
             "at %.0f %% of the pixels the kept lights are coplanar; all observations are used there", 100 * share
         )
-    return known.conclude(vectors, diagnostics | {"unresolved": share})
+    return known.conclude(vectors, replace(notes, unresolved=share))

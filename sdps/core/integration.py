@@ -24,7 +24,7 @@ n_z is sqrt(1 / R), so this is the rim of R = 1100."""
 _TOLERANCE = 1e-7  # of the linear system
 _ROUGH = 1e-4  # the same while weights still change
 _SETTLED = 1e-3
-_OUTWORN = 12  # steps of a solve after which the preconditioner is built anew for the changed weights
+_OUTWORN = 12  # steps of a solve after which the preconditioner is rebuilt for the changed weights
 _WEAKEST = 1e-6  # weight of an edge that both of its equations have left
 LARGE = 1_000_000
 """Pixels above which the grid is solved in place (`sdps.core.large_depth`); a graph of so many takes 0.7 GiB."""
@@ -101,7 +101,7 @@ def integrate(
     With `discontinuities` each pixel has a one-sided equation per neighbour, n_z (z' - z) + n_x = 0, and of the two
     neighbours left and right, or above and below, the one across the smaller step counts more. These are the bilateral
     weights of Cao et al., Bilateral Normal Integration (ECCV 2022), for an orthographic camera:
-    sigmoid(k ((n_z dz of the other side)^2 - (n_z dz of this side)^2)), found anew until the energy settles.
+    sigmoid(k ((n_z dz of the other side)^2 - (n_z dz of this side)^2)), found again until the energy settles.
 
     Args:
         normals: (H, W, 3) camera frame (x right, y up, z to the camera), of any length and real type; not read
@@ -116,7 +116,7 @@ def integrate(
     """
     started = time.perf_counter()
     large = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and int(mask.sum()) > LARGE
-    unit = None if large else checked_normals(normals, mask)
+    unit = None if large else check_normals(normals, mask)
     if not (sharpness > 0 and most >= 1):
         raise InputError(f"sharpness must be positive and most at least 1, got {sharpness} and {most}")
     stage("depth")
@@ -135,7 +135,7 @@ def integrate(
     return Depth(mask=mask, **_laid_out(graph, mask, z), **diagnostics, seconds=time.perf_counter() - started)
 
 
-def checked_normals(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def check_normals(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return the mask's unit normals (n, 3) float64 in row order, or refuse them as `integrate` says."""
     normals, mask = np.asarray(normals), np.asarray(mask)
     if mask.ndim != 2 or mask.dtype != np.bool_ or normals.shape != (*mask.shape, 3):
@@ -308,7 +308,7 @@ def _slopes(normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...]) -> tu
         inside = mask[rows, box[1]]
         if not inside.any():
             continue
-        unit = checked_normals(normals[rows, box[1]], inside)
+        unit = check_normals(normals[rows, box[1]], inside)
         flat += int((unit[:, 2] < STEEPEST).sum())
         for part, values in zip(slopes, (unit[:, 0], unit[:, 1], np.maximum(unit[:, 2], STEEPEST)), strict=True):
             part[start : start + step][inside] = values

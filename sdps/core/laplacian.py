@@ -1,7 +1,7 @@
 """Linear systems on weighted graphs of pixels, by conjugate gradients with algebraic multigrid (pyamg).
 
 A direct solve takes ever more memory per pixel, plain conjugate gradients ever more steps; this takes time and memory
-in proportion to the pixels, whatever the shape of the mask.
+in proportion to the pixels, for any shape of the mask.
 
 Legend: n unknowns, m edges of the graph.
 """

@@ -4,6 +4,7 @@ import numpy as np
 
 from render.shared.errors import InputError
 from sdps.core.estimate import Estimate, Score
+from sdps.core.intensities import over_first
 
 _TINY = 1e-8
 _PART = 2**20  # vectors worked on at once
@@ -62,12 +63,9 @@ def intensity_error(estimate: np.ndarray, truth: np.ndarray) -> float:
         estimate: (L,) estimated intensities, the same for the three channels.
         truth: (L,) or (L, 3) true intensities.
     """
-    estimate = np.asarray(estimate, np.float64)
-    truth = np.asarray(truth, np.float64)
-    truth = truth[:, None] if truth.ndim == 1 else truth
     if len(estimate) != len(truth):
         raise InputError(f"{len(estimate)} estimated light intensities against {len(truth)} true ones")
-    truth = truth / (truth[0] + _TINY)  # (L, C)
+    estimate, truth = np.asarray(estimate, np.float64), over_first(np.asarray(truth, np.float64))  # (L,), (L, C)
     estimate = np.broadcast_to(estimate[:, None], truth.shape)
     scale = (estimate * truth).sum() / max((estimate * estimate).sum(), _TINY)
     return float((np.abs(truth - scale * estimate) / (truth + _TINY)).mean())

@@ -105,7 +105,7 @@ def _speed(device: str) -> tuple[float, str]:
 
 def _measured(side: int) -> float:
     """Return the least time of a step in float32 over the least in bfloat16, taken in turn."""
-    with torch.inference_mode(False), torch.enable_grad():  # whatever the caller is in
+    with torch.inference_mode(False), torch.enable_grad():  # in any mode of the caller
         ways = {dtype: _convolution_step(dtype, side) for dtype in (torch.float32, torch.bfloat16)}
         least = dict.fromkeys(ways, float("inf"))
         for way in ways.values():

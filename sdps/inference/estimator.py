@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import unit
 from render.shared.progress import repeat
 from sdps.core.estimate import Estimate
+from sdps.core.intensities import check_intensities, colour_balance, grey, scale_to_mean
 from sdps.core.precision import Arithmetic, arithmetic
 from sdps.core.symmetry import SYMMETRIES
 from sdps.data.augment import measure_exposure
@@ -42,10 +44,10 @@ class Estimator(InferenceConfig):
     """Trained networks that work together: any lighting model with any normal model; its options are those of its base.
 
     Attributes:
-        lighting: Trained lighting model, or None when lights are always given or `normals` is told none.
+        lighting: Trained lighting model, or None when lights are always given or `normals` needs none.
         normals: Trained model that gives normals, by convolution or pixel by pixel; None for lights alone.
         device: Where all networks are.
-        chunk_pixels: Image pixels a network encodes at once; bounds memory whatever the number of images. None: what
+        chunk_pixels: Image pixels a network encodes at once; bounds memory for any number of images. None: what
             suits the device.
 
     Raises:
@@ -95,7 +97,7 @@ class Estimator(InferenceConfig):
         """Estimate normals, and whichever of light directions and intensities are not given.
 
         Without a lighting model, given directions alone stand for lights of equal intensity. Normal models that are
-        told no lights see the images as they are, whatever is given.
+        given no lights see the images as they are, even where lights are given.
 
         Args:
             images: (L, H, W, 3), linear radiance of any overall scale, L >= 1, any size; an array, or anything that
@@ -108,11 +110,7 @@ class Estimator(InferenceConfig):
 
         Returns:
             The estimate. Directions or intensities that nobody gave, estimated or assumed are empty, (0, 3) and (0,),
-            so that scoring them is refused. Diagnostics hold `seconds`, `precision` (what was computed in), `exposure`
-            (factor applied for each network), `stray_light` (L, 3) (taken off before that) and, where classes of light
-            were estimated, `confidence` (L,), the product of the probabilities of the two likeliest direction classes;
-            of lighting models that tell it, `expected_light_error` (L,), the error to expect of each direction, and of
-            normal models, `expected_error` (H, W), 0 off the object; both in degrees.
+            so that scoring them is refused.
 
         Raises:
             InputError: sizes that do not fit, non-finite values, an empty mask, lights wanted without a lighting
@@ -120,12 +118,22 @@ class Estimator(InferenceConfig):
         """
         if self.needs_lights and self.lighting is None and lights is None:
             raise InputError("no lighting model was loaded, so light directions must be given")
-        began = time.perf_counter() - (found.diagnostics["seconds"] if found is not None else 0.0)
-        scene, known, diagnostics = self._prepare(images, mask, lights, intensities)
-        lit = self._lit(scene, known, found, diagnostics)
-        normals = np.zeros((*mask.shape, 3), np.float32)
-        normals[scene.rows, scene.columns] = self._box_normals(scene, known, lit, diagnostics)
-        return _concluded(normals, known if lit is None else lit, began, diagnostics)
+        began = time.perf_counter() - (found.seconds if found is not None else 0.0)
+        scene, known = self._prepare(images, mask, lights, intensities)
+        if found is None:
+            found = self._estimate_lights(scene, known)
+        elif known.directions is not None or len(found.light_directions) != len(scene):
+            raise InputError("found holds lights of other images, or of images whose lights are given")
+        normals, expected, exposure = self._box_normals(scene, known, self._lights(found, known))
+        return replace(
+            found,
+            normals=scene.in_frame(normals),
+            expected_error=None if expected is None else scene.in_frame(expected),
+            precision=self.arithmetic.precision,
+            stray_light=scene.stray,
+            exposure=found.exposure | {"normals": exposure},
+            seconds=time.perf_counter() - began,
+        )
 
     @torch.inference_mode()
     def estimate_lights(self, images: ImageSource, mask: np.ndarray, intensities: np.ndarray | None = None) -> Estimate:
@@ -143,57 +151,91 @@ class Estimator(InferenceConfig):
         if self.lighting is None:
             raise InputError("no lighting model was loaded; load one, or give the lights")
         began = time.perf_counter()
-        scene, known, diagnostics = self._prepare(images, mask, None, intensities)
-        lights = self._estimate_lights(scene, known, diagnostics)
-        return _concluded(np.zeros((0, 0, 3), np.float32), lights, began, diagnostics)
+        scene, known = self._prepare(images, mask, None, intensities)
+        found = self._estimate_lights(scene, known)
+        precision = self.arithmetic.precision
+        return replace(found, precision=precision, stray_light=scene.stray, seconds=time.perf_counter() - began)
 
     def _prepare(
         self, images: ImageSource, mask: np.ndarray, lights: np.ndarray | None, intensities: np.ndarray | None
-    ) -> tuple[ObjectImages, _Known, dict[str, Any]]:
-        """Check the arguments of `estimate`; return the object's images, what is known, and the first diagnostics."""
+    ) -> tuple[ObjectImages, _Known]:
+        """Check the arguments of `estimate`; return the object's images, and what is known of the lights.
+
+        Directions become of unit length; intensities, whose scale is their own, come to that of training.
+        """
         check_lights(len(images), lights, intensities)
         scene = survey(images, mask, self.margin_of(mask.shape), stray=self.stray_light)
-        precision = self.arithmetic.precision
-        diagnostics: dict[str, Any] = {"precision": precision, "stray_light": scene.stray, "exposure": {}}
-        return scene, self._known(lights, intensities), diagnostics
+        directions = strengths = balance = None
+        if lights is not None:
+            directions = unit(np.asarray(lights, np.float64)).astype(np.float32)
+        if intensities is not None:
+            scaled = scale_to_mean(np.asarray(intensities, np.float64), self._mean_intensity())
+            strengths, colours = grey(scaled).astype(np.float32), colour_balance(scaled)
+            balance = None if colours is None else colours.astype(np.float32)
+        return scene, _Known(directions, strengths, balance)
 
-    def _lit(
-        self, scene: ObjectImages, known: _Known, found: Estimate | None, diagnostics: dict[str, Any]
-    ) -> Lights | None:
-        """Return the lights (1, L, ...) the normal model is told: found before, estimated or given; None for none."""
-        if found is not None:
-            return self._taken(found, known, len(scene), diagnostics)
-        if self.lighting is not None and (known.directions is None or known.intensities is None):
-            return self._estimate_lights(scene, known, diagnostics)
+    def _estimate_lights(self, scene: ObjectImages, known: _Known) -> Estimate:
+        """Return the lights, without normals: what is known, and what the lighting network finds of the rest.
+
+        Directions or intensities that nobody knows are empty. Without a lighting model lights are equally strong for a
+        normal model that needs them.
+        """
+        directions, intensities, _ = known
+        exposure, confidence, errors = {}, None, None
+        if self.lighting is not None and (directions is None or intensities is None):
+            view = self._view(scene, self.lighting, None, resize_input, INPUT_SIZE**2)
+            lights = self._run_lighting(cast(LightingNetwork, self.lighting.network), view)
+            exposure["lighting"] = view.exposure.scale
+            directions = _to_numpy(lights.directions) if directions is None else directions
+            intensities = _to_numpy(lights.intensities) if intensities is None else intensities
+            confidence = None if lights.confidence is None else _to_numpy(lights.confidence)
+            errors = None if lights.expected_error is None else _to_numpy(lights.expected_error)
+        elif intensities is None and self.needs_lights:
+            intensities = np.full(len(scene), self._mean_intensity(), np.float32)
+        return Estimate(
+            np.zeros((0, 0, 3), np.float32),
+            np.zeros((0, 3), np.float32) if directions is None else directions,
+            np.zeros(0, np.float32) if intensities is None else intensities,
+            expected_light_error=errors,
+            confidence=confidence,
+            exposure=exposure,
+        )
+
+    def _lights(self, found: Estimate, known: _Known) -> Lights | None:
+        """Return lights (1, L, ...) as the normal model is given them; None for one that is given none."""
         if not self.needs_lights:
             return None
-        assert known.directions is not None  # without a lighting model `estimate` refuses that
-        equal = np.full(len(scene), self._mean_intensity(), np.float32)
-        return self._lights(known.directions, equal if known.intensities is None else known.intensities)
+        lights = Lights(self._tensor(found.light_directions), self._tensor(found.intensities))
+        if known.directions is not None or self.lighting is None:
+            return lights
+        errors = found.expected_light_error
+        return lights._replace(expected_error=None if errors is None else self._tensor(errors)).with_errors()
 
     def _box_normals(
-        self, scene: ObjectImages, known: _Known, lit: Lights | None, diagnostics: dict[str, Any]
-    ) -> np.ndarray:
-        """Return the normals of the object's box, (h, w, 3) float32, zero outside the mask."""
+        self, scene: ObjectImages, known: _Known, lights: Lights | None
+    ) -> tuple[np.ndarray, np.ndarray | None, float]:
+        """Return what is found in the object's box: normals (h, w, 3) float32, zero outside the mask, the errors to
+        expect, (h, w) float32 where the network predicts them, and the factor of the exposure.
+        """
         multiple, halo, most = self._tiling(len(scene))
         parts = tiles(scene.mask, most, halo, multiple)
         largest = max(scene.mask[tile.outer_rows, tile.outer_columns].size for tile in parts)
-        view = self._view(scene, "normals", known.balance, pad_to(multiple), largest, diagnostics)
-        box = np.zeros((*scene.mask.shape, 3), np.float32)
+        view = self._view(scene, self._normal_model(), known.balance, pad_to(multiple), largest)
+        box, errors = np.zeros((*scene.mask.shape, 3), np.float32), np.zeros(scene.mask.shape, np.float32)
+        predicted = False
         for number, tile in enumerate(parts):
             part = replace(view, images=scene.part(tile.outer_rows, tile.outer_columns))
             with repeat(number, len(parts)):
-                normals, expected = self._normals(part, lit)  # padded
+                normals, expected = self._normals(part, lights)  # padded
             inside = scene.mask[tile.inner]
             box[tile.inner][inside] = normals[0].permute(1, 2, 0).cpu().numpy()[tile.within][inside]
             if expected is not None:
-                whole = diagnostics.setdefault("expected_error", np.zeros(scene.shape, np.float32))
-                found = expected[0, 0].cpu().numpy()[tile.within] * inside
-                whole[scene.rows, scene.columns][tile.inner] = found
+                predicted = True
+                errors[tile.inner] = expected[0, 0].cpu().numpy()[tile.within] * inside
             if len(parts) > 1:
                 del normals, expected
                 release_memory()
-        return box
+        return box, errors if predicted else None, view.exposure.scale
 
     def _tiling(self, images: int) -> tuple[int, int, int]:
         """Return of which multiple tiles are, how wide their halo is, and how many pixels they have at most."""
@@ -201,31 +243,8 @@ class Estimator(InferenceConfig):
         most = TILE_BYTES // (PIXEL_BYTES + images * network.kept_bytes)
         return network.size_multiple, network.reach, most
 
-    def _estimate_lights(self, scene: ObjectImages, known: _Known, diagnostics: dict[str, Any]) -> Lights:
-        """Return the lights (1, L, ...); what is known stays."""
-        lights = self._found_lights(scene, diagnostics)
-        if lights.confidence is not None:
-            diagnostics["confidence"] = lights.confidence[0].float().cpu().numpy()
-        if lights.expected_error is not None:
-            diagnostics["expected_light_error"] = lights.expected_error[0].float().cpu().numpy()
-        return self._merged(known, lights.with_errors())
-
-    def _taken(self, found: Estimate, known: _Known, count: int, diagnostics: dict[str, Any]) -> Lights:
-        """Return lights (1, L, ...) that were estimated before, and what was noted of them."""
-        if known.directions is not None or len(found.light_directions) != count:
-            raise InputError("found holds lights of other images, or of images whose lights are given")
-        diagnostics["exposure"].update(found.diagnostics["exposure"])
-        told = ("confidence", "expected_light_error")
-        diagnostics.update({name: found.diagnostics[name] for name in told if name in found.diagnostics})
-        lights = self._lights(found.light_directions, found.intensities)
-        errors = found.diagnostics.get("expected_light_error")
-        return lights._replace(expected_error=None if errors is None else self._tensor(errors)).with_errors()
-
-    def _found_lights(self, scene: ObjectImages, diagnostics: dict[str, Any]) -> Lights:
-        """Return the lights (1, L, ...) that the lighting network finds, with test-time augmentation."""
-        assert self.lighting is not None
-        network = cast(LightingNetwork, self.lighting.network)
-        read = self._view(scene, "lighting", None, resize_input, INPUT_SIZE**2, diagnostics)
+    def _run_lighting(self, network: LightingNetwork, read: View) -> Lights:
+        """Return the lights (1, L, ...) that a network finds, with test-time augmentation."""
         views = self.light_views or 1
         view: View | KeptView = KeptView(read) if views > 1 else read
         found = []
@@ -248,15 +267,13 @@ class Estimator(InferenceConfig):
     def _view(
         self,
         scene: ObjectImages,
-        place: str,
+        model: TrainedModel,
         balance: np.ndarray | None,
         fit: Any,
         pixels: int,  # of an image as the network sees it
-        diagnostics: dict[str, Any],
     ) -> View:
-        """Return the scene as the model in `place` saw scenes in training."""
-        exposure = measure_exposure(scene.sample, getattr(self, place).augmentation())
-        diagnostics["exposure"][place] = exposure.scale
+        """Return the scene as a model saw scenes in training."""
+        exposure = measure_exposure(scene.sample, model.augmentation())
         chunk = self.chunk_pixels or _CHUNK_PIXELS.get(self.device.type, 2**19)
         return View(scene, exposure, balance, fit, max(1, chunk // pixels), self.device)
 
@@ -265,31 +282,9 @@ class Estimator(InferenceConfig):
         assert model is not None  # what is estimated needs one of them
         return float(np.mean(model.augmentation().intensity_range))
 
-    def _known(self, lights: np.ndarray | None, intensities: np.ndarray | None) -> _Known:
-        """Bring given lights to unit length and given intensities, whose scale is their own, to that of training."""
-        directions = balance = strengths = None
-        if lights is not None:
-            directions = np.asarray(lights, np.float64)
-            directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
-        if intensities is not None:
-            colours = np.asarray(intensities, np.float64)
-            colours = colours / colours.mean() * self._mean_intensity()
-            strengths = (colours if colours.ndim == 1 else colours.mean(1)).astype(np.float32)
-            balance = None if colours.ndim == 1 else (colours / colours.mean(1, keepdims=True)).astype(np.float32)
-        return _Known(directions, strengths, balance)
-
-    def _lights(self, directions: np.ndarray, intensities: np.ndarray) -> Lights:
-        return Lights(self._tensor(directions), self._tensor(intensities))
-
     def _tensor(self, values: np.ndarray) -> Tensor:
         """Return values of all images, (L, ...), as (1, L, ...) where the networks are."""
         return torch.from_numpy(values)[None].to(self.device)
-
-    def _merged(self, known: _Known, lights: Lights) -> Lights:
-        """Return the lights with what is known in place of what was estimated."""
-        pairs = zip(known[:2], lights[:2], strict=True)
-        merged = Lights(*(lit.float() if one is None else self._tensor(one) for one, lit in pairs))
-        return merged._replace(expected_error=lights.expected_error if known.directions is None else None)
 
 
 def default_device(device: str | torch.device | None = None) -> torch.device:
@@ -309,18 +304,9 @@ def load_model(file: str | Path, device: torch.device) -> TrainedModel:
     return model
 
 
-def _concluded(normals: np.ndarray, lights: Lights | _Known, began: float, diagnostics: dict[str, Any]) -> Estimate:
-    """Return an estimate; directions or intensities that nobody knows are empty."""
-    directions, strengths = (
-        lights[:2] if isinstance(lights, _Known) else (part[0].float().cpu().numpy() for part in lights[:2])
-    )
-    diagnostics["seconds"] = time.perf_counter() - began
-    return Estimate(
-        normals,
-        np.zeros((0, 3), np.float32) if directions is None else directions,
-        np.zeros(0, np.float32) if strengths is None else strengths,
-        diagnostics,
-    )
+def _to_numpy(values: Tensor) -> np.ndarray:
+    """Return values of all images, (1, L, ...), as (L, ...) float32."""
+    return values[0].float().cpu().numpy()
 
 
 def check_lights(count: int, lights: np.ndarray | None, intensities: np.ndarray | None = None) -> None:
@@ -341,7 +327,4 @@ def check_lights(count: int, lights: np.ndarray | None, intensities: np.ndarray 
         if not ((lengths > 0.0) & np.isfinite(lengths)).all():
             raise InputError("a light direction is zero or NaN; give unit vectors from the surface to the light")
     if intensities is not None:
-        if np.shape(intensities) not in ((count,), (count, 3)):
-            raise InputError(f"{count} images need as many intensities, got {np.shape(intensities)}")
-        if not ((np.asarray(intensities) > 0.0) & np.isfinite(intensities)).all():
-            raise InputError("light intensities must be positive finite numbers")
+        check_intensities(count, intensities)

@@ -15,7 +15,7 @@ from render.shared.errors import InputError
 from render.shared.progress import stage
 from render.shared.seeds import generator
 from sdps.data.augment import Exposure
-from sdps.inference.stray_light import stray_light, without
+from sdps.inference.stray_light import remove_stray_light, stray_light
 
 EXPOSURE_VALUES = 4_000_000
 """Values the exposure is measured on at most; of more, the same random pixels of every image are taken."""
@@ -67,8 +67,9 @@ class ObjectImages:
         step = _images_at_once(self.mask.shape)  # few copies of large images at a time
         for first in range(start, stop, step):
             last = min(first + step, stop)
-            found = _window(self.source, slice(first, last), self.rows, self.columns, self.shape)
-            images[first - start : last - start] = without(np.asarray(found, np.float32), self.stray[first:last])
+            part = slice(first, last)
+            found = np.asarray(_window(self.source, part, self.rows, self.columns, self.shape), np.float32)
+            images[first - start : last - start] = remove_stray_light(found, self.stray[part])
         # Not a product: outside the mask there may be NaN.
         images[:, ~self.mask] = 0.0
         return images
@@ -79,6 +80,12 @@ class ObjectImages:
         rows_of_all = slice(top + rows.start, top + rows.stop)
         columns_of_all = slice(left + columns.start, left + columns.stop)
         return replace(self, rows=rows_of_all, columns=columns_of_all, mask=self.mask[rows, columns])
+
+    def in_frame(self, values: np.ndarray) -> np.ndarray:
+        """Return values of the box, (h, w, ...), in the whole frame, (H, W, ...), zero elsewhere."""
+        whole = np.zeros((*self.shape, *values.shape[2:]), values.dtype)
+        whole[self.rows, self.columns] = values
+        return whole
 
     def parts(self, count: int) -> Iterator[range]:
         """Yield `count` images after `count` images, each time as the starts of what is read at once."""
@@ -114,11 +121,11 @@ def survey(source: ImageSource, mask: np.ndarray, margin: int | None, *, stray: 
         inside = _read(source, start, stop, shape)[:, mask]  # (n, P, 3)
         stage("survey", stop, len(source))
         if not np.isfinite(inside).all():
-            raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
+            raise InputError("the images contain NaN or infinite values inside the mask; repair them first")
         sample[start:stop] = inside[:, chosen]
     rows, columns = (_box(np.any(mask, axis=axis), margin) for axis in (1, 0))
     level = stray_light(sample) if stray else np.zeros((len(source), 3), np.float32)
-    return ObjectImages(source, rows, columns, mask[rows, columns], shape, level, without(sample, level))
+    return ObjectImages(source, rows, columns, mask[rows, columns], shape, level, remove_stray_light(sample, level))
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,11 +14,11 @@ SHADOW = 0.05
 _BRIGHT = 75.0
 """Percentile of a pixel's values over the images that is called bright; above are highlights, of metals above all."""
 _FEWEST = 50
-"""Pixels in shadow from which on an image tells its own level; others have the median of those that do."""
+"""Pixels in shadow from which on an image shows its own level; others have the median of those that do."""
 _MOST = 2.0
 """Times the images' median that a level is at most: what only some images show in shadow is light from the object."""
 _NOISE = 3.0
-"""Times the level up to which nothing can be told from it."""
+"""Times the level up to which it hides everything."""
 
 
 def stray_light(values: np.ndarray) -> np.ndarray:
@@ -38,12 +38,12 @@ def stray_light(values: np.ndarray) -> np.ndarray:
         for channel in np.flatnonzero(inside.sum(0) >= _FEWEST):
             found[channel] = np.median(image[inside[:, channel], channel])
     for column in level.T:
-        told = column[np.isfinite(column)]
-        column[np.isnan(column)] = np.median(told) if len(told) else 0.0
+        known = column[np.isfinite(column)]
+        column[np.isnan(column)] = np.median(known) if len(known) else 0.0
     return np.minimum(level, _MOST * np.median(level, axis=0))
 
 
-def without(images: np.ndarray, level: np.ndarray) -> np.ndarray:
+def remove_stray_light(images: np.ndarray, level: np.ndarray) -> np.ndarray:
     """Return images less their stray light; up to three times its level they are black, as noise in shadow is.
 
     Args:

@@ -15,10 +15,12 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from render.shared.imaging.reducing import reduce_image
+from render.shared.imaging.vectors import unit
 from render.shared.seeds import generator
+from sdps.core.intensities import scale_to_mean
 from sdps.core.metrics import angle_degrees
 from sdps.inference.image_source import ImageSource
-from sdps.inference.stray_light import stray_light, without
+from sdps.inference.stray_light import remove_stray_light, stray_light
 
 _SIDE = 96
 """Longest side of the reduced images: enough for smooth normals, and noise averages out."""
@@ -111,7 +113,7 @@ def reduce_images(images: ImageSource, mask: np.ndarray) -> ReducedImages:
         image = np.where(mask[rows, columns][..., None], image, np.float32(0.0))
         grey.append((reduce_image(image, shape) / np.maximum(share, 1e-6)[..., None])[small])
     values = np.stack(grey)  # (L, P, 3)
-    values = without(values, stray_light(values)).mean(-1).astype(np.float64)
+    values = remove_stray_light(values, stray_light(values)).mean(-1).astype(np.float64)
     return ReducedImages(values / max(values.mean(), 1e-12), small, small & _rim(mask, rows, columns, shape))
 
 
@@ -166,7 +168,7 @@ def find_intensities(images: ReducedImages, directions: np.ndarray, start: np.nd
         start: (L,), intensities that a network finds.
     """
     images = _sampled(images)
-    start = np.asarray(start, np.float64) / np.mean(start)
+    start = scale_to_mean(np.asarray(start, np.float64))
     held = _PRIOR * (1.0 + (_residual(images, directions, start) / _MISFIT) ** 4)
     found = start.copy()
     for _ in range(_ROUNDS):
@@ -174,7 +176,7 @@ def find_intensities(images: ReducedImages, directions: np.ndarray, start: np.nd
         prior = held * (weights * shading**2).sum(axis=1).mean()
         ratio = (weights * shading * images.values).sum(axis=1) + prior * start
         found = ratio / ((weights * shading**2).sum(axis=1) + prior)
-        found /= found.mean()
+        found = scale_to_mean(found)
     return np.maximum(found, 1e-3).astype(np.float32)
 
 
@@ -293,6 +295,5 @@ def _outward(images: ReducedImages, normals: np.ndarray) -> np.ndarray | None:
     soft = cv2.GaussianBlur(np.pad(images.mask.astype(np.float32), 8), (0, 0), 3)[8:-8, 8:-8]
     down, right = np.gradient(soft)
     away = np.stack([-right, down], axis=-1)[images.outline]  # (N, 2), y up
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    unit = normals[rim] / np.maximum(np.linalg.norm(normals[rim], axis=1, keepdims=True), 1e-9)
-    return np.array([float(((unit @ axes.T)[:, :2] * away).sum(axis=1).mean()) for axes in AXES])
+    away, facing = unit(away), unit(normals[rim])
+    return np.array([float(((facing @ axes.T)[:, :2] * away).sum(axis=1).mean()) for axes in AXES])

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import unit
 from sdps.core.estimate import Estimate
+from sdps.core.intensities import grey, scale_to_mean
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.given_lights import LightFit, compare_lights, find_intensities, reduce_images
@@ -64,17 +66,12 @@ def question_lights(
     Returns:
         The intensities, those given or those found, and how the lights fit; None where nothing can be said.
     """
-    directions = _unit(directions)
+    directions = unit(np.asarray(directions, np.float64))
     reduced = reduce_images(images, mask)
     if intensities is None:
         start = np.ones(len(images)) if seen is None else seen.intensities
         intensities = find_intensities(reduced, directions, start)
     if seen is None or len(files) < _FEWEST:
         return intensities, None
-    grey = np.asarray(intensities, np.float64).reshape(len(files), -1).mean(axis=1)
-    return intensities, compare_lights(reduced, files, directions, grey / grey.mean(), seen.light_directions)
-
-
-def _unit(directions: np.ndarray) -> np.ndarray:
-    vectors = np.asarray(directions, np.float64)
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+    relative = scale_to_mean(grey(np.asarray(intensities, np.float64)))
+    return intensities, compare_lights(reduced, files, directions, relative, seen.light_directions)

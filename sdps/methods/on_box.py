@@ -27,7 +27,7 @@ def observed_bytes(name: str, images: int, box: float) -> float:
     return min(whole, PART_BYTES) if classical.METHODS[name].by_pixel else whole
 
 
-def run_on_box(name: str, images: ImageSource, mask: np.ndarray, told: tuple[Any, ...]) -> Estimate:
+def run_on_box(name: str, images: ImageSource, mask: np.ndarray, given: tuple[Any, ...]) -> Estimate:
     """Run a classical method on the object's box; arguments as of `sdps.classical.registry.run`."""
     scene = survey(images, mask, _MARGIN)
     count = 1
@@ -41,7 +41,7 @@ def run_on_box(name: str, images: ImageSource, mask: np.ndarray, told: tuple[Any
             continue
         part = replace(scene, rows=slice(scene.rows.start + number, scene.rows.stop, count), mask=inside)
         with repeat(number, count):
-            estimate = classical.run(name, part.read(0, len(images)), inside, *told)
+            estimate = classical.run(name, part.read(0, len(images)), inside, *given)
             stage("normals", 1, 1)
         normals[scene.rows, scene.columns][rows] = estimate.normals
     assert estimate is not None  # the mask is not empty

@@ -12,7 +12,7 @@ from sdps.models.registry import COMBINATIONS, MODELS
 
 MODELS_FOLDER = "models"
 SHIPPED = "shipped:"
-"""Prefix of names that mean the weights shipped with the package, whatever was trained since."""
+"""Prefix of names that mean the weights shipped with the package, in spite of any trained since."""
 
 ALL = ("all",)
 """Where names of pretrained ways are asked for: every one."""

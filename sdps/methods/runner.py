@@ -12,8 +12,7 @@ import numpy as np
 from render.records.shards import file_hash
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
-from sdps.core.baselines import constant_estimate
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, constant_estimate
 from sdps.core.metrics import score
 from sdps.inference.estimator import Estimator, default_device, load_model
 from sdps.inference.image_source import ImageSource
@@ -132,23 +131,23 @@ class Runner:
     def _classical(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
         """Run a classical method, which holds the object's box of all images at once."""
         name = self.method.normals
-        told: tuple[Any, ...] = ()
+        arguments: tuple[Any, ...] = ()
         if classical.METHODS[name].calibrated:
             if self.method.lights == TRUE_LIGHTS:
-                told = given["lights"], given.get("intensities")
+                arguments = given["lights"], given.get("intensities")
             else:
                 lit = self._lights(images, mask, given, found)
-                told = lit.light_directions, lit.intensities
+                arguments = lit.light_directions, lit.intensities
         if isinstance(images, np.ndarray):
-            return classical.run(name, images, mask, *told)
-        return run_on_box(name, images, mask, told)
+            return classical.run(name, images, mask, *arguments)
+        return run_on_box(name, images, mask, arguments)
 
     def _refine(
         self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any], saturation: float
     ) -> Estimate:
         """Refine an estimate, or keep it where refinement cannot be trusted; light directions it was given stay."""
         from sdps.refinement.refine import refine
-        from sdps.refinement.trust import trust
+        from sdps.refinement.trust import choose, trust
 
         if not len(estimate.light_directions):
             raise InputError(
@@ -163,10 +162,7 @@ class Runner:
             directions_given=lit, stray=self.config.stray_light, saturation=saturation,
         )  # fmt: skip
         expected = trust(refined, mask, estimate, given=lit)
-        diagnostics = estimate.diagnostics | {"refined": refined, "start": estimate, "trust": expected}
-        if expected.doubt:
-            return replace(estimate, diagnostics=diagnostics)
-        return Estimate(refined.normals, refined.light_directions, refined.grey_intensities, diagnostics)
+        return choose(estimate, refined, expected)
 
     def score(
         self,

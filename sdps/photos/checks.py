@@ -13,7 +13,7 @@ from sdps.photos.reading import Photographs
 LEVELS = ("error", "warning", "note")
 """How grave a finding is.
 
-error: surely a fault of the pictures or files; `infer` stops, unless told to go on `anyway`.
+error: surely a fault of the pictures or files; `infer` stops, unless asked to go on (`anyway`).
 warning: it may be a fault or the object's nature (a mirror is black in most pictures); expect a worse result.
 note: worth knowing.
 """
@@ -155,7 +155,7 @@ def _movement(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     yield Finding(
         "warning",
         f"The camera or the object moved: the edges in {_pictures(names)} lie up to {lengths.max():.0f} pixels "
-        "beside those of the others. Use a tripod and a remote release; leave these pictures out or retake them.",
+        "away from those of the others. Use a tripod and a remote release; leave these pictures out or retake them.",
         names,
     )
 
@@ -224,7 +224,7 @@ def _duplicates(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     again = [names for names in groups.values() if len(names) > 1]
     if again:
         names = tuple(name for group in again for name in group)
-        yield Finding("warning", f"The same picture is there twice: {', '.join(again[0])}. Keep one of each.", names)
+        yield Finding("warning", f"The same picture appears twice: {', '.join(again[0])}. Keep one of each.", names)
 
 
 def _colour(photos: Photographs, measures: Measures) -> Iterator[Finding]:

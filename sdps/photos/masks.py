@@ -1,6 +1,6 @@
 """Which pixels belong to the object: from a mask file, or from how much each pixel changes with the light.
 
-Under a moving lamp the object changes and a dark, distant background does not, whatever steady light the room adds.
+Under a moving lamp the object changes and a dark, distant background does not, under any steady light of the room.
 """
 
 from pathlib import Path
@@ -10,7 +10,7 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from render.shared.errors import InputError
-from sdps.photos.picture_file import Picture, decode, turned
+from sdps.photos.picture_file import Picture, decode, orient_pixels
 from sdps.photos.response import full_scale
 
 _LARGEST = 0.9
@@ -92,8 +92,8 @@ def automatic_mask(variation: Variation) -> tuple[np.ndarray, str]:
     doubt = _doubt(changes, mask, float(threshold)) or _ground_is_lit(variation, mask, changes > threshold)
     if doubt:
         return np.ones_like(mask), (
-            f"no object could be told from the background ({doubt}), so the whole frame is taken for the object; draw "
-            "a mask.png (white object on black), or photograph against black cloth"
+            f"the object cannot be told apart from the background ({doubt}), so the whole frame is taken for the "
+            "object; draw a mask.png (white object on black), or photograph against black cloth"
         )
     return (
         mask,
@@ -127,7 +127,7 @@ def bright_part(picture: Picture) -> np.ndarray:
     low, high = pixels.min(), pixels.max()
     if low < high <= limit and ((pixels == low) | (pixels == high)).all():
         limit = low  # such as labels 0 and 1
-    return turned(pixels, picture.orientation) > limit
+    return orient_pixels(pixels, picture.orientation) > limit
 
 
 def border_share(mask: np.ndarray) -> float:

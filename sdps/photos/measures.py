@@ -13,9 +13,10 @@ from PIL import Image
 
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
-from sdps.photos.evidence.colours import colour_casts
-from sdps.photos.evidence.fall_off import FallOff, block_means, fall_off
-from sdps.photos.evidence.motion import Shift, Tracker, second_look
+from sdps.core.intensities import colour_balance
+from sdps.photos.analysis.colours import colour_casts
+from sdps.photos.analysis.fall_off import FallOff, block_means, fall_off
+from sdps.photos.analysis.motion import Shift, Tracker, second_look
 from sdps.photos.reading import Photographs
 from sdps.photos.response import brightness
 
@@ -101,8 +102,8 @@ def _casts(photos: Photographs, observations: np.ndarray) -> np.ndarray:  # (L,)
     """Find changes of colour that the given intensities do not explain, on a few hundred pixels."""
     some = observations[:, :: max(1, observations.shape[1] // _COLOUR_PIXELS)]
     saturation = photos.saturation
-    if photos.intensities is not None and photos.intensities.ndim == 2:
-        balance = photos.intensities / photos.intensities.mean(1, keepdims=True)
+    balance = None if photos.intensities is None else colour_balance(photos.intensities)
+    if balance is not None:
         full = np.any(some >= saturation, axis=-1, keepdims=True)
         some = np.where(full, np.inf, some / balance[:, None]).astype(np.float32)
         some[full[..., 0]] = saturation

@@ -1,4 +1,4 @@
-"""One picture file, decoded at its own depth, whatever its name says it is."""
+"""One picture file, decoded at its own depth, by content and not by name."""
 
 import logging
 from collections.abc import Iterator
@@ -52,7 +52,7 @@ def decode(path: Path) -> Picture:
     return Picture(read.pixels, read.alpha, coding, read.orientation, read.layer)
 
 
-def misnamed(name: str, kind: str) -> bool:
+def is_misnamed(name: str, kind: str) -> bool:
     """Tell whether a file's suffix stands for another kind than `kind`."""
     return SUFFIXES.get(Path(name).suffix.lower()) not in (None, kind)
 
@@ -71,7 +71,7 @@ def _not_read(path: Path, data: bytes) -> InputError:
     return InputError(f"{path}: is not a picture of a kind that is read ({NAMED}); convert it to 16-bit TIFF or PNG")
 
 
-def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
+def orient_pixels(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Return (H, W, ...) pixels turned as an EXIF orientation tag asks."""
     if orientation >= 5:
         pixels = np.swapaxes(pixels, 0, 1)

@@ -3,7 +3,6 @@
 Legend: L pictures of H x W pixels.
 """
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,22 +11,20 @@ import numpy as np
 
 from render.shared.errors import InputError
 from render.shared.imaging.reducing import check_scale, reduce_image, smaller_shape
-from sdps.photos.doubts import Doubts
+from sdps.photos.faults import Faults
 from sdps.photos.light_files.light_choice import known_lights
-from sdps.photos.picture_file import decode, turned
+from sdps.photos.picture_file import decode, orient_pixels
 from sdps.photos.pictures.listing import list_pictures
 from sdps.photos.pictures.picture_kinds import Coding
 from sdps.photos.response import to_linear
 from sdps.photos.survey import survey
-
-_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
     """A folder of photographs; an `ImageSource` (sdps/inference/image_source.py) that holds no pixel in memory.
 
-    `len(photos)` is L; `photos[2:5]` reads three files anew and returns (3, H, W, 3) float32, linear radiance with 1
+    `len(photos)` is L; `photos[2:5]` reads three files again and returns (3, H, W, 3) float32, linear radiance with 1
     for full scale (floating-point files: as they are), 0 for what is negative or not finite.
 
     Attributes:
@@ -88,7 +85,7 @@ class Photographs:
         images = np.empty((len(numbers), *sides, 3), np.float32)
         for image, number in zip(images, numbers, strict=True):
             picture = decode(self.folder / self.files[number])
-            pixels = turned(picture.pixels, self.orientation)
+            pixels = orient_pixels(picture.pixels, self.orientation)
             if smaller_shape(pixels.shape[:2], self.scale) != self.shape or picture.coding != self.coding:
                 raise InputError(f"{self.folder / self.files[number]}: changed while it was in use; start again")
             if self.scale == 1.0:
@@ -140,18 +137,15 @@ def load(
     """
     folder, scale = Path(folder), check_scale(scale)
     listing = list_pictures(folder, names)
-    doubts = Doubts(anyway)
-    seen = survey(folder, listing, gamma, None if mask is None else Path(mask), doubts, scale)
+    faults = Faults(anyway)
+    seen = survey(folder, listing, gamma, None if mask is None else Path(mask), faults, scale)
     try:
-        known = known_lights(listing.places, seen.files, lights, intensities, frame, doubts)
+        known = known_lights(listing.places, seen.files, lights, intensities, frame, faults)
     except InputError as error:
         raise InputError(f"{error} ({seen.left_out})" if seen.left_out else error) from error
-    photos = Photographs(
+    return Photographs(
         folder=folder, files=seen.files, shape=seen.mask.shape, bits=seen.coding.bits, gamma=seen.gamma,
         mask=seen.mask, mask_origin=seen.origin, light_directions=known.directions, intensities=known.intensities,
         lights_name=known.name, lights_frame=known.frame, notes=(*listing.notes, *seen.notes, *known.notes),
-        coding=seen.coding, orientation=seen.orientation, overridden=tuple(doubts.overridden), scale=scale,
+        coding=seen.coding, orientation=seen.orientation, overridden=tuple(faults.overridden), scale=scale,
     )  # fmt: skip
-    if photos.mask_origin == "automatic" and photos.mask.all():
-        _LOG.warning("%s", next(note for note in photos.notes if "whole frame" in note))
-    return photos

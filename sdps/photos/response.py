@@ -5,6 +5,8 @@ from functools import cache
 
 import numpy as np
 
+from render.shared.imaging.srgb import from_srgb, to_srgb
+
 _FULL = {8: 255, 16: 65535}
 _AT_ONCE = 2**20
 
@@ -45,7 +47,7 @@ def curve(values: np.ndarray, gamma: str | float) -> np.ndarray:
     if gamma == "linear":
         return values
     if gamma == "srgb":
-        return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(values.dtype)
+        return from_srgb(values)
     return values**gamma
 
 
@@ -57,9 +59,7 @@ def display(linear: np.ndarray) -> np.ndarray:  # uint8
         for start in range(0, len(linear), step := max(1, _AT_ONCE * len(linear) // linear.size)):
             shown[start : start + step] = display(linear[start : start + step])
         return shown
-    linear = np.clip(linear, 0, 1)
-    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return (255 * coded + 0.5).astype(np.uint8)
+    return (255 * to_srgb(linear) + 0.5).astype(np.uint8)
 
 
 @cache

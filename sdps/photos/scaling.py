@@ -6,7 +6,7 @@ import numpy as np
 
 from render.shared.errors import InputError
 from render.shared.imaging.reducing import reduce_image, reduce_mask
-from sdps.photos.doubts import Doubts
+from sdps.photos.faults import Faults
 from sdps.photos.masks import read_mask
 from sdps.photos.response import brightness, to_linear
 
@@ -22,11 +22,11 @@ def reduced_grey(pixels: np.ndarray, gamma: str | float, shape: tuple[int, int])
     return reduce_image(np.concatenate([brightness(to_linear(some, gamma)) for some in rows]), shape)
 
 
-def refuse_huge(path: Path, full: tuple[int, int], shape: tuple[int, int], doubts: Doubts) -> None:
+def refuse_huge(path: Path, full: tuple[int, int], shape: tuple[int, int], faults: Faults) -> None:
     """Refuse pictures that would fill the memory one by one."""
     if shape[0] * shape[1] > MOST_PIXELS:
         fits = int(20 * (MOST_PIXELS / (full[0] * full[1])) ** 0.5) / 20
-        doubts.stop(
+        faults.stop(
             f"{path}: is {full[1]}x{full[0]} pixels; more than {MOST_PIXELS // 10**6} million would take more than "
             f"4 GiB of memory; give --scale {fits:g} (in Python load(..., scale={fits:g}))"
         )

@@ -9,9 +9,9 @@ import numpy as np
 from render.shared.errors import InputError
 from render.shared.imaging.reducing import reduce_image, smaller_shape
 from render.shared.progress import progress_bar, stage
-from sdps.photos.doubts import Doubts
+from sdps.photos.faults import Faults
 from sdps.photos.masks import Variation, automatic_mask, bright_part
-from sdps.photos.picture_file import Picture, decode, misnamed, turned
+from sdps.photos.picture_file import Picture, decode, is_misnamed, orient_pixels
 from sdps.photos.pictures.contents import judge_content, like_mask
 from sdps.photos.pictures.gamma import resolve_gamma
 from sdps.photos.pictures.listing import Listing
@@ -48,7 +48,7 @@ class Survey:
 
 
 def survey(
-    folder: Path, listing: Listing, gamma: str | float, mask_file: Path | None, doubts: Doubts, scale: float = 1.0
+    folder: Path, listing: Listing, gamma: str | float, mask_file: Path | None, faults: Faults, scale: float = 1.0
 ) -> Survey:
     """Decode every file once: photographs of one kind and size, finite in the mask, and the mask if there is none.
 
@@ -57,17 +57,17 @@ def survey(
         listing: Its pictures.
         gamma: As of `load`.
         mask_file: The mask, None for the listing's or, without one, an automatic mask.
-        doubts: What becomes of faults that leave something to compute.
+        faults: What becomes of faults that leave something to compute.
         scale: What the pictures' sides are multiplied by.
 
     Raises:
         InputError: pictures that cannot be used together.
     """
     masks = _given_masks(folder, listing) if mask_file is None else _Masks(mask_file, ())
-    look = _Look(folder, listing, gamma, doubts, scale, masked=masks.file is not None)
+    look = _Look(folder, listing, gamma, faults, scale, masked=masks.file is not None)
     look.through(judging=True)
     if len(look.kept) < len(look.dropped):  # what most pictures look like is their nature
-        look = _Look(folder, listing, gamma, doubts, scale, masked=masks.file is not None)
+        look = _Look(folder, listing, gamma, faults, scale, masked=masks.file is not None)
         look.through(judging=False)
     left = [f"{name} ({why})" for name, why in look.dropped.items()]
     left_out = f"left out: {', '.join(left)}; --images takes what it names" if left else ""
@@ -79,11 +79,11 @@ def survey(
         mask, said = read_reduced_mask(masks.file, look.full, look.shape), f"the mask is {masks.file.name}"
     else:
         if not look.variation.changes().any():
-            doubts.stop(
+            faults.stop(
                 f"{folder}: nothing changes between the pictures; is the lamp on and moved? otherwise give a mask"
             )
         mask, said = automatic_mask(look.variation)
-    _refuse_broken(folder, look.kept, look.broken, mask, doubts)
+    _refuse_broken(folder, look.kept, look.broken, mask, faults)
     if (look.broken >= 0).any():
         notes.append("values that are not finite were set to 0")
     return Survey(
@@ -100,7 +100,7 @@ class _Look:
     folder: Path
     listing: Listing
     asked: str | float
-    doubts: Doubts
+    faults: Faults
     scale: float
     masked: bool
     kept: list[str] = field(default_factory=list)
@@ -135,7 +135,7 @@ class _Look:
         """Say which files are of another kind than their names tell, and which layers of EXR files were read."""
         notes = []
         kind = self.first.coding.kind if self.first else ""
-        wrong = [name for name in self.kept if misnamed(name, kind)]
+        wrong = [name for name in self.kept if is_misnamed(name, kind)]
         if wrong:
             verb = f"is a {kind} file" if len(wrong) == 1 else f"are {kind} files"
             notes.append(f"{_span(wrong)} {verb} in spite of the name, and read as such")
@@ -172,7 +172,7 @@ class _Look:
         if (shape, picture.coding) != (self.first.pixels.shape[:2], self.first.coding):
             return  # refused when all are known
         self.turns.add(picture.orientation)
-        pixels = turned(picture.pixels, self.first.orientation)
+        pixels = orient_pixels(picture.pixels, self.first.orientation)
         if picture.coding.floating:
             touched = reduce_image((~np.isfinite(pixels).all(-1)).astype(np.float32), self.shape) > 0
             self.broken[(self.broken < 0) & touched] = len(self.kept) - 1
@@ -181,9 +181,9 @@ class _Look:
 
     def _begin(self, name: str, picture: Picture) -> None:
         """Settle what the first photograph decides."""
-        self.full = turned(picture.pixels, picture.orientation).shape[:2]
+        self.full = orient_pixels(picture.pixels, picture.orientation).shape[:2]
         self.shape = smaller_shape(self.full, self.scale)
-        refuse_huge(self.folder / name, self.full, self.shape, self.doubts)
+        refuse_huge(self.folder / name, self.full, self.shape, self.faults)
         self.first = picture
         self.gamma, self.why = resolve_gamma(self.asked, picture.coding, self.listing.places)
         self.variation = Variation(self.shape)
@@ -199,7 +199,7 @@ class _Masks:
 def _given_masks(folder: Path, listing: Listing) -> _Masks:
     """Choose the folder's mask.
 
-    `mask.*` is one whatever it holds; others, such as `cat_mask.png`, must have about two values, and several must
+    `mask.*` is always one; others, such as `cat_mask.png`, must have about two values, and several must
     hold the same.
 
     Raises:
@@ -274,13 +274,13 @@ def _check_fit(folder: Path, look: _Look, left_out: str) -> None:
     )
 
 
-def _refuse_broken(folder: Path, files: Sequence[str], broken: np.ndarray, mask: np.ndarray, doubts: Doubts) -> None:
+def _refuse_broken(folder: Path, files: Sequence[str], broken: np.ndarray, mask: np.ndarray, faults: Faults) -> None:
     """Refuse values that are not finite inside the mask."""
     inside = broken[mask]
     bad = inside[inside >= 0]
     if len(bad):
         name = files[int(bad.min())]
-        doubts.stop(
+        faults.stop(
             f"{folder / name}: NaN or infinite values inside the mask ({len(bad)} pixels over all pictures); write it "
             "again or cut them out of the mask"
         )

@@ -15,6 +15,7 @@ from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
 from sdps.core.integration import integrate
+from sdps.core.intensities import per_channel
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.inference.tiles import Tile, release_memory, tiles
 from sdps.refinement.descent import Problem, Weights, solve
@@ -93,7 +94,7 @@ def refine(
     Raises:
         InputError: fewer than four images, shapes that do not fit, or an object that is black.
     """
-    config, gains = config or RefineConfig(), _checked(len(images), mask, normals, lights, intensities)
+    config, gains = config or RefineConfig(), _check(len(images), mask, normals, lights, intensities)
     scene = survey(images, mask, 0, stray=stray)
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
     most = TILE_BYTES // (_PIXEL_BYTES + _OBSERVATION_BYTES * len(scene)) if stride > 1 else scene.mask.size
@@ -145,7 +146,7 @@ def _advance(bar: Any) -> Callable[[], None]:
     return on_step
 
 
-def _checked(
+def _check(
     count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray
 ) -> np.ndarray:
     """Return the intensities (L, 3), if all sizes fit."""
@@ -157,7 +158,7 @@ def _checked(
         )
     if lights.shape != (count, 3) or len(intensities) != count:
         raise InputError(f"refinement: {count} images, but {len(lights)} lights and {len(intensities)} intensities")
-    return np.broadcast_to(np.reshape(intensities, (count, -1)), (count, 3))
+    return per_channel(intensities)
 
 
 def build_start(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> State:

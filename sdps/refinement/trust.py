@@ -5,6 +5,7 @@ The formulas were fitted on rendered scenes of shapes and lights that no network
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -54,19 +55,42 @@ class Trust(NamedTuple):
     doubt: str
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RefinedEstimate(Estimate):
+    """An estimate after refinement: what refinement found, or its start where there is a doubt.
+
+    Attributes:
+        refined: What refinement found, kept or not.
+        start: What it began with.
+        trust: What to expect of it.
+    """
+
+    refined: Refined
+    start: Estimate
+    trust: Trust
+
+
+def choose(start: Estimate, refined: Refined, expected: Trust) -> RefinedEstimate:
+    """Return what refinement found, or its start where there is a doubt."""
+    values = vars(start) | {"start": start, "refined": refined, "trust": expected}
+    if not expected.doubt:
+        values["normals"], values["light_directions"] = refined.normals, refined.light_directions
+        values["intensities"] = refined.grey_intensities
+    return RefinedEstimate(**values)
+
+
 def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = False) -> Trust:
     """Return the errors to expect of what refinement found.
 
     Args:
         found: What it found.
         mask: (H, W) bool.
-        start: Its start, with normals (H, W, 3), lights (L, 3) and, if a network tells it, `expected_error` (H, W),
-            degrees, among the diagnostics.
+        start: Its start; where a network predicts them, with its expected errors.
         given: The light directions were given: less is expected to be off, of lights nothing is said, and the start is
             kept for no error that is expected.
     """
     of_lights, moved, parts = _features(found, mask, start)
-    told, plainly, values = "expected_error" in start.diagnostics, [], []
+    told, plainly, values = start.expected_error is not None, [], []
     for of_normals in parts:
         plainly.append(np.exp(of_normals[:, : len(NORMAL)] @ NORMAL))
         values.append(np.exp(of_normals @ NORMAL_TOLD) if told else (_GIVEN if given else 1.0) * plainly[-1])
@@ -99,7 +123,7 @@ def _features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.nda
     share = ndimage.uniform_filter(mask.astype(np.float32), _WINDOW)[mask]
     around = ndimage.uniform_filter(np.where(mask, found.pixel_residual, 0.0), _WINDOW)[mask] / share
     turned = angle_degrees(found.normals[mask], normals[mask])
-    own = start.diagnostics.get("expected_error")
+    own = start.expected_error
     told, facing = None if own is None else own[mask], found.normals[..., 2][mask]
 
     def of_normals(part: slice) -> np.ndarray:

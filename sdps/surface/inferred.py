@@ -23,12 +23,14 @@ from sdps.inference.tiles import release_memory
 from sdps.methods import pretrained
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
+from sdps.refinement.trust import RefinedEstimate
 from sdps.surface.meshing import mesh, step_of, write_mesh
-from sdps.surface.relight import Residuals, fit_albedo, lit, relit, residuals
+from sdps.surface.relight import Residuals, fit_albedo, relit, residuals, trace_light
 from sdps.surface.verdict import give_verdict
 
 RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
          "grazing": (-0.85, 0.45, 0.25)}  # fmt: skip
+_RESULT = "result.json"
 _PART = 2**20  # pixels worked on at once
 
 
@@ -69,6 +71,11 @@ class Inference:
         """Intensities (L,), known up to one common scale; (0,) of methods that find normals alone."""
         return self.estimate.intensities
 
+    @property
+    def refinement(self) -> RefinedEstimate | None:
+        """The estimate with what refinement says; None where nothing was refined."""
+        return self.estimate if isinstance(self.estimate, RefinedEstimate) else None
+
     @cached_property
     def depth(self) -> Depth:
         """The surface the normals belong to, by least squares."""
@@ -91,19 +98,18 @@ class Inference:
     @property
     def expected_error(self) -> np.ndarray | None:
         """Angle to the true normals to expect, (H, W) float32 in degrees; None where neither network nor refinement
-        tells it. Where refinement was not kept it is the network's, if that one tells.
+        predicts it. Where refinement was not kept it is the network's, if there is one.
         """
-        diagnostics = self.estimate.diagnostics
-        own, trust = diagnostics.get("expected_error"), diagnostics.get("trust")
-        return own if trust is None or (trust.doubt and own is not None) else trust.normals
+        found, own = self.refinement, self.estimate.expected_error
+        return own if found is None or (found.trust.doubt and own is not None) else found.trust.normals
 
     @cached_property
     def verdict(self) -> str:
         """Why the result is not to be used, with the likeliest reason; empty where nothing speaks against it."""
-        diagnostics = self.estimate.diagnostics
-        refined = diagnostics.get("refined")
-        residual = 0.0 if refined is None else float(refined.pixel_residual[self.photos.mask].mean())
-        return give_verdict(self.photos, self.expected_error, self.findings, diagnostics.get("trust"), residual)
+        found, trust, residual = self.refinement, None, 0.0
+        if found is not None:
+            trust, residual = found.trust, float(found.refined.pixel_residual[self.photos.mask].mean())
+        return give_verdict(self.photos, self.expected_error, self.findings, trust, residual)
 
     @property
     def gains(self) -> np.ndarray:
@@ -132,7 +138,7 @@ class Inference:
         """What each light of `relit` reaches, (H, W) bool."""
         found = {}
         for number, (name, light) in enumerate(RELIT.items(), start=1):
-            found[name] = lit(self.depth, np.array(light, np.float64))
+            found[name] = trace_light(self.depth, np.array(light, np.float64))
             stage("relit pictures", number, len(RELIT))
         return found
 
@@ -163,20 +169,18 @@ class Inference:
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
             "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
         }  # fmt: skip
-        if "precision" in self.estimate.diagnostics:
-            facts["precision"] = self.estimate.diagnostics["precision"]
-            facts["stray_light"] = round(float(self.estimate.diagnostics["stray_light"].mean()), 6)
-        confidence = self.estimate.diagnostics.get("confidence")
-        if confidence is not None:
-            facts["light_confidence"] = _by_file(photos, confidence, 4)
-        expected = self.estimate.diagnostics.get("expected_light_error")
-        if expected is not None:
-            facts["expected_light_error_degrees"] = _by_file(photos, expected, 2)
+        found = self.estimate
+        if found.stray_light is not None:
+            facts["precision"] = found.precision
+            facts["stray_light"] = round(float(found.stray_light.mean()), 6)
+        if found.confidence is not None:
+            facts["light_confidence"] = _by_file(photos, found.confidence, 4)
+        if found.expected_light_error is not None:
+            facts["expected_light_error_degrees"] = _by_file(photos, found.expected_light_error, 2)
         if self.expected_error is not None:
             facts["expected_normal_error_degrees"] = round(float(self.expected_error[photos.mask].mean()), 2)
-        refined = self.estimate.diagnostics.get("refined")
-        if refined is not None:
-            facts["refined"] = _about_refined(self.estimate.diagnostics, photos)
+        if self.refinement is not None:
+            facts["refined"] = _about_refined(self.refinement, photos)
         if self.residuals is not None:
             facts["lambertian_residual"] = round(self.residuals.overall, 4)
         return facts
@@ -184,7 +188,8 @@ class Inference:
     def save(self, out: str | Path) -> list[Path]:
         """Write everything into a folder: normals, lights, depth, meshes, relit views, result.json.
 
-        Every file is written whole; all of them are made before the first is put in place.
+        Every file is written whole; all of them are made before the first is put in place. result.json is removed first
+        and put in place last, so that a folder with one holds files of one run.
 
         Raises:
             InputError: the folder of the photographs, or a disk that refuses the files.
@@ -197,7 +202,8 @@ class Inference:
                 folder = Path(temporary)
                 self._write(folder)
                 made = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-                for name in made:
+                (out / _RESULT).unlink(missing_ok=True)
+                for name in sorted(made, key=lambda name: name.name == _RESULT):
                     (out / name).parent.mkdir(exist_ok=True)
                     (folder / name).replace(out / name)
         except OSError as error:
@@ -214,8 +220,8 @@ class Inference:
         write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
         if len(self.light_directions):
             write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains)
-        refined = self.estimate.diagnostics.get("refined")
-        if refined is not None:
+        if self.refinement is not None:
+            refined = self.refinement.refined
             _save_array(folder / "albedo.npy", refined.albedo)
             _save_array(folder / "highlights.npy", refined.strength)
             _save_array(folder / "residual.npy", refined.pixel_residual)
@@ -238,7 +244,7 @@ class Inference:
             shown = [display(self.relit_view(name, (rows,))) for rows in _bands(mask)]
             write_png(folder / "relit" / f"{name}.png", np.concatenate(shown))
             stage("relit pictures", 1, 1)
-        write_json(folder / "result.json", self.summary())
+        write_json(folder / _RESULT, self.summary())
 
 
 def check_out(out: Path, photographs: Path) -> None:
@@ -256,9 +262,9 @@ def _by_file(photos: Photographs, values: np.ndarray, digits: int) -> dict[str, 
     return dict(zip(photos.files, np.round(np.asarray(values, float), digits).tolist(), strict=True))
 
 
-def _about_refined(diagnostics: dict[str, Any], photos: Photographs) -> dict[str, Any]:
+def _about_refined(found: RefinedEstimate, photos: Photographs) -> dict[str, Any]:
     """Say how far refinement went, what to expect of it, and which photographs it explains worst; JSON ready."""
-    refined, start, expected = diagnostics["refined"], diagnostics["start"], diagnostics["trust"]
+    refined, start, expected = found.refined, found.start, found.trust
     mask, residual = photos.mask, refined.image_residual
     moved = _mean_angle(refined.normals, start.normals, mask)
     turned = angle_degrees(refined.light_directions, start.light_directions)

@@ -64,7 +64,7 @@ def mesh(
     Raises:
         InputError: sizes or types that do not fit, depth that is not finite, or no triangle.
     """
-    z, mask = _checked(depth, mask, colour, normals)
+    z, mask = _check(depth, mask, colour, normals)
     height, width = mask.shape
     few = slice(None, None, every), slice(None, None, every)
     z, mask = z[few] / np.float32(every), mask[few]
@@ -142,14 +142,14 @@ def _matt(tree: dict[str, Any]) -> None:
             tree["accessors"][place]["normalized"] = True
 
 
-def _checked(
+def _check(
     depth: Depth | np.ndarray, mask: np.ndarray | None, colour: np.ndarray | None, normals: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return z (H, W) and the mask, or refuse the arguments of `mesh`."""
     if isinstance(depth, Depth):
         z, mask = depth.z, depth.mask if mask is None else mask
     elif mask is None:
-        raise InputError("a depth array needs a mask beside it")
+        raise InputError("a depth array needs a mask as well")
     else:
         z = np.asarray(depth)
     if mask.dtype != np.bool_ or z.shape != mask.shape or z.ndim != 2:

@@ -15,7 +15,8 @@ import numpy as np
 
 from render.shared.errors import InputError
 from render.shared.progress import repeat, stage
-from sdps.core.integration import Depth, checked_normals
+from sdps.core.integration import Depth, check_normals
+from sdps.core.intensities import per_channel
 
 if TYPE_CHECKING:
     from sdps.inference.image_source import ImageSource
@@ -73,15 +74,15 @@ def fit_albedo(
     for number, rows in enumerate(bands):
         some = _Rows(images, rows, mask.shape) if rows != slice(0, len(mask)) else images
         with repeat(number, len(bands)):
-            unit, directions, strengths = _checked(some, mask[rows], normals[rows], lights, intensities)
-            picture[rows][mask[rows]] = _fitted(some, mask[rows], unit, directions, strengths, passes)
+            unit, directions, strengths = _check(some, mask[rows], normals[rows], lights, intensities)
+            picture[rows][mask[rows]] = _fit(some, mask[rows], unit, directions, strengths, passes)
     return picture
 
 
-def _fitted(
+def _fit(
     images: "ImageSource", mask: np.ndarray, unit: np.ndarray, lights: np.ndarray, intensities: np.ndarray, passes: int
 ) -> np.ndarray:  # (n, C)
-    """Return the albedo of the mask's pixels; arguments as `_checked` returns them."""
+    """Return the albedo of the mask's pixels; arguments as `_check` returns them."""
     albedo = smallest = None
     for number in range(passes):
         above, below = np.zeros((2, len(unit), 3), np.float32)
@@ -114,7 +115,7 @@ def relit(
         albedo: (H, W, 3) of `fit_albedo`, or (H, W, 1) or a number.
         direction: (3,) from the surface to the light, of any length.
         depth: Of `integrate`; adds cast shadows.
-        free: (H, W) bool, what `lit` found of them before.
+        free: (H, W) bool, what `trace_light` found of them before.
 
     Raises:
         InputError: a direction that is none.
@@ -123,7 +124,7 @@ def relit(
     length = np.linalg.norm(direction)
     if direction.shape != (3,) or not (np.isfinite(length) and length > 0):
         raise InputError(f"a light direction must be three finite numbers, not all zero, got {direction.tolist()}")
-    free = lit(depth, direction) if free is None and depth is not None else free
+    free = trace_light(depth, direction) if free is None and depth is not None else free
     albedo = np.broadcast_to(albedo, (*normals.shape[:2], np.shape(albedo)[-1] if np.ndim(albedo) else 1))
     picture = np.empty((*normals.shape[:2], 3), np.float32)
     step = max(1, _PART // normals.shape[1])
@@ -135,7 +136,7 @@ def relit(
     return picture
 
 
-def lit(depth: Depth, direction: np.ndarray) -> np.ndarray:
+def trace_light(depth: Depth, direction: np.ndarray) -> np.ndarray:
     """Return which pixels see a distant light over the depth map, (H, W) bool; nothing outside the mask occludes.
 
     Rays march in steps of a pixel; of objects whose box has more than a million, of some, between as many pixels.
@@ -149,15 +150,15 @@ def lit(depth: Depth, direction: np.ndarray) -> np.ndarray:
     if not inside[few].any():
         found[box] = inside
         return found
-    free = _marched(depth.z[box][few] / every if every > 1 else depth.z[box], inside[few], direction)
+    free = _march(depth.z[box][few] / every if every > 1 else depth.z[box], inside[few], direction)
     if every > 1:
         free = cv2.resize(free.astype(np.float32), inside.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
     found[box] = free & inside
     return found
 
 
-def _marched(z: np.ndarray, mask: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Do what `lit` does for depth z (H, W) in pixels, pixel by pixel."""
+def _march(z: np.ndarray, mask: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Do what `trace_light` does for depth z (H, W) in pixels, pixel by pixel."""
     across, towards = np.asarray(direction[:2], np.float64), float(direction[2])
     length = np.linalg.norm(across)
     if length < 1e-9 * max(abs(towards), 1e-300):
@@ -203,7 +204,7 @@ def _sums(
     albedo: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the squared differences and the squared images, summed over each image (2, L) and each pixel (2, n)."""
-    unit, lights, intensities = _checked(images, mask, normals, lights, intensities)
+    unit, lights, intensities = _check(images, mask, normals, lights, intensities)
     inside = albedo[mask].astype(np.float32)
     wrong, power = np.zeros((2, len(lights))), np.zeros((2, len(unit)))
     for part, observed in _read(images, mask):
@@ -226,7 +227,7 @@ def _shading(unit: np.ndarray, light: np.ndarray) -> np.ndarray:  # (n,)
     return np.maximum(unit @ light, 0.0)
 
 
-def _checked(
+def _check(
     images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return normals (n, 3), lights (L, 3) and intensities (L, 3), all float32."""
@@ -240,7 +241,7 @@ def _checked(
         )
     if not (count and np.isfinite(lights).all() and np.isfinite(intensities).all()):
         raise InputError("there must be images, and their lights and intensities must be finite")
-    return unit, lights, np.broadcast_to(intensities.reshape(count, -1), (count, 3))
+    return unit, lights, per_channel(intensities)
 
 
 class _Rows:
@@ -274,9 +275,9 @@ def _unit(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
     step = max(1, _PART // mask.shape[-1]) if mask.size > _PART else mask.size
     bands = [slice(start, start + step) for start in range(0, len(mask), step)]
     if len(bands) < 2:
-        return checked_normals(normals, mask).astype(np.float32)
-    found = [checked_normals(normals[rows], mask[rows]).astype(np.float32) for rows in bands if mask[rows].any()]
-    return np.concatenate(found) if found else checked_normals(normals, mask).astype(np.float32)
+        return check_normals(normals, mask).astype(np.float32)
+    found = [check_normals(normals[rows], mask[rows]).astype(np.float32) for rows in bands if mask[rows].any()]
+    return np.concatenate(found) if found else check_normals(normals, mask).astype(np.float32)
 
 
 def _parts(count: int) -> list[slice]:
@@ -293,5 +294,5 @@ def _read(images: "ImageSource", mask: np.ndarray) -> Iterator[tuple[slice, np.n
             raise InputError(f"images must be (L, {mask.shape[0]}, {mask.shape[1]}, 3), got {observed.shape}")
         observed = observed[:, mask].astype(np.float32, copy=False)
         if not np.isfinite(observed).all():
-            raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
+            raise InputError("the images contain NaN or infinite values inside the mask; repair them first")
         yield part, observed

@@ -24,7 +24,7 @@ def give_verdict(
 
     Args:
         photos: What was photographed.
-        expected: (H, W) degrees, angle to the true normals to expect; None where nothing tells it.
+        expected: (H, W) degrees, angle to the true normals to expect; None where nothing predicts it.
         findings: What the checks said.
         trust: What refinement says of itself, where it ran.
         residual: Mean residual of refinement.
@@ -34,7 +34,7 @@ def give_verdict(
     if mean < UNUSABLE and not grave:
         return ""
     reasons = (*grave, *_reasons(photos, findings, trust, residual), "no network has learned objects like this one")
-    how = f"the normals are {mean:.0f} degrees off, as far as can be told" if mean >= UNUSABLE else "a check failed"
+    how = f"the normals are off by an estimated {mean:.0f} degrees" if mean >= UNUSABLE else "a check failed"
     return f"NOT TO BE USED: {how}. Likeliest reason: {reasons[0]}"
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import unit
 from sdps.core.integration import Depth
 
 _LIGHT = (-0.35, 0.45, 0.82)  # in the viewer's frame
@@ -30,8 +31,7 @@ def depth_normals(depth: Depth) -> np.ndarray:
             total += np.pad(steps, padding)
             number += np.pad(there, padding)
         slopes.append(sign * total / np.maximum(number, 1))
-    normals = np.stack([-slopes[0], -slopes[1], np.ones(mask.shape)], axis=-1)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = unit(np.stack([-slopes[0], -slopes[1], np.ones(mask.shape)], axis=-1))
     return np.where(mask[..., None], normals, 0.0).astype(np.float32)
 
 

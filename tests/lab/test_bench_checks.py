@@ -13,8 +13,8 @@ from lab.bench import bench_checks
 from lab.commands import main
 from pipelines.evaluate.self_test import photograph_bunny
 from sdps import photos
+from sdps.photos.analysis.colours import colour_casts
 from sdps.photos.checks import Finding
-from sdps.photos.evidence.colours import colour_casts
 
 BODIES = {"red": (0.5, 0.05, 0.05), "black": (0.015, 0.015, 0.015), "blue": (0.05, 0.1, 0.4)}
 STEP = (5, -4)  # pixels

@@ -184,7 +184,7 @@ def test_folders_and_methods_that_do_not_fit_are_one_line(hills: tuple, tmp_path
     one = folders.write_folder(tmp_path / "one", np.full((1, 40, 40, 3), 0.5, np.float32))
     assert "1" in fails(capsys, one, "--out", out)
     assert "did you mean 'pf14'" in fails(capsys, folder, "--method", "pf-14", "--out", out)
-    assert "told the lights; give them with --lights" in fails(
+    assert "needs the lights; give them with --lights" in fails(
         capsys, folder, "--method", "least-squares", "--out", out
     )
     assert "holds the photographs" in fails(capsys, folder, "--method", "factorisation", "--out", folder)

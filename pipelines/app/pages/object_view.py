@@ -14,6 +14,7 @@ from pipelines.app.pages.reflectance_tables import build_tables
 from pipelines.infer import depth_picture
 from pipelines.shared import pictures
 from render.shared.progress import stage
+from sdps.core.intensities import grey
 from sdps.refinement.reflectance import shade
 from sdps.surface.meshing import mesh, write_mesh
 
@@ -63,7 +64,7 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
         "width": width, "height": height, "step": step, "full": [mask.shape[1], mask.shape[0]], "albedo": peak * scale,
         "strength": shine * scale if lobes else 0.0, "tables": tables, "files": list(result.photos.files),
         "lights": np.round(result.light_directions, 5).tolist() if found else [],
-        "intensities": _grey(result.gains).round(4).tolist() if found else [],
+        "intensities": grey(result.gains).round(4).tolist() if found else [],
         "confidence": [confidence[name] for name in result.photos.files] if confidence else [],
         "components": result.depth.components, "integrability": facts["depth"]["residual_degrees"],
         "residual": facts.get("lambertian_residual"),
@@ -91,11 +92,10 @@ def shade_object(
 
 def _reflectance(result: "Inference") -> tuple[np.ndarray, np.ndarray, dict[str, list[float]]]:
     """Return albedo (H, W, 3), strength of highlights (H, W) and lobes; grey and matt where no lights were found."""
-    found = result.estimate.diagnostics
-    refined = found.get("refined")
-    if refined is not None and not found["trust"].doubt:
-        lobes = {name: getattr(refined, name).astype(float).tolist() for name in _LOBES}
-        return refined.albedo, refined.strength, lobes
+    found = result.refinement
+    if found is not None and not found.trust.doubt:
+        lobes = {name: getattr(found.refined, name).astype(float).tolist() for name in _LOBES}
+        return found.refined.albedo, found.refined.strength, lobes
     albedo = result.albedo
     if albedo is None:
         albedo = np.repeat(result.photos.mask[..., None], 3, -1).astype(np.float32)
@@ -108,23 +108,18 @@ def _observations(
 ) -> None:  # fmt: skip
     """Write what every shown pixel measures in every photograph, and what the model says it should."""
     count = len(result.photos)
-    observed = np.stack([_grey(result.photos.window(slice(k, k + 1), *few)[0]) for k in range(count)], axis=-1)
+    observed = np.stack([grey(result.photos.window(slice(k, k + 1), *few)[0]) for k in range(count)], axis=-1)
     np.save(folder / "observed.npy", observed.astype(np.float16))
     if not len(result.light_directions):
         return
-    gains = _grey(result.gains)
+    gains = grey(result.gains)
     lights = result.light_directions.astype(np.float64)
     model = np.stack(
-        [gain * _grey(shade_object(normals, albedo, strength, lobes, light))
+        [gain * grey(shade_object(normals, albedo, strength, lobes, light))
          for gain, light in zip(gains, lights, strict=True)], axis=-1,
     )  # fmt: skip
     scale = float((observed * model).sum() / max(float((model**2).sum()), 1e-12))
     np.save(folder / "model.npy", (scale * model).astype(np.float16))
-
-
-def _grey(values: np.ndarray) -> np.ndarray:
-    """Return the mean of the colours, if there are any: (L, 3) to (L,), (h, w, 3) to (h, w)."""
-    return values.mean(-1) if values.ndim > 1 else values
 
 
 def _mesh(result: "Inference", path: Path) -> None:

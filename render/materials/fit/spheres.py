@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from render.materials.model import half_knots
+from render.shared.imaging.vectors import half_vectors
 
 CLIP_PERCENTILE = 99.5
 _VIEW = np.array([0.0, 0.0, 1.0])
@@ -106,8 +107,7 @@ def _sphere_pairs(count: int, rng: np.random.Generator) -> Samples:
     with enough samples inside a peak that covers a few pixels.
     """
     lights = hemisphere_lights(count, rng)
-    half = lights + _VIEW
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    half = half_vectors(lights)
     normals = np.where((np.arange(count) % 2 == 0)[:, None], _disk(count, rng), _about(half, rng))
     wi, wo = shading_frame(normals, lights)
     pixel = np.maximum(normals[:, 2], 0) / np.pi

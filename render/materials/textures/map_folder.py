@@ -19,6 +19,7 @@ from render.shared.decoding import check_picture, decoding
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
 from render.shared.images import read_channels, to_unit
+from render.shared.imaging.srgb import from_srgb
 
 _log = logging.getLogger(__name__)
 _LARGEST = 4096
@@ -106,8 +107,7 @@ def _read(folder: str, files: tuple[tuple[str, Source, int], ...]) -> MapFolder:
                 f"{source.path}: {next(sizes)} pixels, but {first.name} has {next(sizes)}; scale them to one size"
             )
     values = np.empty((*shape, 5), np.float32)
-    colour = pictures["colour"]
-    values[..., :3] = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    values[..., :3] = from_srgb(pictures["colour"])
     values[..., 3] = pictures.get("roughness", np.float32(_ROUGHNESS))
     values[..., 4] = pictures.get("metallic", np.float32(0))
     down = any(kind == "normal" and source.convention == DX for kind, source, _ in files)

@@ -15,6 +15,7 @@ import numpy as np
 
 from render.materials.textures.map_folder import MapFolder, read
 from render.shared.errors import InputError, unknown
+from render.shared.imaging.srgb import from_srgb
 from render.shared.seeds import generator
 
 KINDS = {
@@ -161,7 +162,7 @@ def palette(kind: str, seed: int) -> np.ndarray:
 def _colour(hue: float, saturation: float, value: float) -> list[float]:
     """Return linear RGB of an sRGB colour given by hue, saturation and value."""
     encoded = np.array(colorsys.hsv_to_rgb(hue % 1, np.clip(saturation, 0, 1), np.clip(value, 0, 1)))
-    return list(np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4))
+    return list(from_srgb(encoded))
 
 
 def _noise(rng: np.random.Generator) -> np.ndarray:

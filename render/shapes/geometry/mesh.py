@@ -7,6 +7,7 @@ import numpy as np
 
 from render.records.manifest import View
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import spiral
 
 _BLOCK = 1 << 20  # points looked at together
 
@@ -118,9 +119,7 @@ def bounding_centre(points: np.ndarray) -> np.ndarray:
     centre met. Run on the extreme points along a fixed spiral of directions, which decide the sphere.
     """
     count = 128
-    z = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
-    directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)  # (128, 3)
+    directions = spiral(count)
     highest, found = np.full(count, -np.inf, np.float32), np.zeros(count, np.int64)
     for start in range(0, len(points), _BLOCK):  # all heights at once are 2.5 GB for a mesh of ten million triangles
         heights = directions.astype(np.float32) @ points[start : start + _BLOCK].astype(np.float32).T  # (128, block)

@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.imaging import environments
+from render.shared.imaging.vectors import spiral, unit
 
 FEWEST = 128
 WIDEST_GAP = 20.0  # degrees from any direction above the horizon to the nearest light
@@ -173,7 +174,7 @@ class LightStage:
     def mean_directions(self, weights: np.ndarray) -> np.ndarray:  # (Q, 3) float32
         """Return the unit vector along which the light of each image (Q, L, 3) comes on average."""
         vectors = weights.mean(-1) @ self.directions
-        return (vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+        return unit(vectors).astype(np.float32)
 
 
 def require_enough(count: int, where: str) -> None:
@@ -227,6 +228,4 @@ def _upper(height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @lru_cache(maxsize=1)
 def _hemisphere() -> np.ndarray:  # (_DENSE, 3)
     """Return directions evenly spread over the upper hemisphere."""
-    z = 1.0 - (np.arange(_DENSE) + 0.5) / _DENSE
-    turn, flat = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(_DENSE), np.sqrt(1.0 - z * z)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+    return spiral(_DENSE, lowest=0.0)

@@ -21,6 +21,7 @@ import numpy as np
 
 from render.shared.config import check_fields
 from render.shared.errors import InputError
+from render.shared.imaging.srgb import from_srgb, to_srgb
 
 DEPTHS = (8, 10, 12, 14, 16)
 _SKEWNESS = 0.125
@@ -212,20 +213,9 @@ def _blur(images: np.ndarray, sigma: float) -> np.ndarray:
     return np.stack([cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT) for image in images])
 
 
-def to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Return values in [0, 1] on the sRGB curve (IEC 61966-2-1), linear ones clipped to that range."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055).astype(np.float32)
-
-
-def from_srgb(values: np.ndarray) -> np.ndarray:
-    """Undo `to_srgb`."""
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
 def jpeg(linear: np.ndarray, quality: int) -> bytes:
     """Return a linear image (H, W, 3) as the bytes of an 8-bit sRGB JPEG file."""
-    pixels = np.rint(255 * to_srgb(linear)).astype(np.uint8)
+    pixels = np.rint(255 * to_srgb(linear).astype(np.float32)).astype(np.uint8)
     _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return encoded.tobytes()
 

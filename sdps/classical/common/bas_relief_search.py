@@ -20,7 +20,7 @@ _REFINED = 5
 """How many of the best nodes are refined."""
 
 
-def minimise_over_bas_reliefs(energy: Callable[[Gbr], float], starts: Sequence[Gbr]) -> tuple[Gbr, float, int]:
+def minimise_over_bas_reliefs(energy: Callable[[Gbr], float], starts: Sequence[Gbr]) -> tuple[Gbr, float]:
     """Search boxes of depth scales of one sign from coarse to fine, then polish by Nelder-Mead.
 
     A box spans four times its start's depth scale in mu and nu, and from a quarter to four times it in lambda; a second
@@ -32,13 +32,10 @@ def minimise_over_bas_reliefs(energy: Callable[[Gbr], float], starts: Sequence[G
         starts: Centres of boxes, also candidates themselves.
 
     Returns:
-        The best transformation, its energy and the number of energies computed.
+        The best transformation and its energy.
     """
-    counted = 0
 
     def value(gbr: Gbr) -> float:
-        nonlocal counted
-        counted += 1
         result = energy(gbr)
         return result if np.isfinite(result) else np.inf
 
@@ -60,7 +57,7 @@ def minimise_over_bas_reliefs(energy: Callable[[Gbr], float], starts: Sequence[G
         found = optimize.minimize(near, np.zeros(3), method="Nelder-Mead", options=options)
         if found.fun < lowest:
             best, lowest = _moved(centre, found.x), float(found.fun)
-    return best, lowest, counted
+    return best, lowest
 
 
 def _moved(start: Gbr, offset: np.ndarray) -> Gbr:

@@ -85,7 +85,7 @@ def factorise(profiles: np.ndarray) -> Factors:
     return Factors(surface=surface, lights=lights, singular=relative[:6])
 
 
-def balanced(surface: np.ndarray, lights: np.ndarray) -> Factors:
+def balance(surface: np.ndarray, lights: np.ndarray) -> Factors:
     """Return the factors of B S in which B's columns are orthogonal, of root mean square 1, and S's rows orthogonal.
 
     Args:
@@ -173,7 +173,7 @@ def outward_score(normals: np.ndarray, mask: np.ndarray) -> float:
     return float((normals[:, :2] * outward).sum() / total) if total > 0.0 else 0.0
 
 
-def oriented(factors: Factors, mask: np.ndarray) -> Factors:
+def orient(factors: Factors, mask: np.ndarray) -> Factors:
     """Decide between convex and concave, and turn the normals to the camera.
 
     (B, S) and (-B, -S) give the same images, and so does the sign of lambda: one is fixed by the contour, along which

@@ -4,18 +4,19 @@ Check, tell Lambert's law from highlights and shadows, factorise, impose integra
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from render.shared.errors import unknown
-from sdps.classical.common.factorisation import Factors, factorise, impose_integrability, oriented
+from sdps.classical.common.factorisation import Factors, factorise, impose_integrability, orient
 from sdps.classical.common.gbr import Gbr
 from sdps.classical.common.observations import Observations, observe
 from sdps.classical.common.rpca import robust_low_rank
 from sdps.classical.common.separation import diffuse_factors
 from sdps.classical.common.shadows import fit_lit
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import NO_NOTES, Estimate, Notes
+from sdps.core.intensities import scale_to_mean
 
 Front = Literal["low-rank", "diffuse", "none"]
 
@@ -84,18 +85,18 @@ def prepare(
         factors = diffuse_factors(profiles, seed=seed)
         cleaned = np.maximum(factors.surface.astype(np.float32) @ factors.lights.astype(np.float32), 0.0)
     factors = impose_integrability(replace(factors, singular=singular), observations.mask, smoothing=smoothing)
-    return Prepared(observations, profiles, cleaned, oriented(factors, observations.mask))
+    return Prepared(observations, profiles, cleaned, orient(factors, observations.mask))
 
 
-def conclude(prepared: Prepared, gbr: Gbr, diagnostics: dict[str, Any] | None = None) -> Estimate:
+def conclude(prepared: Prepared, gbr: Gbr, notes: Notes = NO_NOTES) -> Estimate:
     """Turn the factors, transformed, into an estimate: oriented, unit normals, lights as direction and intensity.
 
     Args:
         prepared: What `prepare` returned.
         gbr: The method's bas-relief transformation of the prepared factors.
-        diagnostics: What the method adds to `albedo` (H, W), `singular_values` and `gbr` (mu, nu, lambda).
+        notes: What the method notes besides `albedo` and `gbr`.
     """
-    factors = oriented(prepared.factors.transformed(gbr), prepared.mask)
+    factors = orient(prepared.factors.transformed(gbr), prepared.mask)
     strength = np.linalg.norm(factors.lights, axis=0)
     directions = (factors.lights / np.maximum(strength, 1e-12)).T
     directions[strength <= 0.0] = (0.0, 0.0, 1.0)
@@ -103,11 +104,6 @@ def conclude(prepared: Prepared, gbr: Gbr, diagnostics: dict[str, Any] | None = 
     return Estimate(
         normals=to_map(factors.normals()),
         light_directions=directions.astype(np.float32),
-        intensities=(strength / max(float(strength.mean()), 1e-300)).astype(np.float32),
-        diagnostics={
-            "albedo": to_map(factors.albedo()),
-            "singular_values": factors.singular,
-            "gbr": (gbr.mu, gbr.nu, gbr.lam),
-            **(diagnostics or {}),
-        },
+        intensities=scale_to_mean(strength).astype(np.float32),
+        notes=replace(notes, albedo=to_map(factors.albedo()), gbr=(gbr.mu, gbr.nu, gbr.lam)),
     )

@@ -6,6 +6,8 @@ theta_h the angle of normal and half vector. An isotropic BRDF with half-vector 
 
 import numpy as np
 
+from render.shared.imaging.vectors import half_vectors
+
 _LIT = 0.08
 """Smallest n . l of a sample whose reflectance counts."""
 
@@ -19,12 +21,6 @@ _WIDTH_H, _WIDTH_D = np.radians(5.0), np.radians(10.0)
 """Differences of theta_h and theta_d over which two samples are still compared."""
 
 _CHUNK = 5000
-
-
-def half_vectors(lights: np.ndarray) -> np.ndarray:  # (L, 3)
-    """Return the unit half vectors of unit lights (L, 3) under a camera along z."""
-    half = lights + np.array([0.0, 0.0, 1.0])
-    return half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-6)
 
 
 def asymmetry(values: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:  # (P,)

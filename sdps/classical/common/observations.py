@@ -71,7 +71,7 @@ def observe(images: np.ndarray, mask: np.ndarray, *, minimum: int = 3) -> Observ
         raise InputError("the mask is empty; mark the object's pixels")
     values = images[:, mask].astype(np.float32)
     if not np.isfinite(values).all():
-        raise InputError("the images hold NaN or infinite values inside the mask; repair them first")
+        raise InputError("the images contain NaN or infinite values inside the mask; repair them first")
     peak = float(values.max())
     if peak <= 0.0:
         raise InputError("all images are black inside the mask")

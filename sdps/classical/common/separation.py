@@ -11,7 +11,7 @@ import numpy as np
 
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
-from sdps.classical.common.factorisation import Factors, balanced, column_scale, factorise
+from sdps.classical.common.factorisation import Factors, balance, column_scale, factorise
 from sdps.classical.common.weighted import normal_equations
 
 _COARSE, _FINE = 0.4, 0.02
@@ -39,7 +39,7 @@ def diffuse_factors(profiles: np.ndarray, *, samples: int = 6000, seed: int = 0)
         seed: Root seed of the draw.
 
     Returns:
-        The factors, `balanced`.
+        The factors, balanced (`balance`).
 
     Raises:
         InputError: fewer than three dimensions; see `factorise`.
@@ -59,8 +59,8 @@ def diffuse_factors(profiles: np.ndarray, *, samples: int = 6000, seed: int = 0)
         scale = column_scale(surface)
         surface, lights = surface @ np.linalg.inv(scale), lights @ scale.T  # well conditioned, same product
     if total > len(chosen):
-        return balanced(diffuse_surface(profiles, lights * gains[:, None]), lights.T * gains)
-    return balanced(surface * levels[:, None], lights.T * gains)
+        return balance(diffuse_surface(profiles, lights * gains[:, None]), lights.T * gains)
+    return balance(surface * levels[:, None], lights.T * gains)
 
 
 def diffuse_surface(profiles: np.ndarray, lights: np.ndarray) -> np.ndarray:  # (P, 3)

@@ -9,7 +9,7 @@ Reddy, PAMI 1995; Wu et al., ACCV 2010, leave shadows out of their low-rank fit 
 import numpy as np
 
 from render.shared.seeds import generator
-from sdps.classical.common.factorisation import Factors, balanced
+from sdps.classical.common.factorisation import Factors, balance
 from sdps.classical.common.weighted import solve_weighted
 
 _SHADOW = 0.05
@@ -37,7 +37,7 @@ def fit_lit(profiles: np.ndarray, cleaned: np.ndarray, start: np.ndarray, *, see
         seed: Root seed of the sample.
 
     Returns:
-        The factors, `balanced`.
+        The factors, balanced (`balance`).
 
     Raises:
         InputError: the lit observations have fewer than three dimensions.
@@ -60,7 +60,7 @@ def fit_lit(profiles: np.ndarray, cleaned: np.ndarray, start: np.ndarray, *, see
         for _ in range(5):
             surface = data.solve(lights, surface)
         found.append(surface)
-    return balanced(np.concatenate(found), lights.T)
+    return balance(np.concatenate(found), lights.T)
 
 
 class _Lit:

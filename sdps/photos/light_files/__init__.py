@@ -29,8 +29,8 @@ _MOST_BEHIND = 0.8
 _MOST_NAMED = 20
 
 
-class Stops(Protocol):
-    """What stops for a fault that leaves something to compute, unless the user wants to go on: `Doubts`."""
+class FaultHandler(Protocol):
+    """What is called for a fault that leaves something to compute: `sdps.photos.faults.Faults`."""
 
     def stop(self, text: str) -> None: ...
 
@@ -52,7 +52,9 @@ class Lights:
     own_frame: bool = False
 
 
-def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up", doubts: Stops | None = None) -> Lights:
+def read_lights(
+    path: str | Path, files: Sequence[str], frame: str = "y-up", faults: FaultHandler | None = None
+) -> Lights:
     """Read one light per picture.
 
     Args:
@@ -62,7 +64,7 @@ def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up", dou
         files: Names of the pictures, (L,).
         frame: Axes of the file: y-up, y-down, x-left, z-away, xy-swapped, several joined by commas. With Meshroom's
             JSON, how it differs from Meshroom's axes.
-        doubts: What becomes of lights that are not above the horizon, or may not belong to their pictures; None
+        faults: What becomes of lights that are not above the horizon, or may not belong to their pictures; None
             refuses them.
 
     Raises:
@@ -76,7 +78,7 @@ def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up", dou
         raise InputError(f"{path}: lights.json states its own frame; leave the frame flag {frame!r} out")
     axes = turn * table.signs  # the file's own axes first
     if table.doubt:
-        _stop(doubts, table.doubt)
+        _stop(faults, table.doubt)
     vectors, strengths, said = _ordered(path, table, files, axes.sum(axis=1).tolist())
     vectors = vectors @ axes.T
     lengths = np.linalg.norm(vectors, axis=1)
@@ -88,7 +90,7 @@ def read_lights(path: str | Path, files: Sequence[str], frame: str = "y-up", dou
             "the picture out"
         )
     directions = vectors / lengths[:, None]
-    _refuse_behind(path, directions, files, frame, doubts)
+    _refuse_behind(path, directions, files, frame, faults)
     turned = f", turned by {frame}" if (turn != np.eye(3)).any() else ""
     how = f", axes {frame}" if table.signs == (1, 1, 1) else turned
     notes = [f"lights are those of {path.name}{how}", *said]
@@ -183,13 +185,15 @@ def _intensities(path: Path, values: np.ndarray, files: Sequence[str]) -> np.nda
     return values.squeeze(1).astype(np.float32) if values.shape[1] == 1 else values.astype(np.float32)
 
 
-def _stop(doubts: Stops | None, text: str) -> None:
-    if doubts is None:
+def _stop(faults: FaultHandler | None, text: str) -> None:
+    if faults is None:
         raise InputError(text)
-    doubts.stop(text)
+    faults.stop(text)
 
 
-def _refuse_behind(path: Path, directions: np.ndarray, files: Sequence[str], frame: str, doubts: Stops | None) -> None:
+def _refuse_behind(
+    path: Path, directions: np.ndarray, files: Sequence[str], frame: str, faults: FaultHandler | None
+) -> None:
     """Refuse lights at or below the horizon, name them, and say the likeliest reason."""
     behind = np.flatnonzero(directions[:, 2] <= 0).tolist()
     if not behind:
@@ -211,4 +215,4 @@ def _refuse_behind(path: Path, directions: np.ndarray, files: Sequence[str], fra
         pictures = "this picture" if len(behind) == 1 else "these pictures"
         flags_out = f"--images '!{files[behind[0]]}'" + (" and so on" if len(behind) > 1 else "")
         advice = f"correct the file, or leave {pictures} out ({flags_out})"
-    _stop(doubts, f"{path}: {said}; {advice}")
+    _stop(faults, f"{path}: {said}; {advice}")

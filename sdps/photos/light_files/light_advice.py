@@ -32,7 +32,7 @@ def advise(fit: LightFit, files: Sequence[str], name: str, frame: str) -> tuple[
     if not fit.sure:
         turned = _flag(AXES[3], frame)
         return "note", (
-            f"the lights of {name} are half a turn from {_SAID}; without an outline it cannot be told which is right: "
+            f"the lights of {name} are half a turn from {_SAID}; without an outline nothing shows which is right: "
             f"if hollows come out as bumps, {turned}"
         )
     if apart > _FAR:

@@ -127,7 +127,7 @@ def _chosen(
     named = [name for name in rest if _NAMED.fullmatch(name)]
     found = rest if len(rest) == 1 else named if want.lights else [name for name in rest if _STRENGTHS.search(name)]
     if not fitting and len(small) == 1:
-        found = list(small)  # its shape is what is wrong, and is told as for a text
+        found = list(small)  # its shape is what is wrong, which is said as for a text
     if len(found) != 1:
         shapes = [f"{name} ({' x '.join(map(str, entry.shape))})" for name, entry in entries.items()]
         there = listed([*shapes, *others]) or "nothing"
@@ -138,12 +138,12 @@ def _chosen(
     values = values.reshape(-1, 1) if values.ndim == 1 else values
     notes = [f"of the arrays in it, {found[0]} was taken"] if len(entries) > 1 else []
     bright = [name for name, one in small.items() if _STRENGTHS.search(name)]
-    beside = [name for name in bright if _fits(small[name].shape, count, INTENSITIES)]
-    if not want.lights or len(beside) != 1 or len(values) == values.size:
+    matching = [name for name in bright if _fits(small[name].shape, count, INTENSITIES)]
+    if not want.lights or len(matching) != 1 or len(values) == values.size:
         return Table(values, notes=tuple(notes))
-    strengths = _numbers(small[beside[0]])
+    strengths = _numbers(small[matching[0]])
     strengths = strengths.T if strengths.shape[0] != count else strengths
-    notes.append(f"its intensities are {beside[0]}")
+    notes.append(f"its intensities are {matching[0]}")
     return Table(values, notes=tuple(notes), strengths=strengths.reshape(count, -1))
 
 

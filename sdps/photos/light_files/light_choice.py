@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from render.shared.errors import InputError
-from sdps.photos.light_files import Stops, find_lights, read_intensities, read_lights
+from sdps.photos.light_files import FaultHandler, find_lights, read_intensities, read_lights
 from sdps.photos.light_files.light_frame import frame_matrix
 
 EQUAL = "equal"
@@ -40,7 +40,7 @@ def known_lights(
     lights: str | Path | None,
     intensities: str | Path | None,
     frame: str,
-    stops: Stops,
+    stops: FaultHandler,
 ) -> KnownLights:
     """Read directions and intensities where asked for; a frame flag without lights is checked all the same.
 

@@ -138,7 +138,7 @@ def _of_views(path: Path, keys: list[str], files: Sequence[str]) -> tuple[tuple[
         return None, ""
     return None, (
         f"{path}: its view ids ({keys[0]}, {keys[1]}, ...) are Meshroom's own and say nothing about the pictures' "
-        "order; put its cameraInit.sfm, which names them, beside the file"
+        "order; put its cameraInit.sfm, which names them, next to the file"
     )
 
 

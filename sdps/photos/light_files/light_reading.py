@@ -1,4 +1,4 @@
-"""Which kind of file a light file is, told by its content, and its rows."""
+"""The kind of a light file, known by its content, and its rows."""
 
 import zipfile
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ def read_table(path: Path, files: Sequence[str], want: Want) -> tuple[Table, boo
 
 
 def _is_json(text: str) -> bool:
-    """Tell JSON from text in brackets, such as a list of Python, whatever the file's suffix."""
+    """Tell JSON from text in brackets, such as a list of Python, by the content alone."""
     try:
         return text.lstrip().startswith("{") and isinstance(parse_json(text), dict)
     except ValueError:

@@ -11,7 +11,7 @@ SRGB_EXPONENT = 2.224
 """log f(1/2) / log(1/2) of sRGB's decoding curve f, by which colour profiles with that curve are recognised."""
 
 _EXPONENTS = (0.3, 4.0)
-"""Exponents that are believed to be a display curve."""
+"""Exponents that are taken for a display curve."""
 
 
 def resolve_gamma(gamma: str | float, coding: Coding, folders: Sequence[Path]) -> tuple[str | float, str]:
@@ -53,7 +53,7 @@ def _given_gamma(gamma: str | float) -> str | float:
     except ValueError as error:
         raise InputError(f"gamma {gamma!r} is none of auto, linear, srgb and no exponent like 2.2") from error
     if not _EXPONENTS[0] <= value <= _EXPONENTS[1]:
-        raise InputError(f"gamma {value:g} is no display curve; give an exponent like 2.2, linear, srgb or auto")
+        raise InputError(f"gamma {value:g} is not a display curve; give an exponent like 2.2, linear, srgb or auto")
     return value
 
 

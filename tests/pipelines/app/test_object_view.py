@@ -18,7 +18,7 @@ from pipelines.app.pages.reflectance_tables import build_tables
 from pipelines.app.pages.studio_tasks import check_choice, make_training_preset, triangulate
 from pipelines.shared import presets
 from render.shared.errors import InputError
-from render.shared.imaging.sensor import to_srgb
+from render.shared.imaging.srgb import to_srgb
 
 RNG = np.random.default_rng(0)
 

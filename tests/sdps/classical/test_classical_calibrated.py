@@ -30,7 +30,7 @@ def test_exact_on_lambertian_images_without_shadows(method):
     scene = lambertian(*hills(48), lights(24), intensities=gains, shadows=False)
     estimate = method(scene.images, scene.mask, scene.lights, gains)
     assert normal_mae(estimate.normals, scene.normals, scene.mask) < 0.05
-    np.testing.assert_allclose(estimate.diagnostics["albedo"][scene.mask], 0.7, rtol=2e-3)
+    np.testing.assert_allclose(estimate.notes.albedo[scene.mask], 0.7, rtol=2e-3)
     np.testing.assert_allclose(estimate.intensities, gains, rtol=1e-6)
     assert not estimate.normals[~scene.mask].any()
 
@@ -51,7 +51,7 @@ def test_middle_positions_by_hand():
     images[1] += 7.0
     images[2] = -1.0
     estimate = position_threshold(images, scene.mask, scene.lights)
-    assert estimate.diagnostics["kept"] == 6
+    assert estimate.notes.kept == 6
     assert normal_mae(estimate.normals, scene.normals, scene.mask) < 0.05
     assert normal_mae(least_squares(images, scene.mask, scene.lights).normals, scene.normals, scene.mask) > 10.0
 
@@ -62,7 +62,7 @@ def test_least_absolute_minimises_the_sum_of_absolute_residuals():
 
     def cost(method) -> np.ndarray:
         estimate = method(scene.images, scene.mask, scene.lights)
-        vectors = estimate.normals[scene.mask] * estimate.diagnostics["albedo"][scene.mask][:, None]
+        vectors = estimate.normals[scene.mask] * estimate.notes.albedo[scene.mask][:, None]
         return np.abs(profiles - vectors @ scene.lights.T).sum(1)
 
     best = cost(partial(robust_least_squares, iterations=200, floor=1e-5))
@@ -76,7 +76,7 @@ def test_pixels_in_shadow_fall_back_and_say_so(caplog):
     scene = lambertian(*hills(24), lit)
     estimate = position_threshold(scene.images, scene.mask, lit, drop_lowest=0.6, drop_highest=0.0)
     assert np.isfinite(estimate.normals).all()
-    assert estimate.diagnostics["unresolved"] > 0.05
+    assert estimate.notes.unresolved > 0.05
     assert "coplanar" in caplog.text
 
 

@@ -34,7 +34,7 @@ def test_brightness_does_not_matter():
     second = entropy(1000.0 * scene.images, scene.mask, front="none")
     assert scene.errors(first)[0] < 3.0
     np.testing.assert_allclose(scene.errors(second), scene.errors(first), atol=0.2)
-    assert second.diagnostics["entropy"] == pytest.approx(first.diagnostics["entropy"], abs=0.05)
+    assert second.notes.energy == pytest.approx(first.notes.energy, abs=0.05)
 
 
 def test_standard_form_does_not_depend_on_the_start():
@@ -49,7 +49,7 @@ def test_same_seed_same_answer():
     scene = few_albedos(3)
     estimates = [entropy(scene.images, scene.mask, front="none", samples=1000, starts=2, seed=seed) for seed in (5, 5)]
     np.testing.assert_array_equal(estimates[0].normals, estimates[1].normals)
-    minima = estimates[0].diagnostics["minima"]
+    minima = estimates[0].notes.minima
     assert (np.diff(minima[:, 0]) >= 0.0).all()
 
 

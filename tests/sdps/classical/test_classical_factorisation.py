@@ -8,7 +8,7 @@ import pytest
 
 from render.shared.errors import InputError
 from sdps.classical import registry
-from sdps.classical.common.factorisation import Factors, factorise, impose_integrability, oriented, outward_score
+from sdps.classical.common.factorisation import Factors, factorise, impose_integrability, orient, outward_score
 from sdps.classical.common.front_end import prepare
 from sdps.classical.common.gbr import Gbr
 from sdps.classical.common.observations import observe
@@ -83,7 +83,7 @@ def test_contour_tells_convex_from_concave():
     prepared = prepare(scene.images, mask, front="none")
     for flip in ([1, 1, -1], [-1, -1, 1], [-1, -1, -1]):
         flipped = Factors(prepared.factors.surface * flip, prepared.factors.lights, prepared.factors.singular)
-        assert np.allclose(oriented(flipped, mask).surface, prepared.factors.surface)
+        assert np.allclose(orient(flipped, mask).surface, prepared.factors.surface)
 
 
 def test_object_cut_by_the_frame_is_judged_by_its_true_contour():

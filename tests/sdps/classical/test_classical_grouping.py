@@ -43,8 +43,8 @@ def test_exact_without_shadows(count):
     scene = coloured(0, count, shadows=False)
     estimate = grouping(scene.images, scene.mask, front="none")
     assert scene.errors(estimate)[0] < 0.5
-    assert estimate.diagnostics["albedo_groups"] == count
-    assert estimate.diagnostics["residual"] < 0.01
+    assert estimate.notes.albedo_groups == count
+    assert estimate.notes.residual < 0.01
 
 
 @pytest.mark.parametrize("front", ["none", "low-rank"])
@@ -59,7 +59,7 @@ def test_a_uniform_object_is_one_group(caplog):
     normals, mask = hills(64)
     scene = lambertian(normals, mask, lights(24, 3, 0.7), albedo=np.array([0.6, 0.3, 0.2]), shadows=False)
     estimate = grouping(scene.images, scene.mask, front="none")
-    assert estimate.diagnostics["albedo_groups"] == 1
+    assert estimate.notes.albedo_groups == 1
     assert scene.errors(estimate)[0] < 0.5
     assert "single chromaticity" in caplog.text
 

@@ -71,7 +71,7 @@ def test_far_better_than_the_factorisation(name, uneven):
     assert normal < min(3.0, 0.25 * plain[0])
     assert direction < min(2.5, 0.25 * plain[1])
     assert intensity < 0.03
-    assert found.diagnostics["highlights"]
+    assert found.notes.highlights
 
 
 def test_known_lights_and_a_wide_lobe_beat_least_squares():
@@ -87,7 +87,7 @@ def test_known_lights_and_a_wide_lobe_beat_least_squares():
 def test_the_solution_of_some_pixels_is_carried_to_all():
     scene = glossy("sphere", roughness=0.35)
     found = half_vector(scene.images, scene.mask, light_directions=scene.lights, samples=300, updates=0)
-    assert found.diagnostics["solved"] == 300
+    assert found.notes.solved == 300
     assert scene.errors(found)[0] < 2.0
     assert angle_degrees(found.normals[scene.mask], scene.normals[scene.mask]).max() < 20.0
     assert (found.normals[~scene.mask] == 0.0).all()
@@ -99,7 +99,7 @@ def test_a_diffuse_object_falls_back_with_a_warning(caplog):
     with caplog.at_level(logging.WARNING):
         found = half_vector(scene.images, mask)
     assert "equal light intensities" in caplog.text
-    assert not found.diagnostics["highlights"]
+    assert not found.notes.highlights
     assert scene.errors(found)[0] < 2.0
 
 

@@ -37,11 +37,11 @@ def test_exact_on_a_smooth_lambertian_surface(scene: scenes.Scene) -> None:
     assert normals < 2.0  # over seeds, 0.6 to 0.9
     assert lights < 2.0
     assert intensities < 0.02
-    diagnostics = estimate.diagnostics
-    assert diagnostics["candidates"] > 100
-    assert diagnostics["intersections"] > 1000
-    assert (diagnostics["candidate_map"] >= 0).sum() == diagnostics["candidates"]
-    assert diagnostics["candidate_map"].max() < 40
+    notes = estimate.notes
+    assert notes.candidates > 100
+    assert notes.intersections > 1000
+    assert (notes.candidate_map >= 0).sum() == notes.candidates
+    assert notes.candidate_map.max() < 40
 
 
 def test_maxima_face_their_light(scene: scenes.Scene, prepared: Prepared) -> None:
@@ -82,7 +82,7 @@ def test_the_limit_thins_at_random_but_repeatably(scene: scenes.Scene) -> None:
     first, second, other = (
         pf14.diffuse_maxima(scene.images, scene.mask, front="none", limit=80, seed=seed) for seed in (0, 0, 1)
     )
-    assert first.diagnostics["gbr"] == second.diagnostics["gbr"] != other.diagnostics["gbr"]
+    assert first.notes.gbr == second.notes.gbr != other.notes.gbr
     assert scene.errors(first)[0] < 3.0
 
 

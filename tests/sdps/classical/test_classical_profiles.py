@@ -7,17 +7,18 @@ import pytest
 from classical_scenes import glossy, lambertian, lights, patches, sphere
 
 from render.shared.errors import InputError
+from render.shared.imaging.vectors import spiral
 from sdps.classical.plain import factorisation
 from sdps.classical.profile_distances import (
-    compressed,
+    compress,
     decompose,
     distribution_slope,
     geodesics,
-    normalised,
-    oriented,
+    normalise,
+    orient,
     profile_distances,
 )
-from sdps.classical.profile_lights import fibonacci, find_lights
+from sdps.classical.profile_lights import find_lights
 from sdps.core.metrics import angle_degrees
 
 
@@ -63,8 +64,8 @@ def random_normals(count: int) -> np.ndarray:
 
 def test_geodesics_are_linear_in_the_angle_and_the_distribution_gives_their_slope():
     normals = random_normals(700)
-    brightness = np.maximum(normals @ fibonacci(400).T, 0.0)  # (S, L)
-    ways = geodesics(normalised(brightness), 15)
+    brightness = np.maximum(normals @ spiral(400).T, 0.0)  # (S, L)
+    ways = geodesics(normalise(brightness), 15)
     angles = np.arccos(np.clip(normals @ normals.T, -1.0, 1.0))
     near = (angles > 0.1) & (angles < 1.0)
     assert np.corrcoef(ways[near], angles[near])[0, 1] > 0.985
@@ -79,14 +80,14 @@ def test_decomposition_recovers_normals_from_near_angles_alone():
     angles = np.where(angles < np.pi / 3, angles, 1.1 * angles)  # the far ones are wrong, and not to be trusted
     rim = np.flatnonzero(normals[:, 2] < 0.2)
     outward = normals[rim, :2] / np.linalg.norm(normals[rim, :2], axis=1, keepdims=True)
-    found = oriented(decompose(angles, limit=300), rim, outward)
+    found = orient(decompose(angles, limit=300), rim, outward)
     assert angle_degrees(found, normals).mean() < 3.0  # over seeds, 0.4 to 1.8
 
 
 def test_lights_of_known_normals():
     normals, directions, gains = random_normals(400), around(60), strengths(60)
     profiles = np.maximum(normals @ directions.T, 0.0) * gains
-    found = find_lights(profiles, compressed(profiles / gains), normals)
+    found = find_lights(profiles, compress(profiles / gains), normals)
     front = directions[:, 2] > 0.0
     assert angle_degrees(found.directions, directions)[front].mean() < 3.0
     ratio = found.intensities / gains
@@ -96,7 +97,7 @@ def test_lights_of_known_normals():
 def even(count: int, seed: int = 3) -> np.ndarray:
     """Return directions spread evenly over the whole sphere, the method's assumption, turned at random."""
     turn = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
-    return (fibonacci(count) @ turn).astype(np.float32)
+    return (spiral(count) @ turn).astype(np.float32)
 
 
 @pytest.mark.parametrize("surface", [sphere, two_blobs])
@@ -112,7 +113,7 @@ def test_clearly_better_than_factorisation_under_lights_all_around(surface, shad
     assert normal < 0.7 * rival[0]
     assert np.allclose(np.linalg.norm(ours.normals[mask], axis=1), 1.0, atol=1e-5)
     assert not ours.normals[~mask].any()
-    assert ours.diagnostics["light_mean"] < 0.3
+    assert ours.notes.light_mean < 0.3
 
 
 def test_albedo_cancels_and_the_seed_fixes_the_answer():
@@ -130,7 +131,7 @@ def test_lights_on_one_side_draw_a_warning(caplog):
     scene = lambertian(normals, mask, lights(60, 1, lowest=0.6))
     with caplog.at_level(logging.WARNING):
         estimate = profile_distances(scene.images, mask, samples=250, rounds=1)
-    assert estimate.diagnostics["light_mean"] > 0.35
+    assert estimate.notes.light_mean > 0.35
     assert "do not surround the object" in caplog.text
 
 

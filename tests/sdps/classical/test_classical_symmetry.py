@@ -54,10 +54,9 @@ def test_the_search_finds_a_far_minimum_and_survives_holes():
             return float("nan")
         return (gbr.mu - truth.mu) ** 2 + (gbr.nu - truth.nu) ** 2 + np.log(gbr.lam / truth.lam) ** 2
 
-    found, lowest, count = minimise_over_bas_reliefs(energy, [Gbr()])
+    found, lowest = minimise_over_bas_reliefs(energy, [Gbr()])
     np.testing.assert_allclose([found.mu, found.nu, found.lam], [truth.mu, truth.nu, truth.lam], atol=0.01)
     assert lowest < 1e-4
-    assert 400 < count < 3000
 
 
 @pytest.mark.parametrize("name", ["sphere", "hills"])
@@ -88,8 +87,8 @@ def test_far_better_than_the_factorisation(name, uneven):
     assert normal < min(2.5, 0.25 * plain[0])
     assert direction < min(2.5, 0.25 * plain[1])
     assert intensity < 0.03
-    assert found.diagnostics["highlights"]
-    assert found.diagnostics["energy"] <= found.diagnostics["energy_of_equal_intensities"]
+    assert found.notes.highlights
+    assert found.notes.energy <= found.notes.equal_energy
 
 
 @pytest.mark.slow
@@ -121,7 +120,7 @@ def test_a_diffuse_object_falls_back_with_a_warning(caplog):
     with caplog.at_level(logging.WARNING):
         found = reflectance_symmetry(scene.images, mask)
     assert "no highlights" in caplog.text
-    assert not found.diagnostics["highlights"]
+    assert not found.notes.highlights
     assert scene.errors(found)[0] < 1.5
 
 

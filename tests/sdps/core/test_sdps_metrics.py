@@ -6,8 +6,7 @@ from sdps_scenes import hemisphere_lights, shade, sphere_normals
 
 from render.shared.errors import InputError
 from sdps.classical.least_squares import least_squares
-from sdps.core.baselines import constant_estimate
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, constant_estimate
 from sdps.core.metrics import angle_degrees, direction_mae, intensity_error, normal_error_map, normal_mae, score
 
 
@@ -95,7 +94,7 @@ def test_least_squares_is_exact_without_shadows() -> None:
     mask &= (normals @ lights.T > 0.0).all(-1)
     estimate = least_squares(shade(normals, lights, 0.6) * gains[:, None, None, None], mask, lights, gains)
     assert normal_mae(estimate.normals, normals, mask) < 0.02
-    np.testing.assert_allclose(estimate.diagnostics["albedo"][mask], 0.6, rtol=1e-4)
+    np.testing.assert_allclose(estimate.notes.albedo[mask], 0.6, rtol=1e-4)
 
 
 def test_shadow_threshold_repairs_attached_shadows() -> None:

@@ -5,7 +5,7 @@ import pytest
 from sdps_scenes import hemisphere_lights, shade, sphere_normals
 
 from sdps.inference.image_source import survey
-from sdps.inference.stray_light import stray_light, without
+from sdps.inference.stray_light import remove_stray_light, stray_light
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def sphere() -> tuple[np.ndarray, np.ndarray]:
 def test_rendered_images_have_none(sphere: tuple) -> None:
     images, mask = sphere
     assert not stray_light(images[:, mask]).any()
-    np.testing.assert_array_equal(without(images, np.zeros((24, 3), np.float32)), images)
+    np.testing.assert_array_equal(remove_stray_light(images, np.zeros((24, 3), np.float32)), images)
 
 
 def test_the_veil_of_every_image_and_channel_is_found(sphere: tuple) -> None:

@@ -114,9 +114,9 @@ def test_tiles_say_what_the_whole_says(name: str, sphere: tuple, monkeypatch: py
     assert len(tiles(mask, side**2, 0)) > 1
     cut = estimator.estimate(images, mask, lights)
     np.testing.assert_allclose(cut.normals, whole.normals, atol=1e-5)
-    if "expected_error" in whole.diagnostics:
-        error = whole.diagnostics["expected_error"]
-        np.testing.assert_allclose(cut.diagnostics["expected_error"], error, atol=1e-3)
+    if whole.expected_error is not None:
+        error = whole.expected_error
+        np.testing.assert_allclose(cut.expected_error, error, atol=1e-3)
 
 
 def test_a_part_reads_what_the_whole_reads(sphere: tuple) -> None:

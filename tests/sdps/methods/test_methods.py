@@ -15,8 +15,7 @@ from pipelines.shared import presets
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import source_digest
-from sdps.core.baselines import constant_estimate
-from sdps.core.estimate import Estimate
+from sdps.core.estimate import Estimate, constant_estimate
 from sdps.core.precision import arithmetic
 from sdps.data.augment import Augmentation
 from sdps.inference.estimator import Estimator

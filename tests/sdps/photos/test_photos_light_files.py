@@ -14,7 +14,7 @@ import scipy.io
 
 from render.shared.errors import InputError
 from sdps import photos
-from sdps.photos.doubts import Doubts
+from sdps.photos.faults import Faults
 from sdps.photos.light_files import find_lights, read_intensities, read_lights
 
 COUNT = 8
@@ -297,10 +297,10 @@ def test_meshroom_s_own_numbers_need_its_list_of_views(tmp_path: Path) -> None:
     """It writes views by hash, so in no order of the pictures."""
     hashes = sorted(int(k * 7919 + 13) ** 3 for k in range(COUNT))
     path = tmp_path / "lights.json"
-    assert "put its cameraInit.sfm, which names them, beside the file" in refusal(path, meshroom(hashes))
-    doubts = Doubts(anyway=True)
-    np.testing.assert_allclose(read_lights(path, FILES, doubts=doubts).directions, LIGHTS, atol=1e-5)
-    assert len(doubts.overridden) == 1
+    assert "put its cameraInit.sfm, which names them, next to the file" in refusal(path, meshroom(hashes))
+    faults = Faults(anyway=True)
+    np.testing.assert_allclose(read_lights(path, FILES, faults=faults).directions, LIGHTS, atol=1e-5)
+    assert len(faults.overridden) == 1
     views = [{"viewId": str(view), "path": f"/data/{FILES[k]}"} for view, k in zip(hashes, ORDER, strict=True)]
     (tmp_path / "cameraInit.sfm").write_text(json.dumps({"views": views}))
     np.testing.assert_allclose(read_lights(path, FILES).directions[ORDER], LIGHTS, atol=1e-5)

@@ -97,7 +97,7 @@ def test_gamma_follows_the_profile_the_folder_and_the_user(tmp_path: Path) -> No
     assert photos.load(tmp_path).gamma == "srgb"
     with pytest.raises(InputError, match="'bright' is none of auto, linear, srgb"):
         photos.load(tmp_path, gamma="bright")
-    with pytest.raises(InputError, match="22 is no display curve"):
+    with pytest.raises(InputError, match="22 is not a display curve"):
         photos.load(tmp_path, gamma=22)
 
 

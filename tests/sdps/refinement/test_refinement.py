@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from render.shared.errors import InputError
-from sdps.core.estimate import Estimate
 from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
 from sdps.methods.parse import parse
@@ -17,6 +16,7 @@ from sdps.refinement.image_model import State, build_model, measure_differences
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.refined import Refined
 from sdps.refinement.reflectance import LOBES, MODES
+from sdps.refinement.trust import RefinedEstimate
 
 QUICK = RefineConfig(coarse_pixels=700, iterations=600, bounces=0, fine_iterations=0)  # nothing here shades itself
 
@@ -204,8 +204,8 @@ def test_any_method_that_gives_normals_is_refined_by_its_name() -> None:
     normals, mask = bumpy(40)
     images, lights, intensities = lit(normals, 16, seed=8, gloss=1.0)
     estimate = Runner(method, pretrained.require).estimate(images, mask, lights, intensities)
-    start = estimate.diagnostics["start"]
-    assert isinstance(start, Estimate) and isinstance(estimate.diagnostics["refined"], Refined)
+    assert isinstance(estimate, RefinedEstimate)
+    start = estimate.start
     assert np.allclose(estimate.light_directions, lights, atol=1e-6)  # what is given stays
     before, after = (float(angle_degrees(item.normals[mask], normals[mask]).mean()) for item in (start, estimate))
     assert after < 0.3 * before

@@ -49,7 +49,7 @@ def found(residual: float, lights: np.ndarray) -> Refined:
 
 
 def begun(normals: np.ndarray, lights: np.ndarray, **told: np.ndarray) -> Estimate:
-    return Estimate(normals, lights, np.ones(len(lights), np.float32), told)
+    return Estimate(normals, lights, np.ones(len(lights), np.float32), **told)
 
 
 def test_more_is_expected_of_a_model_that_fits_and_of_more_images() -> None:
@@ -110,7 +110,7 @@ def test_a_doubted_refinement_leaves_what_the_method_found(monkeypatch: pytest.M
     monkeypatch.setattr(refining, "refine", partial(refining.refine, config=quick))
     runner = Runner(parse("true+least-squares+refine", pretrained.require), pretrained.require)
     estimate = runner.estimate(images, mask, lights, np.ones(count, np.float32))
-    start, expected = estimate.diagnostics["start"], estimate.diagnostics["trust"]
+    start, expected = estimate.start, estimate.trust
     assert isinstance(start, Estimate) and bool(expected.doubt) == (count < FEWEST_IMAGES)
     assert (estimate.normals is start.normals) == bool(expected.doubt)
 

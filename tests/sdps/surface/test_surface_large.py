@@ -10,7 +10,7 @@ from sdps.core import integration, metrics
 from sdps.core.integration import integrate
 from sdps.surface import meshing, relight, views
 from sdps.surface.meshing import mesh, step_of
-from sdps.surface.relight import fit_albedo, lit, relit, residuals
+from sdps.surface.relight import fit_albedo, relit, residuals, trace_light
 
 
 def fields() -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -100,10 +100,10 @@ def test_shadows_of_large_objects_are_those_of_small_ones(monkeypatch) -> None:
     object.__setattr__(depth, "z", np.where(depth.mask, z, 0.0).astype(np.float32))
     for light in ((1.0, 0.0, 1.0), (-0.5, 0.6, 0.5), (0.0, 0.0, 1.0)):
         monkeypatch.setattr(relight, "_TRACED", 2**20)
-        whole = lit(depth, np.array(light))
+        whole = trace_light(depth, np.array(light))
         monkeypatch.setattr(relight, "_TRACED", 6000)  # every fourth pixel
-        assert (lit(depth, np.array(light)) != whole).mean() < 0.02
-        assert not lit(depth, np.array(light))[~depth.mask].any()
+        assert (trace_light(depth, np.array(light)) != whole).mean() < 0.02
+        assert not trace_light(depth, np.array(light))[~depth.mask].any()
 
 
 def test_work_in_parts_is_the_whole_work(monkeypatch) -> None:

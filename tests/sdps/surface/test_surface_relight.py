@@ -14,7 +14,7 @@ from lab.commands import main as lab_main
 from render.records.shards import Shard
 from render.shared.errors import InputError
 from sdps.core.integration import integrate
-from sdps.surface.relight import fit_albedo, lit, relit, residuals
+from sdps.surface.relight import fit_albedo, relit, residuals, trace_light
 from sdps.surface.views import depth_normals, strip, turned
 
 
@@ -116,14 +116,14 @@ def test_cast_shadow_of_a_wall():
     flat[..., 2] = 1.0
     depth = integrate(flat, np.ones((21, 41), bool))
     object.__setattr__(depth, "z", z)
-    free = lit(depth, np.array([1.0, 0.0, 1.0]))  # from the right, 45 degrees: 10 pixels of shadow on the left
+    free = trace_light(depth, np.array([1.0, 0.0, 1.0]))  # from the right, 45 degrees: 10 pixels of shadow on the left
     assert free[10, 21:].all() and free[10, :10].all()
     assert not free[10, 12:20].any()
-    up = lit(depth, np.array([0.0, 1.0, 0.2]))
+    up = trace_light(depth, np.array([0.0, 1.0, 0.2]))
     assert up.all()
-    assert lit(depth, np.array([0.0, 0.0, 1.0])).all()
+    assert trace_light(depth, np.array([0.0, 0.0, 1.0])).all()
     object.__setattr__(depth, "z", np.where(np.arange(21)[:, None] == 10, 10.0, 0.0).astype(np.float32) + 0 * z)
-    below = lit(depth, np.array([0.0, 1.0, 1.0]))  # light from above: the shadow falls on the rows below the wall
+    below = trace_light(depth, np.array([0.0, 1.0, 1.0]))  # from above: the rows below the wall are in shadow
     assert below[:9].all() and not below[12:18].any()
 
 

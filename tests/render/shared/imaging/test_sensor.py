@@ -7,7 +7,8 @@ import pytest
 
 from render.shared.config import build
 from render.shared.errors import InputError
-from render.shared.imaging.sensor import Sensor, SensorModel, from_srgb, jpeg, to_srgb, vignetting
+from render.shared.imaging.sensor import Sensor, SensorModel, jpeg, vignetting
+from render.shared.imaging.srgb import from_srgb, to_srgb
 from render.shared.seeds import generator
 
 CLEAN = Sensor(full_well=1e9, read_noise=0.0, bits=16)

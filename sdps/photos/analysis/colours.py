@@ -29,7 +29,7 @@ def colour_casts(observations: np.ndarray, saturation: float) -> np.ndarray:  # 
     Each pixel is compared with itself in the other images, so that paint does not matter. A lamp of another colour
     changes all pixels alike; gloss, white on coloured plastic, changes those it falls on. So a change counts where it
     is large against its spread over the pixels. Gloss moves a pixel's colour along the line from its paint to white,
-    and no further: changes within that line must be very steady, and what is left beside it needs less.
+    and no further: changes within that line must be very steady, and what is left next to it needs less.
 
     Args:
         observations: (L, P, 3) float32, linear, not negative.
@@ -50,13 +50,13 @@ def colour_casts(observations: np.ndarray, saturation: float) -> np.ndarray:  # 
     white = paint / np.maximum(length, 1e-6) * np.sqrt(np.minimum(length / _COLOURED, 1))
     found = np.zeros(len(observations))
     gloss = np.zeros(len(observations), bool)
-    changes = np.full((2, 2, len(observations), 3), np.nan)  # whole or beside white; median or spread
+    changes = np.full((2, 2, len(observations), 3), np.nan)  # whole or without white; median or spread
     for number, chosen in enumerate(good):
         if chosen.sum() < _FEW:
             continue
         change = (colours[number] - paint)[chosen]
-        beside = change - white[chosen] * (change * white[chosen]).sum(-1, keepdims=True)
-        for row, values in zip(changes, (change, beside), strict=True):
+        rest = change - white[chosen] * (change * white[chosen]).sum(-1, keepdims=True)
+        for row, values in zip(changes, (change, rest), strict=True):
             low, row[0, number], high = np.percentile(values, (25, 50, 75), axis=0)
             row[1, number] = high - low
         own, middle = np.median(paint[chosen], axis=0), changes[0, 0, number]

@@ -1,6 +1,6 @@
 """Did the camera or the object move between photographs? Two witnesses that no light can move.
 
-Tiles of a picture are explained by the other pictures where the picture lies: they vote on its shift (`explained`).
+Tiles of a picture are explained by the other pictures where the picture lies: they vote on its shift (`explainer`).
 
 Outlines and paint have their edges in the same place, with the same sign, under every light; edges of shading, shadows
 and highlights wander with it. So every image's field of edge directions is laid over the sum of the fields of the
@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from scipy import fft, ndimage
 
-from sdps.photos.evidence.explained import Explainer
+from sdps.photos.analysis.explainer import Explainer
 
 START = 3
 """Images at the beginning that are taken to lie still: three explain a matte surface under a fourth light."""
@@ -38,7 +38,7 @@ WHOLE = (5, 0.35, 3.0)
 against."""
 
 SURE = (12, 0.5, 3.0)
-"""Votes by which a shift is believed before a background, whatever edges and silhouette say."""
+"""Votes by which a shift is believed before a background, against edges and silhouette."""
 
 WHOLE_OF_FEW = (6, 0.6, 4.0)
 """The same where there are few other images, which may not explain a new light."""
@@ -260,12 +260,12 @@ def second_look(tracker: Tracker, shifts: list[Shift], image: Callable[[int], np
             apart.append(number)
         else:
             tracker.take(number, view, Shift())
-    found = _believed(tracker, apart, image)
+    found = _keep_sure(tracker, apart, image)
     if found and len(tracker) < _FEW:
         for number in apart:
             if number not in found:
                 tracker.take(number, tracker.view(image(number)), Shift())
-        found = _believed(tracker, list(found), image)
+        found = _keep_sure(tracker, list(found), image)
     return [found.get(number, Shift()) for number in range(len(shifts))]
 
 
@@ -276,7 +276,7 @@ def _wanders(shifts: list[Shift]) -> bool:
     return len(places) > len(shifts) / 2 and bool(places.std(0).max() > 0.25 * lengths.mean())
 
 
-def _believed(tracker: Tracker, numbers: list[int], image: Callable[[int], np.ndarray]) -> dict[int, Shift]:
+def _keep_sure(tracker: Tracker, numbers: list[int], image: Callable[[int], np.ndarray]) -> dict[int, Shift]:
     """Measure images that are not taken in, and return the shifts that are sure, or like one that is."""
     found = {number: tracker.compare(tracker.view(image(number))) for number in numbers}
     sure = [shift for shift in found.values() if shift.sure]

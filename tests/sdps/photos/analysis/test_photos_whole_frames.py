@@ -8,9 +8,9 @@ import photo_folders as folders
 import pytest
 
 from sdps import photos
-from sdps.photos.evidence.explained import Explainer
-from sdps.photos.evidence.fall_off import FallOff, block_means, fall_off
-from sdps.photos.evidence.motion import Tracker, second_look
+from sdps.photos.analysis.explainer import Explainer
+from sdps.photos.analysis.fall_off import FallOff, block_means, fall_off
+from sdps.photos.analysis.motion import Tracker, second_look
 
 RING = np.arange(12) * 2 * np.pi * 5 / 12
 AROUND = np.stack([0.8 * np.cos(RING), 0.8 * np.sin(RING), np.full(12, 0.6)], axis=-1)

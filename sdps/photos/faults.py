@@ -1,4 +1,4 @@
-"""Checks that stop, unless the user wants to go on."""
+"""Faults that stop, unless the user wants to go on."""
 
 from dataclasses import dataclass, field
 
@@ -8,7 +8,7 @@ ANYWAY = "--anyway goes on all the same"
 
 
 @dataclass(frozen=True)
-class Doubts:
+class Faults:
     """What becomes of a fault that leaves something to compute.
 
     Attributes:
