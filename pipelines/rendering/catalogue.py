@@ -96,7 +96,7 @@ def models_main(args: argparse.Namespace) -> int:
         ]
         header = ["combination", "parameters", "models", "paper", "what it is"]
         sys.stdout.write("\n" + render_text("Combinations", header, rows, left={0, 2, 3, 4}))
-        sys.stdout.write("\nAny lighting model works with any normal model: --lights NAME --normals NAME.\n")
+        sys.stdout.write("\nAny lighting model works with any normal model: --lighting NAME --normals NAME.\n")
     return 0
 
 
