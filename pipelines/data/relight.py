@@ -4,9 +4,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from pipelines.data.exchange import UNCHECKED, add_check_argument, exposure_flag, planned
+from pipelines.data.exchange import parse_exposure, read_planned, report_check
 from pipelines.shared.flags import add_fields, from_flags
 from render.exchange.samples import ExportOptions
+from render.exchange.tree_check import check_tree
 from render.shared.errors import InputError
 from render.shared.imaging import environments, mixing
 
@@ -26,19 +27,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--split", default=None, choices=("train", "val", "test"), help="only this split")
     parser.add_argument("--limit", type=int, default=None, help="only the first so many scenes")
     parser.add_argument("--skip-missing", action="store_true", help="leave out planned scenes that have no shard yet")
-    add_check_argument(parser)
+    parser.add_argument("--check", action="store_true", help="check the tree; exit code 1 if it breaks a rule")
 
 
 def main(args: argparse.Namespace) -> int:
     """Mix, write, and say what of each map is lost."""
     mixed = from_flags(mixing.LightMix, args)
     options = ExportOptions(
-        layout=args.layout, bits=args.bits, exposure=exposure_flag(args.exposure), mixed=mixed, images=args.images,
+        layout=args.layout, bits=args.bits, exposure=parse_exposure(args.exposure), mixed=mixed, images=args.images,
         seed=args.seed,
     )  # fmt: skip
     from render.exchange.export import export, select
 
-    scenes = planned(args.folder, skip_missing=args.skip_missing)
+    scenes = read_planned(args.folder, skip_missing=args.skip_missing)
     chosen = select(scenes, ids=args.ids, split=args.split, limit=args.limit)
     if Path(args.out).resolve() == Path(args.folder).resolve():
         raise InputError(f"--out {args.out}: is the data folder itself; choose another")
@@ -53,5 +54,4 @@ def main(args: argparse.Namespace) -> int:
         )  # others of the kind lose about as much
         lost = mixing.share_behind(environments.load(name))
         sys.stdout.write(f"{name}: {lost:.0%} of its light comes from behind the object and is left out\n")
-    sys.stdout.write(UNCHECKED if args.check else "")
-    return 0
+    return report_check(check_tree(args.out, args.layout, shards=args.folder), args.out) if args.check else 0

@@ -10,9 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from render.exchange.folders import MARKER, RECORD, claim, read_record
-from render.exchange.layouts import LAYOUTS, Layout
-from render.exchange.names import Place
+from render.exchange.layouts import LAYOUTS
+from render.exchange.layouts.foreign_samples import MARKER, read_record
 from render.exchange.samples import ExportOptions, prepare
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
 from render.records.mirror import select_rendered, shard_path
@@ -21,6 +20,11 @@ from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_folder, write_json
 from render.shared.imaging import mixing
 from render.shared.progress import progress_bar
+from render.shared.temporary import is_empty
+
+RECORD = "export.json"
+_LISTED = ("shape", "material", "split", "exposure", "clipped", "black", "sha256", "spec")
+"""What of a scene's record is in the record of the tree too."""
 
 
 @dataclass(frozen=True)
@@ -56,23 +60,23 @@ def export(folder: str | Path, out: str | Path, options: ExportOptions, scenes: 
     _check_shards(folder, scenes)
     versions = {"sdps": metadata.version("sdps"), "numpy": np.__version__, "opencv": cv2.__version__}
     record = options.settings() | {"manifest": file_hash(folder / MANIFEST), "versions": versions}
-    places = layout.places(planned)
+    places = layout.name_folders(planned)
     chosen = {scene.id for scene in scenes}
-    there = [scene for scene in planned if scene.id in chosen or _marker(root, layout, places[scene.id], scene)]
+    there = [scene for scene in planned if scene.id in chosen or _read_marker(root / places[scene.id], scene)]
     _check_lights(folder, there, options)
     claim(root, record)
     written = 0
     with progress_bar(scenes, unit="scene", desc=f"export {options.layout}") as bar:
         for scene in bar:
-            place = places[scene.id]
-            if _marker(root, layout, place, scene) is None:
-                _write_scene(folder, root, scene, place, options)
+            if _read_marker(root / places[scene.id], scene) is None:
+                _write_scene(folder, root / places[scene.id], scene, options)
                 written += 1
-    done = [(scene, places[scene.id]) for scene in planned]
-    markers = {scene.id: _marker(root, layout, place, scene) for scene, place in done}
-    done = [(scene, place) for scene, place in done if markers[scene.id]]
-    layout.lists(root, done)
-    found = {scene.id: _entry(layout, place, marker) for scene, place in done if (marker := markers[scene.id])}
+    found = {}
+    for scene in planned:
+        marker = _read_marker(root / places[scene.id], scene)
+        if marker is not None:
+            found[scene.id] = {"folder": places[scene.id]} | {key: marker[key] for key in _LISTED}
+    layout.write_lists(root, [(scene, places[scene.id]) for scene in planned if scene.id in found])
     write_json(root / RECORD, record | {"scenes": found})
     return ExportReport(written, len(scenes) - written, found)
 
@@ -110,29 +114,41 @@ def _check_shards(folder: Path, scenes: Sequence[SceneSpec]) -> None:
 
 
 def _check_lights(folder: Path, scenes: Sequence[SceneSpec], options: ExportOptions) -> None:
-    """Refuse numbers of lights the layout cannot hold."""
+    """Refuse numbers of lights that the layout or the mixture cannot do with."""
     counts = {len(scene.lights) for scene in scenes}
-    LAYOUTS[options.layout].check(str(folder), counts)
+    LAYOUTS[options.layout].check_lights(counts, folder)
     if options.mixed is not None:
         mixing.require_enough(min(counts), str(folder))
         options.mixed.load()
 
 
-def scene_folder(root: Path, layout: Layout, place: Place) -> Path:
-    """Return the folder of a scene in the tree at `root`."""
-    return root / layout.base / layout.folder(place)
+def claim(root: Path, record: dict[str, Any]) -> None:
+    """Start a tree, or make sure that the one there comes from the same scenes and options."""
+    path = root / RECORD
+    if root.exists() and not root.is_dir():
+        raise InputError(f"{root}: is a file; choose another --out")
+    if not path.exists():
+        if root.is_dir() and not is_empty(root):
+            raise InputError(f"{root}: has files but no {RECORD}, so it is not ours to write to; choose another --out")
+        write_json(path, record | {"scenes": {}})
+        return
+    before = read_record(path)
+    for field in ("layout", "bits", "exposure", "intensities", "manifest", "mixed"):
+        if before.get(field) != record.get(field):
+            raise InputError(
+                f"{path}: {field} was {before.get(field)!r}, now it is {record.get(field)!r}; choose another --out"
+            )
 
 
-def _marker(root: Path, layout: Layout, place: Place, scene: SceneSpec) -> dict[str, Any] | None:
+def _read_marker(path: Path, scene: SceneSpec) -> dict[str, Any] | None:
     """Return the record in a scene's folder, None where the scene is missing or from another manifest line."""
-    path = scene_folder(root, layout, place) / MARKER
-    if not path.is_file():
+    if not (path / MARKER).is_file():
         return None
-    marker = read_record(path)
+    marker = read_record(path / MARKER)
     return marker if marker.get("spec") == scene.digest() else None
 
 
-def _write_scene(folder: Path, root: Path, scene: SceneSpec, place: Place, options: ExportOptions) -> None:
+def _write_scene(folder: Path, final: Path, scene: SceneSpec, options: ExportOptions) -> None:
     """Write one scene's folder, its record with it."""
     layout, source = LAYOUTS[options.layout], shard_path(folder, scene)
     sample, facts = prepare(read_shard(source, scene), scene, options)
@@ -143,18 +159,8 @@ def _write_scene(folder: Path, root: Path, scene: SceneSpec, place: Place, optio
     if scene.view.camera_distance is not None:
         marker["camera_distance"] = scene.view.camera_distance
     if not layout.directions and options.mixed is None:
-        marker |= {
-            "light_directions": sample.directions.tolist(),
-            "light_intensities": sample.intensities.tolist(),
-        }
-    final = scene_folder(root, layout, place)
+        marker["light_directions"] = sample.directions.tolist()
+        marker["light_intensities"] = sample.intensities.tolist()
     with atomic_folder(final) as temporary:
-        layout.write(temporary, final, place, sample)
+        layout.write(temporary, final, sample)
         (temporary / MARKER).write_text(json.dumps(marker) + "\n", encoding="utf-8")
-
-
-def _entry(layout: Layout, place: Place, marker: dict[str, Any]) -> dict[str, Any]:
-    """Return a scene's line in the record of the tree."""
-    folder = f"{layout.base}/{layout.folder(place)}".lstrip("/")
-    kept = ("shape", "material", "split", "exposure", "clipped", "black", "sha256", "spec")
-    return {"folder": folder} | {key: marker[key] for key in kept}

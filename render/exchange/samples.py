@@ -5,7 +5,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from render.exchange.layouts import LAYOUTS, Sample
+from render.exchange.layouts import LAYOUTS
+from render.exchange.layouts.layout_base import Sample
 from render.records.manifest import SceneSpec
 from render.records.shards import Shard
 from render.shared.config import check_fields, to_plain
@@ -87,7 +88,7 @@ def prepare(shard: Shard, scene: SceneSpec, options: ExportOptions) -> tuple[Sam
         where light is mixed, what each image's light is made of.
     """
     settings = options.settings()
-    radiance, directions, facts = _lit(shard, scene, options)
+    radiance, directions, facts = _relight(shard, scene, options)
     count = len(radiance)
     intensities = np.ones(count)
     if options.intensities == "seed":
@@ -115,7 +116,7 @@ def prepare(shard: Shard, scene: SceneSpec, options: ExportOptions) -> tuple[Sam
     return sample, {"exposure": exposure, "clipped": round(clipped, 6), "black": round(black, 6)} | facts
 
 
-def _lit(shard: Shard, scene: SceneSpec, options: ExportOptions) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+def _relight(shard: Shard, scene: SceneSpec, options: ExportOptions) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """Return radiance (Q, H, W, 3), the directions (Q, 3) its light comes from, and what that light is made of."""
     if options.mixed is None:
         return shard.images, np.asarray(scene.lights, np.float64).reshape(-1, 3), {}

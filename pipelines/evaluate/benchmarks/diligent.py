@@ -15,8 +15,8 @@ from pipelines.evaluate.benchmarks import suite
 from pipelines.evaluate.benchmarks.stacks import MARGIN, Images, build_object
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.shared.flags import from_flags
-from render.exchange.foreign_samples import Source
-from render.exchange.read_diligent import diligent_sources
+from render.exchange.layouts import LAYOUTS
+from render.exchange.layouts.foreign_samples import Source
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.images import bit_depth, read_image, to_unit
@@ -119,7 +119,7 @@ def diligent_objects(tree: Path, config: DiligentConfig) -> list[TestObject]:
     """
     if not tree.is_dir():
         raise InputError(f"{tree}: no such folder; give DiLiGenT's pmsData, the folder above it, or one <object>PNG")
-    found = {source.name: source for source in diligent_sources(tree)}
+    found = {source.name: source for source in (read() for read in LAYOUTS["diligent"].list_samples(tree))}
     names = [name for name in OBJECTS if name in found] + [name for name in found if name not in OBJECTS]
     return [_object(found[name], config) for name in names]
 

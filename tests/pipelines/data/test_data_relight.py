@@ -5,10 +5,10 @@ import json
 import cv2
 import numpy as np
 import pytest
-from exchange_rules import check_tree
 from stage_scenes import write_stage
 
 from pipelines.cli import main
+from render.exchange.tree_check import check_tree
 from render.records.manifest import read_manifest
 from render.records.shards import read_shard
 from render.shared.images import read_image
@@ -36,7 +36,7 @@ def test_a_constant_environment_makes_the_images_it_must(capsys, folder, tmp_pat
     assert main(argv) == 0
     text = capsys.readouterr().out
     assert "2 scenes of 3 images as unips, 2 written now" in text
-    assert check_tree(tmp_path / "tree", "unips", source=folder).violations == []
+    assert check_tree(tmp_path / "tree", "unips", shards=folder).violations == []
     assert "constant:0: 50% of its light comes from behind" in text
     scene = read_manifest(folder)[0]
     shard = read_shard(folder / scene.file, scene)

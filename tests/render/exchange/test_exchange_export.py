@@ -13,17 +13,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from exchange_rules import check_tree
 from exchange_support import LIGHTS, SCENES, SIZE, write_folder
 from PIL import Image
 from scipy.io import loadmat
 
 from pipelines.cli import main
-from render.exchange import layouts
 from render.exchange.export import export, select
-from render.exchange.layouts import LAYOUTS, image_names
-from render.exchange.names import legal_name, unique_names, view_places
+from render.exchange.layouts import LAYOUTS, layout_base
+from render.exchange.layouts.layout_base import image_names
+from render.exchange.layouts.names import legal_name, unique_names
 from render.exchange.samples import ExportOptions
+from render.exchange.tree_check import check_tree
 from render.records.manifest import SceneSpec, View, read_manifest
 from render.records.shards import read_shard
 from render.shared.errors import InputError
@@ -144,7 +144,7 @@ def test_diligent_loader_with_random_intensities(data, tmp_path):
         np.testing.assert_allclose(numbers.reshape(SIZE, SIZE, 3), normals, atol=1e-6)
         assert np.asarray(Image.open(root / object_name / "mask.png")).max() == 255
     assert not np.array_equal(drawn[SCENES[0][0]], drawn[SCENES[1][0]])  # one view, but lit differently
-    assert check_tree(tmp_path, "diligent", source=data).violations == []
+    assert check_tree(tmp_path, "diligent", shards=data).violations == []
 
 
 def test_unips_loader(trees, data):
@@ -166,7 +166,7 @@ def test_unips_loader(trees, data):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_exported_trees_keep_every_rule(trees, data, layout):
-    report = check_tree(trees[layout], layout, source=data)
+    report = check_tree(trees[layout], layout, shards=data)
     assert report.violations == [] and report.samples == len(SCENES) and report.lights == (LIGHTS, LIGHTS)
     assert [line for line in report.warnings if "128x128" in line] == report.warnings  # the trees of tests are small
     assert len(report.warnings) == (layout == "psfcn")
@@ -199,7 +199,7 @@ def test_exposure(data, tmp_path):
 def test_export_goes_on_where_it_stopped_and_ends_the_same(data, trees, tmp_path, monkeypatch):
     scenes = read_manifest(data)
     options = ExportOptions(layout="psfcn")
-    real, calls = layouts.write_png, []
+    real, calls = layout_base.write_png, []
 
     def failing(path, pixels):
         calls.append(path)
@@ -208,13 +208,13 @@ def test_export_goes_on_where_it_stopped_and_ends_the_same(data, trees, tmp_path
             raise OSError(errno.ENOSPC, "No space left on device")
         real(path, pixels)
 
-    monkeypatch.setattr(layouts, "write_png", failing)
+    monkeypatch.setattr(layout_base, "write_png", failing)
     with pytest.raises(InputError, match=r"cannot be written \(No space left on device\); free space") as caught:
         export(data, tmp_path / "tree", options, scenes)
     assert "\n" not in str(caught.value)
     left = [path for path in (tmp_path / "tree").rglob("*") if ".tmp" in path.name]
     assert left == [] and not (tmp_path / "tree" / "train_mtrl.txt").exists()
-    monkeypatch.setattr(layouts, "write_png", real)
+    monkeypatch.setattr(layout_base, "write_png", real)
     report = export(data, tmp_path / "tree", options, scenes[:2])
     assert (report.written, report.kept) == (1, 1)
     report = export(data, tmp_path / "tree", options, scenes)  # the rest, later
@@ -294,7 +294,7 @@ def test_two_files_of_one_name_in_one_view_stay_apart():
     common = {"seed": 0, "split": "train", "shape": "sphere", "view": View(), "lights": ((0.0, 0.0, 1.0),), "size": 8,
               "spp": 1, "bounces": 0}  # fmt: skip
     scenes = [SceneSpec(id=f"s-{k}", material=f"{folder}/gold.yaml", **common) for k, folder in enumerate("ab")]
-    assert [tuple(place) for place in view_places(scenes).values()] == [("sphere", "gold-1"), ("sphere", "gold-2")]
+    assert list(LAYOUTS["psfcn"].name_folders(scenes).values()) == ["Images/sphere/gold-1", "Images/sphere/gold-2"]
 
 
 @pytest.fixture
@@ -354,7 +354,7 @@ def background(value: int):
         (repaint(f"{SAMPLE}/001.png", lambda p: p.astype(np.uint16) * 257), "16 bits, the others 8"),
         (lambda root: os.truncate(root / SAMPLE / "002.png", 90), "damaged"),
         (repaint(NORMALS, background(0)), "background pixels are not 127 or 128"),
-        (repaint(NORMALS, lambda p: (p // 2) + 64), "are no unit normals"),
+        (repaint(NORMALS, lambda p: (p // 2) + 64), "are not unit normals"),
         (repaint(NORMALS, lambda p: 255 - p), "normals point into the object|the mask differs"),
         (flip_lights, "lights fit the shading better with y negated"),
         (lambda root: [cv2.imwrite(str(path), np.zeros((SIZE, SIZE, 3), np.uint8)) for path in
@@ -375,8 +375,8 @@ def test_the_checker_compares_with_the_shards(tree, data):
     coded[rows[0], columns[0]] = 128
     cv2.imwrite(str(tree / NORMALS), coded)
     assert check_tree(tree, "psfcn").violations == []
-    assert len(check_tree(tree, "psfcn", source=data).violations) == 2  # both materials of the view
-    assert "mask differs" in check_tree(tree, "psfcn", source=data).violations[0]
+    assert len(check_tree(tree, "psfcn", shards=data).violations) == 2  # both materials of the view
+    assert "mask differs" in check_tree(tree, "psfcn", shards=data).violations[0]
 
 
 def test_custom_rules(trees, tmp_path):
@@ -396,11 +396,12 @@ def test_the_command_line(data, tmp_path, capsys):
     assert main(["data", "export", str(data), "--layout", "psfcn", "--out", out, "--check", "--split", "train"]) == 0
     told = capsys.readouterr().out
     assert "2 scenes as psfcn, 2 written now, 0 kept\nclipped: 0.00%" in told and "val_mtrl.txt is empty" in told
-    assert "--check does nothing any more" in told
-    assert check_tree(out, "psfcn", source=data).violations == []
-    capsys.readouterr()
+    assert "2 samples of 5 lights; every rule of its loaders holds" in told
+    (tmp_path / "tree" / "Images" / "blobby-00001-v0" / "blue-fabric" / "001.png").unlink()
+    assert main(["data", "export", out, "--layout", "psfcn", "--check"]) == 1
+    assert "001.png: no such picture" in capsys.readouterr().out
     for arguments, message in (
-        (["--layout", "psfcn"], "required: --out"),
+        (["--layout", "psfcn"], "--out is missing"),
         (["--layout", "psfcn", "--out", out, "--exposure", "loud"], "expected a positive number or 'auto'"),
         (["--layout", "psfn", "--out", out], "did you mean 'psfcn'"),
         (["--layout", "unips", "--out", out], "layout was 'psfcn'"),
