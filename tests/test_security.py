@@ -16,7 +16,7 @@ from data_folders import scene_of, sphere_shard, write_folder
 from pipelines.cli import main
 from pipelines.evaluate.report.sections import Picture, Section, SectionWriter
 from render.exchange.layouts import LAYOUTS
-from render.exchange.layouts.names import legal_name
+from render.exchange.layouts.layout_base import legal_name
 from render.records.ledger import read_runs
 from render.records.manifest import read_failed, read_manifest
 from render.shared.config import parse_yaml

@@ -12,7 +12,7 @@ from render.exchange.samples import ExportOptions
 from render.exchange.tree_check import TreeReport, check_tree
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.mirror import open_folder, select_rendered
-from render.shared.errors import InputError
+from render.shared.errors import InputError, unknown
 
 _SHOWN = 20
 _MARGIN = 15  # pixels; the margin SDPS-Net crops DiLiGenT with
@@ -30,13 +30,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--exposure", default=None, help="factor on radiance (1: white facing its light is full scale) "
                         f"or 'auto', per scene (default: {_list_defaults('exposure')})")  # fmt: skip
     parser.add_argument("--intensities", default="unit", help="'unit', or 'seed': one per image in [0.2, 2), seeded")
+    parser.add_argument("--limit", type=int, default=None, help="only the first so many (of a check: spread evenly)")
+    add_scene_arguments(parser)
+    add_cache_argument(parser)
+
+
+def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare which scenes to write, and whether to check the tree they are written to."""
     parser.add_argument("--ids", nargs="+", default=[], metavar="ID", help="only these scenes")
     parser.add_argument("--split", default=None, choices=("train", "val", "test"), help="only this split")
-    parser.add_argument("--limit", type=int, default=None, help="only the first so many (of a check: spread evenly)")
     parser.add_argument("--skip-missing", action="store_true", help="leave out planned scenes that have no shard yet")
     parser.add_argument("--check", action="store_true", help="check the tree against the rules of its loaders; "
                         "exit code 1 if it breaks one")  # fmt: skip
-    add_cache_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -54,10 +59,9 @@ def main(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace, folder: str, options: ExportOptions) -> int:
     """Export scenes of a folder, say how it went, and check the tree if asked to."""
-    from render.exchange.export import export, select
+    from render.exchange.export import export
 
-    scenes = read_planned(folder, skip_missing=args.skip_missing)
-    chosen = select(scenes, ids=args.ids, split=args.split, limit=args.limit)
+    chosen = select_scenes(folder, args)
     done = export(folder, args.out, options, chosen)
     sys.stdout.write(
         f"{args.out}: {len(done.scenes)} scenes as {args.layout}, {done.written} written now, {done.kept} kept\n"
@@ -95,18 +99,28 @@ def _describe_losses(scenes: Sequence[SceneSpec], layout: str) -> str:
     return "".join(lines)
 
 
-def read_planned(folder: str, *, skip_missing: bool) -> list[SceneSpec]:
-    """Return the scenes of a data folder, with `skip_missing` only those that have a shard.
+def select_scenes(folder: str, args: argparse.Namespace) -> list[SceneSpec]:
+    """Choose scenes of a data folder by the flags of `add_scene_arguments`.
 
     Raises:
-        InputError: no manifest, or none left.
+        InputError: no manifest, an id that is not planned, or no scene left.
     """
     scenes = read_manifest(folder)
-    if skip_missing:
+    if args.skip_missing:
         scenes = select_rendered(folder, scenes)
         if not scenes:
             raise InputError(f"{folder}: no shard yet; render some with `sdps render-data`")
-    return scenes
+    known = {scene.id for scene in scenes}
+    for name in args.ids:
+        if name not in known:
+            raise unknown("scene", name, known)
+    if args.limit is not None and args.limit < 1:
+        raise InputError(f"--limit must be at least 1, got {args.limit}")
+    wanted = set(args.ids) or known
+    chosen = [scene for scene in scenes if scene.id in wanted and args.split in (None, scene.split)]
+    if not chosen:
+        raise InputError(f"no scene of {len(scenes)} is left by --ids and --split; choose others")
+    return chosen[: args.limit]
 
 
 def parse_exposure(text: str | None) -> float | Literal["auto"] | None:

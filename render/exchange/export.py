@@ -16,7 +16,7 @@ from render.exchange.samples import ExportOptions, prepare
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
 from render.records.mirror import select_rendered, shard_path
 from render.records.shards import file_hash, read_shard
-from render.shared.errors import InputError, unknown
+from render.shared.errors import InputError
 from render.shared.files import atomic_folder, write_json
 from render.shared.imaging import mixing
 from render.shared.progress import progress_bar
@@ -49,7 +49,7 @@ def export(folder: str | Path, out: str | Path, options: ExportOptions, scenes: 
         folder: Data folder.
         out: Root of the tree; new, empty, or from an earlier export with the same options.
         options: How.
-        scenes: What, from the folder's manifest (`select`).
+        scenes: What, from the folder's manifest.
 
     Raises:
         InputError: a missing or damaged shard, a foreign or differing tree in `out`, or a full disk. Scenes that were
@@ -79,27 +79,6 @@ def export(folder: str | Path, out: str | Path, options: ExportOptions, scenes: 
     layout.write_lists(root, [(scene, places[scene.id]) for scene in planned if scene.id in found])
     write_json(root / RECORD, record | {"scenes": found})
     return ExportReport(written, len(scenes) - written, found)
-
-
-def select(
-    scenes: Sequence[SceneSpec], *, ids: Sequence[str] = (), split: str | None = None, limit: int | None = None
-) -> list[SceneSpec]:
-    """Choose scenes by id and split, then the first `limit` of them.
-
-    Raises:
-        InputError: an id that is not planned, or nothing left.
-    """
-    known = {scene.id for scene in scenes}
-    for name in ids:
-        if name not in known:
-            raise unknown("scene", name, known)
-    wanted = set(ids) or known
-    chosen = [scene for scene in scenes if scene.id in wanted and split in (None, scene.split)]
-    if limit is not None and limit < 1:
-        raise InputError(f"--limit must be at least 1, got {limit}")
-    if not chosen:
-        raise InputError(f"no scene of {len(scenes)} is left by --ids and --split; choose others")
-    return chosen[:limit]
 
 
 def _check_shards(folder: Path, scenes: Sequence[SceneSpec]) -> None:

@@ -14,8 +14,8 @@ import numpy as np
 
 from render.exchange import frame
 from render.exchange.layouts import LAYOUTS
-from render.exchange.layouts.foreign_samples import Source, Truth, read_record
-from render.exchange.layouts.names import legal_name, unique_names
+from render.exchange.layouts.foreign_samples import Source, read_record, size_text
+from render.exchange.layouts.layout_base import legal_name, unique_names
 from render.records.manifest import MANIFEST, SceneSpec, View, read_manifest, write_manifest
 from render.records.shards import Shard, is_whole, to_half, write_shard
 from render.shared.config import to_plain
@@ -103,7 +103,7 @@ def ingest(tree: str | Path, out: str | Path, options: ImportOptions) -> ImportR
         raise InputError(f"{tree}: no such folder; give the root of a {options.layout} tree")
     sources = [read() for read in LAYOUTS[options.layout].list_samples(tree)[: options.limit]]
     boxes = [crop_box(source.truth().mask, options.crop) for source in sources]
-    scenes = _scenes(sources, boxes, options)
+    scenes = _describe_scenes(sources, boxes, options)
     _claim(out, scenes)
     written = 0
     suspicions = read_record(out / RECORD).get("suspicions", {}) if (out / RECORD).is_file() else {}
@@ -112,7 +112,7 @@ def ingest(tree: str | Path, out: str | Path, options: ImportOptions) -> ImportR
         for source, box, scene in bar:
             if is_whole(out / scene.file, scene):
                 continue
-            shard, found = _shard(source, box, scene, options)
+            shard, found = _read_shard(source, box, scene, options)
             write_shard(out / scene.file, shard)
             written += 1
             if found:
@@ -122,7 +122,7 @@ def ingest(tree: str | Path, out: str | Path, options: ImportOptions) -> ImportR
     return ImportReport(written, len(scenes) - written, scenes, suspicions)
 
 
-def _scenes(sources: Sequence[Source], boxes: Sequence[Box], options: ImportOptions) -> list[SceneSpec]:
+def _describe_scenes(sources: Sequence[Source], boxes: Sequence[Box], options: ImportOptions) -> list[SceneSpec]:
     """Describe each sample as a manifest line; fields only a renderer has are zero."""
     scenes = []
     # `_` parts shape and material.
@@ -153,8 +153,8 @@ def crop_box(mask: np.ndarray, margin: int | None) -> Box:
     return Box(sides[0][0], sides[1][0], sides[0][1], sides[1][1])
 
 
-def _shard(source: Source, box: Box, scene: SceneSpec, options: ImportOptions) -> tuple[Shard, list[str]]:
-    """Read one sample; also tell what looks flipped in it."""
+def _read_shard(source: Source, box: Box, scene: SceneSpec, options: ImportOptions) -> tuple[Shard, list[str]]:
+    """Read one sample; also return what looks flipped in it."""
     truth = source.truth()
     images, bits = source.stack(truth.mask.shape)
     exposure = source.exposure()
@@ -163,20 +163,7 @@ def _shard(source: Source, box: Box, scene: SceneSpec, options: ImportOptions) -
     if options.y_down:
         normals = normals * np.array([1.0, -1.0, 1.0], np.float32)
     found = frame.find_faults(images, normals, mask, scene.light_directions())
-    provenance = _provenance(source, truth, box, scene, options, bits, exposure)
-    shard = Shard(
-        scene_id=scene.id, images=to_half(images), normals=normals, depth=np.zeros(mask.shape, np.float32), mask=mask,
-        coverage=mask.astype(np.float32), light_directions=scene.light_directions(),
-        provenance=provenance | {"frame_check": "; ".join(found) or "passed"},
-    )  # fmt: skip
-    return shard, found
-
-
-def _provenance(
-    source: Source, truth: Truth, box: Box, scene: SceneSpec, options: ImportOptions, bits: int, exposure: float | None
-) -> dict[str, str | int | float]:
-    """Say where the scene comes from and what of it is unknown."""
-    return {
+    provenance: dict[str, str | int | float] = {
         "spec": scene.digest(),
         "shape": scene.shape,
         "material": scene.material,
@@ -189,8 +176,14 @@ def _provenance(
         "normals": truth.origin.name,
         "depth": "unknown, zeros",
         "coverage": "unknown, the mask",
-        "crop": f"top {box.top}, left {box.left}, of {truth.mask.shape[0]}x{truth.mask.shape[1]}",
+        "crop": f"top {box.top}, left {box.left}, of {size_text(truth.mask.shape)}",
+        "frame_check": "; ".join(found) or "passed",
     }
+    shard = Shard(
+        scene_id=scene.id, images=to_half(images), normals=normals, depth=np.zeros(mask.shape, np.float32), mask=mask,
+        coverage=mask.astype(np.float32), light_directions=scene.light_directions(), provenance=provenance,
+    )  # fmt: skip
+    return shard, found
 
 
 def _claim(out: Path, scenes: Sequence[SceneSpec]) -> None:

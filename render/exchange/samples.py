@@ -52,10 +52,9 @@ class ExportOptions:
         if self.bits is not None and self.bits not in layout.bits:
             allowed = " or ".join(map(str, layout.bits))
             raise InputError(f"bits must be {allowed} for layout {self.layout}, got {self.bits}")
-        if isinstance(self.exposure, str) and self.exposure != "auto":
+        number = isinstance(self.exposure, int | float) and 0 < self.exposure < float("inf")
+        if not number and self.exposure not in ("auto", None):
             raise InputError(f"exposure must be a positive number or 'auto', got {self.exposure!r}")
-        if isinstance(self.exposure, int | float) and not 0 < self.exposure < float("inf"):
-            raise InputError(f"exposure must be a positive number or 'auto', got {self.exposure}")
         if self.intensities not in ("unit", "seed"):
             raise unknown("value for intensities:", str(self.intensities), ("unit", "seed"))
         if self.intensities != "unit" and not layout.intensities:
@@ -87,7 +86,7 @@ def prepare(shard: Shard, scene: SceneSpec, options: ExportOptions) -> tuple[Sam
         The sample; its exposure, the share of the object's values that clip, and of its positive ones that round to 0;
         where light is mixed, what each image's light is made of.
     """
-    settings = options.settings()
+    bits, exposure = (options.settings()[name] for name in ("bits", "exposure"))
     radiance, directions, facts = _relight(shard, scene, options)
     count = len(radiance)
     intensities = np.ones(count)
@@ -95,24 +94,15 @@ def prepare(shard: Shard, scene: SceneSpec, options: ExportOptions) -> tuple[Sam
         intensities = generator(scene.seed, "export", scene.id, "intensities").uniform(*INTENSITY_RANGE, count).round(6)
     values = radiance.astype(np.float32) * intensities[:, None, None, None].astype(np.float32)
     inside = values[:, shard.mask]
-    exposure = settings["exposure"]
     if exposure == "auto":
-        level = (
-            float(np.quantile(inside, 1.0 - _AUTO_CLIPPED[settings["bits"]], method="higher")) if inside.size else 0.0
-        )
+        level = float(np.quantile(inside, 1.0 - _AUTO_CLIPPED[bits], method="higher")) if inside.size else 0.0
         exposure = float(f"{1.0 / level:.6g}") if level > 0 else 1.0
-    step = 0.5 / (2 ** settings["bits"] - 1)  # what rounds to full scale, or to the first code, is not lost
+    step = 0.5 / (2**bits - 1)  # what rounds to full scale, or to the first code, is not lost
     exposed = inside * np.float32(exposure)
     clipped, black = (
         float(lost.mean()) if lost.size else 0.0 for lost in (exposed > 1.0 + step, exposed[inside > 0] < step)
     )
-    sample = Sample(
-        pixels=quantise(values * np.float32(exposure), settings["bits"]),
-        normals=shard.normals,
-        mask=shard.mask,
-        directions=directions,
-        intensities=intensities,
-    )
+    sample = Sample(quantise(values * np.float32(exposure), bits), shard.normals, shard.mask, directions, intensities)
     return sample, {"exposure": exposure, "clipped": round(clipped, 6), "black": round(black, 6)} | facts
 
 

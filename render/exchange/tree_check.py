@@ -96,9 +96,6 @@ def _check_sample(source: Source, layout: Layout, note: Note) -> Truth:
     truth = source.truth()
     images, bits = source.stack(truth.mask.shape)
     layout.check_sample(source, truth, bits, note)
-    if not truth.mask.any():
-        note(f"{source.folder}: the mask is empty; mark the object")
-        return truth
     if not images[:, truth.mask].any():
         note(f"{source.folder}: all images are black on the object; raise --exposure")
     if len(source.directions) and truth.normals.any():

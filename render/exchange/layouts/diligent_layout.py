@@ -13,7 +13,6 @@ from render.exchange.layouts.foreign_samples import (
     Note,
     Source,
     Truth,
-    check_size,
     make_source,
     make_truth,
     read_lights,
@@ -137,7 +136,6 @@ def _read_truth(folder: Path) -> Truth:
         normals = _read_text_normals(origin, mask.shape)
     else:
         normals = _read_mat(origin)
-    check_size(folder / "mask.png", mask, origin, normals)
     return make_truth(normals, mask, origin)
 
 

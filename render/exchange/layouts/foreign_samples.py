@@ -32,7 +32,6 @@ class Source:
     """One sample of a foreign tree, its pixels still on disk.
 
     Attributes:
-        name: Short name, unique in the tree.
         shape: Name of the object (and view).
         material: Name of the material, or of the object where the layout knows no material.
         split: `train`, `val` or `test`.
@@ -44,7 +43,6 @@ class Source:
         truth: Reads normals and mask.
     """
 
-    name: str
     shape: str
     material: str
     split: str = "test"
@@ -101,7 +99,7 @@ def make_source(
     name = folder.name.removesuffix(suffix) or folder.name
     directions, intensities = lights
     return Source(
-        name=name, shape=name, material=name, folder=folder, where=folder.name, images=images, directions=directions,
+        shape=name, material=name, folder=folder, where=folder.name, images=images, directions=directions,
         intensities=intensities, truth=truth,
     )  # fmt: skip
 
@@ -139,9 +137,12 @@ def read_lights(folder: Path, count: int, *, optional: bool = False) -> tuple[np
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Read a picture as a mask (H, W) bool: above half brightness."""
+    """Read a picture as a mask (H, W) bool: above half brightness, but not empty."""
     pixels = read_image(path, channels=None)
-    return pixels > np.iinfo(pixels.dtype).max // 2
+    mask: np.ndarray = pixels > np.iinfo(pixels.dtype).max // 2
+    if not mask.any():
+        raise InputError(f"{path}: the mask is empty; mark the object")
+    return mask
 
 
 def read_painted_truth(folder: Path, normals_name: str) -> Truth:
@@ -153,25 +154,24 @@ def read_painted_truth(folder: Path, normals_name: str) -> Truth:
     mask, path = read_mask(folder / "mask.png"), folder / normals_name
     if not path.is_file():
         return Truth(np.zeros((*mask.shape, 3), np.float32), mask, folder / "mask.png")
-    normals, found = decode_normals(read_image(path))
-    check_size(folder / "mask.png", mask, path, normals)
-    lacking = int((mask & ~found).sum())
+    truth = make_truth(decode_normals(read_image(path))[0], mask, path)
+    lacking = int((mask & ~truth.mask).sum())
     if lacking:
         raise InputError(f"{path}: {lacking} pixels of mask.png have no normal; shrink it")
-    return Truth(normals, mask, path)
-
-
-def check_size(mask_path: Path, mask: np.ndarray, path: Path, normals: np.ndarray) -> None:
-    """Raise InputError where a mask and normals differ in size."""
-    if normals.shape[:2] != mask.shape:
-        raise InputError(
-            f"{mask_path}: is {size_text(mask.shape)}, {path.name} is {size_text(normals.shape)} (height x width); "
-            "give both one size"
-        )
+    return truth
 
 
 def make_truth(normals: np.ndarray, mask: np.ndarray, origin: Path) -> Truth:
-    """Bring normals to unit length; what has none leaves the mask."""
+    """Bring normals to unit length; what has none leaves the mask.
+
+    Raises:
+        InputError: a mask of another size, or without a normal in it.
+    """
+    if normals.shape[:2] != mask.shape:
+        raise InputError(
+            f"{origin.parent / 'mask.png'}: is {size_text(mask.shape)}, {origin.name} is {size_text(normals.shape)} "
+            "(height x width); give both one size"
+        )
     length = np.linalg.norm(np.nan_to_num(normals), axis=-1)
     mask = mask & np.isfinite(normals).all(-1) & (length > 0.1)
     if not mask.any():

@@ -3,6 +3,8 @@
 A layout is a class below `Layout` in a module of its own, and a line of `render.exchange.layouts.LAYOUTS`.
 """
 
+import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from render.exchange.layouts.foreign_samples import Note, Source, Truth
-from render.exchange.layouts.names import legal_name, unique_names
 from render.records.manifest import SceneSpec
 from render.shared.images import encode_normals, write_png
 from render.shared.tables import format_rows, lines_text
+
+_LONGEST = 80
+_MATERIAL_FILES = r"\.(ya?ml|binary|bsdf)(?=\+|$)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +113,31 @@ class Layout:
 
     def check_sample(self, source: Source, truth: Truth, bits: int, note: Note) -> None:
         """Note what loaders would misread in the files of one sample, whose images have `bits` per channel."""
+
+
+def legal_name(name: str) -> str:
+    """Turn a scene id, shape or material name into a file name; of paths only the stem of the file is kept.
+
+    What is left, ASCII letters, digits and hyphens, has no separator, comment or blank, sorts alike in every natural
+    order, and stays apart on file systems that ignore case (`unique_names`).
+    """
+    stem = re.sub(_MATERIAL_FILES, "", re.sub(r"[^:+]*[/\\]", "", name))
+    return re.sub(r"[^A-Za-z0-9]+", "-", stem).strip("-")[:_LONGEST].strip("-") or "unnamed"
+
+
+def unique_names(names: Sequence[str]) -> list[str]:
+    """Number those names that are equal but for case: `a`, `b`, `A` becomes `a-1`, `b`, `A-2`."""
+    counts = Counter(name.casefold() for name in names)
+    taken = {name for name, count in counts.items() if count == 1}
+    result = []
+    for name in names:
+        chosen, number = name, 0
+        while counts[name.casefold()] > 1 and (number == 0 or chosen.casefold() in taken):
+            number += 1
+            chosen = f"{name}-{number}"
+        taken.add(chosen.casefold())
+        result.append(chosen)
+    return result
 
 
 def image_names(count: int, pattern: str = "{:03d}.png", first: int = 0) -> list[str]:

@@ -8,20 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from render.exchange.layouts.foreign_samples import Note, Source, Truth, make_truth, refuse_several
-from render.exchange.layouts.layout_base import Layout, Sample, image_names, write_lines
-from render.exchange.layouts.names import legal_name, unique_names
+from render.exchange.layouts.layout_base import Layout, Sample, image_names, legal_name, unique_names, write_lines
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, read_text, write_text
-from render.shared.images import (
-    MASK_THRESHOLD,
-    bit_depth,
-    decode_normals,
-    encode_normals,
-    read_image,
-    to_unit,
-    write_png,
-)
+from render.shared.images import MASK_THRESHOLD, decode_normals, encode_normals, read_image, to_unit, write_png
 from render.shared.tables import format_rows, lines_text, read_light_list, read_names
 
 _SPLITS = ("train", "val", "test")
@@ -88,9 +79,9 @@ class PsFcn(Layout):
                 write_text(root / f"{split}_mtrl.txt", lines_text(lines))
 
     def describe_gaps(self, splits: set[str]) -> str:
-        return (
-            "" if "val" in splits else "val_mtrl.txt is empty; export scenes of split 'val' too before training on it"
-        )
+        if "val" in splits:
+            return ""
+        return "val_mtrl.txt is empty; export scenes of split 'val' too before training on it"
 
     def list_samples(self, tree: Path) -> Sequence[Callable[[], Source]]:
         lists = {split: tree / f"{split}_mtrl.txt" for split in _SPLITS}
@@ -114,7 +105,7 @@ class PsFcn(Layout):
     def check_sample(self, source: Source, truth: Truth, bits: int, note: Note) -> None:
         """Check the depths, and that |n|^2 > 0.01 is the mask and keeps vectors of unit length."""
         path, coded = truth.origin, read_image(truth.origin)
-        if bit_depth(coded) != 8:
+        if coded.dtype != np.uint8:
             note(f"{path}: has 16 bits, the loaders divide by 255; save it with 8")
         if bits != 8:
             note(f"{source.folder}: images have 16 bits, the loaders divide by 255; save them with 8")
@@ -150,7 +141,7 @@ def _read_sample(tree: Path, entry: str, split: str, seen: dict[str, str]) -> So
     names, directions = read_light_list(folder / f"{shape}_{material}.txt")
     normals = tree / "Images" / shape / f"{shape}_normal.png"  # its background gives the mask
     return Source(
-        name=f"{shape}_{material}", shape=shape, material=material, split=split, folder=folder,
-        where=f"Images/{entry}", images=names, directions=directions, intensities=np.ones_like(directions),
+        shape=shape, material=material, split=split, folder=folder, where=f"Images/{entry}", images=names,
+        directions=directions, intensities=np.ones_like(directions),
         truth=lambda: make_truth(*decode_normals(read_image(normals)), normals),
     )  # fmt: skip

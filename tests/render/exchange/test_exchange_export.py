@@ -17,11 +17,9 @@ from exchange_support import LIGHTS, SCENES, SIZE, write_folder
 from PIL import Image
 from scipy.io import loadmat
 
-from pipelines.cli import main
-from render.exchange.export import export, select
+from render.exchange.export import export
 from render.exchange.layouts import LAYOUTS, layout_base
-from render.exchange.layouts.layout_base import image_names
-from render.exchange.layouts.names import legal_name, unique_names
+from render.exchange.layouts.layout_base import image_names, legal_name, unique_names
 from render.exchange.samples import ExportOptions
 from render.exchange.tree_check import check_tree
 from render.records.manifest import SceneSpec, View, read_manifest
@@ -268,16 +266,6 @@ def test_bad_options(options, message):
         ExportOptions(**options)
 
 
-def test_selection(data):
-    scenes = read_manifest(data)
-    assert [scene.id for scene in select(scenes, split="train", limit=1)] == ["blobby-00001-v0-m0"]
-    assert [scene.id for scene in select(scenes, ids=["sphere-gold"])] == ["sphere-gold"]
-    with pytest.raises(InputError, match="unknown scene 'sphere-golt'; did you mean 'sphere-gold'"):
-        select(scenes, ids=["sphere-golt"])
-    with pytest.raises(InputError, match="no scene of 4 is left"):
-        select(scenes, ids=["sphere-gold"], split="train")
-
-
 def test_names_are_legal_and_unique():
     assert legal_name("stripes:7:/data/merl/chrome.binary+fits/blue fabric.yaml") == "stripes-7-chrome-blue-fabric"
     assert legal_name("lambertian:0.5") == "lambertian-0-5" and legal_name("#/石") == "unnamed"
@@ -389,34 +377,3 @@ def test_custom_rules(trees, tmp_path):
     (folder / "light_intensities.txt").unlink()
     (folder / "names.txt").write_text("".join(f"{name}\n" for name in reversed(image_names(LIGHTS))))
     assert any("not in natural order" in line for line in check_tree(tmp_path / "tree", "custom").violations)
-
-
-def test_the_command_line(data, tmp_path, capsys):
-    out = str(tmp_path / "tree")
-    assert main(["data", "export", str(data), "--layout", "psfcn", "--out", out, "--check", "--split", "train"]) == 0
-    told = capsys.readouterr().out
-    assert "2 scenes as psfcn, 2 written now, 0 kept\nclipped: 0.00%" in told and "val_mtrl.txt is empty" in told
-    assert "2 samples of 5 lights; every rule of its loaders holds" in told
-    (tmp_path / "tree" / "Images" / "blobby-00001-v0" / "blue-fabric" / "001.png").unlink()
-    assert main(["data", "export", out, "--layout", "psfcn", "--check"]) == 1
-    assert "001.png: no such picture" in capsys.readouterr().out
-    for arguments, message in (
-        (["--layout", "psfcn"], "--out is missing"),
-        (["--layout", "psfcn", "--out", out, "--exposure", "loud"], "expected a positive number or 'auto'"),
-        (["--layout", "psfn", "--out", out], "did you mean 'psfcn'"),
-        (["--layout", "unips", "--out", out], "layout was 'psfcn'"),
-    ):
-        assert main(["data", "export", str(data), *arguments]) == 2
-        error = capsys.readouterr().err
-        assert message in error and error.strip().count("\n") == 0
-
-
-def test_missing_shards(data, tmp_path, capsys):
-    folder = tmp_path / "data"
-    shutil.copytree(data, folder)
-    (folder / "shards" / "sphere-gold.exr").unlink()
-    command = ["data", "export", str(folder), "--layout", "unips", "--out", str(tmp_path / "tree")]
-    assert main(command) == 2
-    assert "1 of 4 shards are missing, the first is 'sphere-gold'" in capsys.readouterr().err
-    assert main([*command, "--skip-missing"]) == 0
-    assert "3 scenes as unips" in capsys.readouterr().out
