@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Literal
 
 from pipelines.shared.flags import add_cache_argument
+from render.exchange.export import ExportOptions, export
 from render.exchange.ingest import IMPORTABLE, ImportOptions, ingest
 from render.exchange.layouts import LAYOUTS
-from render.exchange.samples import ExportOptions
 from render.exchange.tree_check import TreeReport, check_tree
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.mirror import open_folder, select_rendered
@@ -59,8 +59,6 @@ def main(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace, folder: str, options: ExportOptions) -> int:
     """Export scenes of a folder, say how it went, and check the tree if asked to."""
-    from render.exchange.export import export
-
     chosen = select_scenes(folder, args)
     done = export(folder, args.out, options, chosen)
     sys.stdout.write(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pipelines.data.exchange import add_scene_arguments, parse_exposure, report_check, select_scenes
 from pipelines.shared.flags import add_fields, from_flags
-from render.exchange.samples import ExportOptions
+from render.exchange.export import ExportOptions, export
 from render.exchange.tree_check import check_tree
 from render.shared.errors import InputError
 from render.shared.imaging import environments, mixing
@@ -34,8 +34,6 @@ def main(args: argparse.Namespace) -> int:
         layout=args.layout, bits=args.bits, exposure=parse_exposure(args.exposure), mixed=mixed, images=args.images,
         seed=args.seed,
     )  # fmt: skip
-    from render.exchange.export import export
-
     chosen = select_scenes(args.folder, args)
     if Path(args.out).resolve() == Path(args.folder).resolve():
         raise InputError(f"--out {args.out}: is the data folder itself; choose another")

@@ -71,10 +71,8 @@ class Box(NamedTuple):
         """Cut the box out of the rows and columns at `axis` and `axis + 1`."""
         rows, columns = slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
         part = array[(slice(None),) * axis + (rows, columns)]
-        pad = [(0, 0)] * array.ndim
-        pad[axis] = (0, self.height - part.shape[axis])
-        pad[axis + 1] = (0, self.width - part.shape[axis + 1])
-        return np.pad(part, pad)
+        pad = {axis: (0, self.height - part.shape[axis]), axis + 1: (0, self.width - part.shape[axis + 1])}
+        return np.pad(part, [pad.get(number, (0, 0)) for number in range(array.ndim)])
 
 
 @dataclass(frozen=True)

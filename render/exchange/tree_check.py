@@ -50,6 +50,8 @@ def check_tree(
     """
     if layout_name not in LAYOUTS:
         raise unknown("layout", layout_name, LAYOUTS)
+    if limit is not None and limit < 1:
+        raise InputError(f"limit must be at least 1, got {limit}")
     root, layout, report = Path(tree), LAYOUTS[layout_name], TreeReport()
     if not root.is_dir():
         raise InputError(f"{root}: no such folder; give the root of a {layout_name} tree")

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from render.exchange.layouts.foreign_samples import Note, Source, Truth, make_source, read_lights, read_painted_truth
+from render.exchange.layouts.foreign_samples import Note, Source, Truth, read_lights, read_painted_truth
 from render.exchange.layouts.layout_base import Layout, Sample, image_names, write_lines
 from render.records.manifest import SceneSpec
 from render.shared.files import write_text
@@ -42,4 +42,4 @@ def _read_object(folder: Path) -> Source:
     """Read the text files of one object."""
     names = read_names(folder / "names.txt")
     lights = read_lights(folder, len(names), optional=True)
-    return make_source(folder, "", names, lights, lambda: read_painted_truth(folder, "normal.png"))
+    return Source.of_object(folder, "", names, lights, lambda: read_painted_truth(folder, "normal.png"))

@@ -9,17 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat, savemat, whosmat
 
-from render.exchange.layouts.foreign_samples import (
-    Note,
-    Source,
-    Truth,
-    make_source,
-    make_truth,
-    read_lights,
-    read_mask,
-    refuse_several,
-    size_text,
-)
+from render.exchange.layouts.foreign_samples import Note, Source, Truth, read_lights, read_mask, refuse_several
 from render.exchange.layouts.layout_base import Layout, Sample, image_names, write_lines
 from render.records.manifest import SceneSpec
 from render.shared.decoding import check_unpacked, decoding
@@ -117,7 +107,7 @@ def _read_object(folder: Path) -> Source:
         names = sorted((path.name for path in folder.glob("[0-9]*.png")), key=natural_key)
     if not names:
         raise InputError(f"{folder}: no filenames.txt and no 001.png, 002.png, ...; give one image per light")
-    return make_source(folder, "PNG", names, read_lights(folder, len(names)), partial(_read_truth, folder))
+    return Source.of_object(folder, "PNG", names, read_lights(folder, len(names)), partial(_read_truth, folder))
 
 
 def _read_truth(folder: Path) -> Truth:
@@ -133,19 +123,19 @@ def _read_truth(folder: Path) -> Truth:
     if origin.suffix == ".png":
         normals = decode_normals(read_image(origin))[0]
     elif origin.suffix == ".txt":
-        normals = _read_text_normals(origin, mask.shape)
+        normals = _read_text_normals(origin, *mask.shape)
     else:
         normals = _read_mat(origin)
-    return make_truth(normals, mask, origin)
+    return Truth.of(normals, mask, origin)
 
 
-def _read_text_normals(path: Path, size: tuple[int, ...]) -> np.ndarray:
+def _read_text_normals(path: Path, height: int, width: int) -> np.ndarray:
     """Read one normal per pixel."""
     numbers = np.array(read_text(path).split())
-    if numbers.size != math.prod(size) * 3:
-        raise InputError(f"{path}: {numbers.size} numbers for a mask of {size_text(size)}; give 3 per pixel")
+    if numbers.size != height * width * 3:
+        raise InputError(f"{path}: {numbers.size} numbers for a mask of {height}x{width}; give 3 per pixel")
     try:
-        return numbers.astype(np.float64).reshape(*size, 3)
+        return numbers.astype(np.float64).reshape(height, width, 3)
     except ValueError as error:
         raise InputError(f"{path}: holds something that is not a number ({error}); restore the file") from error
 

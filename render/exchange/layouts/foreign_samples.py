@@ -14,9 +14,7 @@ from render.shared.images import bit_depth, decode_normals, read_image, to_unit
 from render.shared.tables import check_directions, line_of_row, read_numbers
 
 Note = Callable[[str], None]
-
-MARKER = "scene.json"
-"""What our own export leaves in the folder of a scene."""
+MARKER = "scene.json"  # what our own export leaves in the folder of a scene
 
 
 class Truth(NamedTuple):
@@ -25,6 +23,25 @@ class Truth(NamedTuple):
     normals: np.ndarray
     mask: np.ndarray
     origin: Path
+
+    @classmethod
+    def of(cls, normals: np.ndarray, mask: np.ndarray, origin: Path) -> "Truth":
+        """Bring normals to unit length; what has none leaves the mask.
+
+        Raises:
+            InputError: a mask of another size, or without a normal in it.
+        """
+        if normals.shape[:2] != mask.shape:
+            raise InputError(
+                f"{origin.parent / 'mask.png'}: is {size_text(mask.shape)}, {origin.name} is "
+                f"{size_text(normals.shape)} (height x width); give both one size"
+            )
+        length = np.linalg.norm(np.nan_to_num(normals), axis=-1)
+        mask = mask & np.isfinite(normals).all(-1) & (length > 0.1)
+        if not mask.any():
+            raise InputError(f"{origin}: no pixel with a normal inside the mask; give another normal map or mask")
+        unit = np.where(mask[..., None], np.nan_to_num(normals) / np.maximum(length, 1e-6)[..., None], 0.0)
+        return cls(unit.astype(np.float32), mask, origin)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,6 +69,18 @@ class Source:
     directions: np.ndarray
     intensities: np.ndarray
     truth: Callable[[], Truth] = field(repr=False)
+
+    @classmethod
+    def of_object(
+        cls, folder: Path, suffix: str, images: Sequence[str], lights: tuple[np.ndarray, np.ndarray],
+        truth: Callable[[], Truth],
+    ) -> "Source":  # fmt: skip
+        """Describe the sample of a layout with a folder per object, called by the object's name and a suffix."""
+        name = folder.name.removesuffix(suffix) or folder.name
+        return cls(
+            shape=name, material=name, folder=folder, where=folder.name, images=images, directions=lights[0],
+            intensities=lights[1], truth=truth,
+        )  # fmt: skip
 
     def exposure(self) -> float | None:
         """Return the exposure our own export recorded next to the images, None in trees of others."""
@@ -90,18 +119,6 @@ class Source:
         for path in [*(self.folder / name for name in self.images), self.truth().origin]:
             digest.update(path.read_bytes())
         return digest.hexdigest()
-
-
-def make_source(
-    folder: Path, suffix: str, images: Sequence[str], lights: tuple[np.ndarray, np.ndarray], truth: Callable[[], Truth]
-) -> Source:
-    """Describe the sample of a layout with one folder per object, named after the object and with a suffix."""
-    name = folder.name.removesuffix(suffix) or folder.name
-    directions, intensities = lights
-    return Source(
-        shape=name, material=name, folder=folder, where=folder.name, images=images, directions=directions,
-        intensities=intensities, truth=truth,
-    )  # fmt: skip
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -154,40 +171,18 @@ def read_painted_truth(folder: Path, normals_name: str) -> Truth:
     mask, path = read_mask(folder / "mask.png"), folder / normals_name
     if not path.is_file():
         return Truth(np.zeros((*mask.shape, 3), np.float32), mask, folder / "mask.png")
-    truth = make_truth(decode_normals(read_image(path))[0], mask, path)
+    truth = Truth.of(decode_normals(read_image(path))[0], mask, path)
     lacking = int((mask & ~truth.mask).sum())
     if lacking:
         raise InputError(f"{path}: {lacking} pixels of mask.png have no normal; shrink it")
     return truth
 
 
-def make_truth(normals: np.ndarray, mask: np.ndarray, origin: Path) -> Truth:
-    """Bring normals to unit length; what has none leaves the mask.
-
-    Raises:
-        InputError: a mask of another size, or without a normal in it.
-    """
-    if normals.shape[:2] != mask.shape:
-        raise InputError(
-            f"{origin.parent / 'mask.png'}: is {size_text(mask.shape)}, {origin.name} is {size_text(normals.shape)} "
-            "(height x width); give both one size"
-        )
-    length = np.linalg.norm(np.nan_to_num(normals), axis=-1)
-    mask = mask & np.isfinite(normals).all(-1) & (length > 0.1)
-    if not mask.any():
-        raise InputError(f"{origin}: no pixel with a normal inside the mask; give another normal map or mask")
-    unit = np.where(mask[..., None], np.nan_to_num(normals) / np.maximum(length, 1e-6)[..., None], 0.0)
-    return Truth(unit.astype(np.float32), mask, origin)
-
-
 def refuse_several(root: Path, pattern: str, up: int) -> None:
     """Name the trees below `root` when there are any."""
     below = sorted({path.parents[up - 1].name for path in root.glob(pattern)})
     if below:
-        which = f"{len(below)} trees" if len(below) > 1 else "a tree"
-        raise InputError(
-            f"{root}: holds {which} ({', '.join(below[:4])}); import one tree at a time, by its own folder"
-        )
+        raise InputError(f"{root}: give one tree itself, not the folder above (which holds {', '.join(below[:4])})")
 
 
 def size_text(shape: tuple[int, ...]) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from render.exchange.layouts.foreign_samples import Note, Source, Truth, make_truth, refuse_several
+from render.exchange.layouts.foreign_samples import Note, Source, Truth, refuse_several
 from render.exchange.layouts.layout_base import Layout, Sample, image_names, legal_name, unique_names, write_lines
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
@@ -143,5 +143,5 @@ def _read_sample(tree: Path, entry: str, split: str, seen: dict[str, str]) -> So
     return Source(
         shape=shape, material=material, split=split, folder=folder, where=f"Images/{entry}", images=names,
         directions=directions, intensities=np.ones_like(directions),
-        truth=lambda: make_truth(*decode_normals(read_image(normals)), normals),
+        truth=lambda: Truth.of(*decode_normals(read_image(normals)), normals),
     )  # fmt: skip

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from render.exchange.layouts.foreign_samples import MARKER, Source, make_source, read_painted_truth, read_record
+from render.exchange.layouts.foreign_samples import MARKER, Source, read_painted_truth, read_record
 from render.exchange.layouts.layout_base import Layout, Sample, image_names
 from render.shared.errors import InputError
 from render.shared.tables import natural_key
@@ -43,4 +43,4 @@ def _read_object(folder: Path) -> Source:
         if names != sorted(names, key=natural_key) or len(directions) != len(names):
             raise InputError(f"{folder}: L*.png do not match the lights of {MARKER}; export the object again")
     truth = partial(read_painted_truth, folder, "Normal_gt.png")
-    return make_source(folder, ".data", names, (directions, intensities), truth)
+    return Source.of_object(folder, ".data", names, (directions, intensities), truth)

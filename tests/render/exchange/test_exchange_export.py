@@ -17,10 +17,9 @@ from exchange_support import LIGHTS, SCENES, SIZE, write_folder
 from PIL import Image
 from scipy.io import loadmat
 
-from render.exchange.export import export
+from render.exchange.export import ExportOptions, export
 from render.exchange.layouts import LAYOUTS, layout_base
 from render.exchange.layouts.layout_base import image_names, legal_name, unique_names
-from render.exchange.samples import ExportOptions
 from render.exchange.tree_check import check_tree
 from render.records.manifest import SceneSpec, View, read_manifest
 from render.records.shards import read_shard
