@@ -1,11 +1,10 @@
-"""Exported trees: what the loaders of each layout get from them, names, exposure, resuming, and the rule checker.
+"""Exported trees: what the loaders of each layout get from them, names, exposure and resuming.
 
 The readers here follow the description of each loader (docs/reference/formats.md), not the package's own.
 """
 
 import errno
 import json
-import os
 import re
 import shutil
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from exchange_support import LIGHTS, SCENES, SIZE, write_folder
+from exchange_support import LIGHTS, SCENES, SIZE
 from PIL import Image
 from scipy.io import loadmat
 
@@ -25,22 +24,6 @@ from render.records.manifest import SceneSpec, View, read_manifest
 from render.records.shards import read_shard
 from render.shared.errors import InputError
 from render.shared.tables import natural_key
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data")
-    write_folder(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def trees(data, tmp_path_factory) -> dict[str, Path]:
-    """Return a tree of every layout with the default options, read-only by convention."""
-    root = tmp_path_factory.mktemp("trees")
-    for layout in LAYOUTS:
-        export(data, root / layout, ExportOptions(layout=layout), read_manifest(data))
-    return {layout: root / layout for layout in LAYOUTS}
 
 
 def shard(data: Path, name: str):
@@ -282,97 +265,3 @@ def test_two_files_of_one_name_in_one_view_stay_apart():
               "spp": 1, "bounces": 0}  # fmt: skip
     scenes = [SceneSpec(id=f"s-{k}", material=f"{folder}/gold.yaml", **common) for k, folder in enumerate("ab")]
     assert list(LAYOUTS["psfcn"].name_folders(scenes).values()) == ["Images/sphere/gold-1", "Images/sphere/gold-2"]
-
-
-@pytest.fixture
-def tree(trees, tmp_path) -> Path:
-    shutil.copytree(trees["psfcn"], tmp_path / "tree")
-    return tmp_path / "tree"
-
-
-SAMPLE = "Images/blobby-00001-v0/blue-fabric"
-LIST = f"{SAMPLE}/blobby-00001-v0_blue-fabric.txt"
-NORMALS = "Images/blobby-00001-v0/blobby-00001-v0_normal.png"
-
-
-def replace(path: str, old: str, new: str):
-    def change(root: Path) -> None:
-        text = (root / path).read_text()
-        assert old in text
-        (root / path).write_text(text.replace(old, new, 1))
-
-    return change
-
-
-def repaint(path: str, edit, flags: int = cv2.IMREAD_UNCHANGED):
-    return lambda root: cv2.imwrite(str(root / path), edit(cv2.imread(str(root / path), flags)))
-
-
-def flip_lights(root: Path) -> None:
-    rows = [line.split(" ") for line in lines(root / LIST)]
-    (root / LIST).write_text("".join(f"{a} {x} {-float(y)} {z}\n" for a, x, y, z in rows))
-
-
-def background(value: int):
-    def edit(pixels: np.ndarray) -> np.ndarray:
-        pixels[0, 0] = value
-        return pixels
-
-    return edit
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (replace(LIST, "000.png ", "000#.png "), "has a '#', which loaders take for a comment"),
-        (replace(LIST, "000.png ", "000.png  "), "with single spaces"),
-        (replace(LIST, "000.png ", "000.png\t"), "with single spaces"),
-        (replace(LIST, "\n", " 1.0\n"), "lines have from 4 to 5 fields"),
-        (replace(LIST, "000.png", "001.png"), "an image is listed twice"),
-        (replace(LIST, "000.png 0.", "000.png 3."), "light 1 has length"),
-        (replace(LIST, "000.png 0.", "000.png x."), "are not numbers"),
-        (replace(LIST, "000.png", "missing.png"), "missing.png: no such picture"),
-        (replace("train_mtrl.txt", "/blue", "/deep/blue"), "with exactly one '/'"),
-        (replace("train_mtrl.txt", "/blue", "/b#ue"), "has a '#'"),
-        (replace("val_mtrl.txt", "v1/lambertian-0-5", "v0/blue-fabric"), "keep it in one list"),
-        (lambda root: (root / "val_mtrl.txt").unlink(), "val_mtrl.txt: missing; training opens both lists"),
-        (repaint(f"{SAMPLE}/001.png", lambda p: p, cv2.IMREAD_GRAYSCALE), "1 channel"),
-        (repaint(f"{SAMPLE}/001.png", lambda p: p[:-1]), "one size"),
-        (repaint(f"{SAMPLE}/001.png", lambda p: p.astype(np.uint16) * 257), "16 bits, the others 8"),
-        (lambda root: os.truncate(root / SAMPLE / "002.png", 90), "damaged"),
-        (repaint(NORMALS, background(0)), "background pixels are not 127 or 128"),
-        (repaint(NORMALS, lambda p: (p // 2) + 64), "are not unit normals"),
-        (repaint(NORMALS, lambda p: 255 - p), "normals point into the object|the mask differs"),
-        (flip_lights, "lights fit the shading better with y negated"),
-        (lambda root: [cv2.imwrite(str(path), np.zeros((SIZE, SIZE, 3), np.uint8)) for path in
-                       (root / SAMPLE).glob("*.png")], "all images are black"),
-    ],
-)  # fmt: skip
-def test_the_checker_names_what_is_broken(tree, damage, message, capfd):
-    damage(tree)
-    report = check_tree(tree, "psfcn")
-    assert report.violations and any(re.search(message, line) for line in report.violations), report.violations
-    assert all("\n" not in line and line.startswith(str(tree)) for line in report.violations)
-    assert "libpng" not in capfd.readouterr().err
-
-
-def test_the_checker_compares_with_the_shards(tree, data):
-    coded = cv2.imread(str(tree / NORMALS), cv2.IMREAD_UNCHANGED)
-    rows, columns = np.nonzero((coded != 128).any(-1))
-    coded[rows[0], columns[0]] = 128
-    cv2.imwrite(str(tree / NORMALS), coded)
-    assert check_tree(tree, "psfcn").violations == []
-    assert len(check_tree(tree, "psfcn", shards=data).violations) == 2  # both materials of the view
-    assert "mask differs" in check_tree(tree, "psfcn", shards=data).violations[0]
-
-
-def test_custom_rules(trees, tmp_path):
-    shutil.copytree(trees["custom"], tmp_path / "tree")
-    folder = tmp_path / "tree" / "sphere-gold"
-    (folder / "light_intensities.txt").write_text("1\n" * LIGHTS)
-    assert "1 column(s) where 3 are needed" in check_tree(tmp_path / "tree", "custom").violations[0]
-    (folder / "light_intensities.txt").write_text("1 1 1\n" * (LIGHTS - 1))
-    assert f"{LIGHTS - 1} rows for {LIGHTS} images" in check_tree(tmp_path / "tree", "custom").violations[0]
-    (folder / "light_intensities.txt").unlink()
-    (folder / "names.txt").write_text("".join(f"{name}\n" for name in reversed(image_names(LIGHTS))))
-    assert any("not in natural order" in line for line in check_tree(tmp_path / "tree", "custom").violations)

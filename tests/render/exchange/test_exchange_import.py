@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from exchange_support import LIGHTS, SCENES, SIZE, write_folder
+from exchange_support import LIGHTS, SCENES, SIZE
 from scipy.io import savemat
 from sdps_scenes import hemisphere_lights, shade, sphere_normals
 
@@ -25,14 +25,8 @@ from sdps.training.training_config import LightingTraining
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data")
-    write_folder(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def trees(data, tmp_path_factory) -> dict[str, Path]:
+    """Return trees with other options than the default, read-only by convention."""
     root = tmp_path_factory.mktemp("trees")
     export(data, root / "psfcn", ExportOptions(layout="psfcn", exposure=0.5), read_manifest(data))
     export(data, root / "diligent", ExportOptions(layout="diligent", intensities="seed"), read_manifest(data))
