@@ -51,6 +51,10 @@ def test_a_constant_environment_makes_the_images_it_must(capsys, folder, tmp_pat
     assert len(record["lighting"]) == 3 and record["lighting"][0]["lights"][0]["map"].startswith("constant:")
     assert "light_directions" not in record
     assert main(argv) == 0 and "0 written now, 2 kept" in capsys.readouterr().out
+    assert main([*argv, "--check"]) == 0
+    assert "2 samples of 3 lights; every rule of its loaders holds" in capsys.readouterr().out
+    (place / "mask.png").unlink()
+    assert main([*argv, "--check"]) == 1 and "mask.png: no such picture" in capsys.readouterr().out
     assert "mixed was" in fails(capsys, *argv[2:], "--seed", "1")
 
 
