@@ -19,7 +19,8 @@ FOLDERS = [
     *(f"render.{name}" for name in (
         "shared", "shared.imaging", "records", "backend", "shapes.geometry", "shapes.files",
         "shapes.sculpture", "shapes", "materials.textures", "materials", "materials.kernels.textures",
-        "materials.kernels", "materials.fit", "planning", "kernel", "running", "checks", "publishing", "exchange",
+        "materials.kernels", "materials.fit", "planning", "kernel", "running", "checks", "publishing",
+        "exchange.layouts", "exchange",
     )),
     "render",
     *(f"sdps.{name}" for name in (

@@ -15,7 +15,8 @@ from data_folders import scene_of, sphere_shard, write_folder
 
 from pipelines.cli import main
 from pipelines.evaluate.report.sections import Picture, Section, SectionWriter
-from render.exchange.names import legal_name, object_places, view_places
+from render.exchange.layouts import LAYOUTS
+from render.exchange.layouts.layout_base import legal_name
 from render.records.ledger import read_runs
 from render.records.manifest import read_failed, read_manifest
 from render.shared.config import parse_yaml
@@ -158,8 +159,9 @@ def test_a_manifest_names_no_file_outside_its_folder(name: str, tmp_path: Path) 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_exported_places_stay_in_the_tree(name: str) -> None:
     scene = scene_of(sphere_shard(count=3), shape=name or "x", material=name or "x")
-    for place in (*object_places([scene]).values(), *view_places([scene]).values()):
-        assert all(re.fullmatch(r"[A-Za-z0-9-]*", part) for part in place)
+    for layout in LAYOUTS.values():
+        (folder,) = layout.name_folders([scene]).values()
+        assert re.fullmatch(r"((Images|pmsData)/)?[A-Za-z0-9-]+(/[A-Za-z0-9-]+|\.data)?", folder)
     assert re.fullmatch(r"[A-Za-z0-9-]{1,80}", legal_name(name))
 
 

@@ -4,9 +4,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from pipelines.data.exchange import UNCHECKED, add_check_argument, exposure_flag, planned
+from pipelines.data.exchange import add_scene_arguments, parse_exposure, report_check, select_scenes
 from pipelines.shared.flags import add_fields, from_flags
-from render.exchange.samples import ExportOptions
+from render.exchange.export import ExportOptions, export
+from render.exchange.tree_check import check_tree
 from render.shared.errors import InputError
 from render.shared.imaging import environments, mixing
 
@@ -22,24 +23,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_fields(parser, mixing.LightMix)
     parser.add_argument("--bits", type=int, default=None, help="8 or 16 per channel (default: 16)")
     parser.add_argument("--exposure", default=None, help="factor on radiance or 'auto', per scene (default: auto)")
-    parser.add_argument("--ids", nargs="+", default=[], metavar="ID", help="only these scenes")
-    parser.add_argument("--split", default=None, choices=("train", "val", "test"), help="only this split")
     parser.add_argument("--limit", type=int, default=None, help="only the first so many scenes")
-    parser.add_argument("--skip-missing", action="store_true", help="leave out planned scenes that have no shard yet")
-    add_check_argument(parser)
+    add_scene_arguments(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     """Mix, write, and say what of each map is lost."""
     mixed = from_flags(mixing.LightMix, args)
     options = ExportOptions(
-        layout=args.layout, bits=args.bits, exposure=exposure_flag(args.exposure), mixed=mixed, images=args.images,
+        layout=args.layout, bits=args.bits, exposure=parse_exposure(args.exposure), mixed=mixed, images=args.images,
         seed=args.seed,
     )  # fmt: skip
-    from render.exchange.export import export, select
-
-    scenes = planned(args.folder, skip_missing=args.skip_missing)
-    chosen = select(scenes, ids=args.ids, split=args.split, limit=args.limit)
+    chosen = select_scenes(args.folder, args)
     if Path(args.out).resolve() == Path(args.folder).resolve():
         raise InputError(f"--out {args.out}: is the data folder itself; choose another")
     done = export(args.folder, args.out, options, chosen)
@@ -48,10 +43,8 @@ def main(args: argparse.Namespace) -> int:
         f"{done.kept} kept; scene.json says each image's light\n"
     )
     for name in mixed.environments if mixed.environment else ():
-        name = (
-            name if environments.is_file(name) or ":" in name else f"{name}:0"
-        )  # others of the kind lose about as much
+        if not environments.is_file(name) and ":" not in name:
+            name = f"{name}:0"  # others of the kind lose about as much
         lost = mixing.share_behind(environments.load(name))
         sys.stdout.write(f"{name}: {lost:.0%} of its light comes from behind the object and is left out\n")
-    sys.stdout.write(UNCHECKED if args.check else "")
-    return 0
+    return report_check(check_tree(args.out, args.layout, shards=args.folder), args.out) if args.check else 0

@@ -66,7 +66,7 @@ def shading_fit(images: np.ndarray, normals: np.ndarray, mask: np.ndarray, light
     return fits
 
 
-def faults(images: np.ndarray, normals: np.ndarray, mask: np.ndarray, lights: np.ndarray) -> list[str]:
+def find_faults(images: np.ndarray, normals: np.ndarray, mask: np.ndarray, lights: np.ndarray) -> list[str]:
     """Say in words which axis looks flipped, of the normals (silhouette) and of the lights against them (shading)."""
     found = []
     outline = silhouette_fit(normals, mask)

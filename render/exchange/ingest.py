@@ -1,11 +1,11 @@
 """PS-FCN trees and DiLiGenT folders into a data folder that the trainer and the tools read like a rendered one.
 
-What the source does not tell is not made up: depth is zero, coverage is the mask, samples and seed are zero, and each
+What the source does not say is not made up: depth is zero, coverage is the mask, samples and seed are zero, and each
 shard's provenance says so. Radiance is per unit light intensity; its absolute scale is known only where our own export
 left a record.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -13,10 +13,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from render.exchange import frame
-from render.exchange.folders import read_record
-from render.exchange.foreign_samples import Source, Truth
 from render.exchange.layouts import LAYOUTS
-from render.exchange.names import legal_name, unique_names
+from render.exchange.layouts.foreign_samples import Source, read_record, size_text
+from render.exchange.layouts.layout_base import legal_name, unique_names
 from render.records.manifest import MANIFEST, SceneSpec, View, read_manifest, write_manifest
 from render.records.shards import Shard, is_whole, to_half, write_shard
 from render.shared.config import to_plain
@@ -26,9 +25,7 @@ from render.shared.progress import progress_bar
 from render.shared.temporary import is_empty
 
 RECORD = "import.json"
-READERS: Mapping[str, Callable[[Path], list[Source]]] = {
-    name: layout.read for name, layout in LAYOUTS.items() if layout.read
-}
+IMPORTABLE = [name for name, layout in LAYOUTS.items() if layout.importable]
 SIZE_MULTIPLE = 4  # the normal networks halve the image twice
 
 
@@ -37,8 +34,8 @@ class ImportOptions:
     """How a foreign tree becomes shards.
 
     Attributes:
-        layout: A name of `READERS`.
-        split: Split of all scenes; None takes the lists' (PS-FCN) or `test` (DiLiGenT).
+        layout: A name of `IMPORTABLE`.
+        split: Split of all scenes; None takes that of the tree's lists, `test` where there are none.
         crop: Margin in pixels around the mask's bounding box, whose sides are rounded up to multiples of 4; None keeps
             the whole image.
         y_down: Normals and lights of the source have y pointing down; both are turned.
@@ -52,8 +49,8 @@ class ImportOptions:
     limit: int | None = None
 
     def __post_init__(self) -> None:
-        if self.layout not in READERS:
-            raise unknown("layout", self.layout, READERS)
+        if self.layout not in IMPORTABLE:
+            raise unknown("layout", self.layout, IMPORTABLE)
         if self.split not in (None, "train", "val", "test"):
             raise unknown("split", str(self.split), ("train", "val", "test"))
         if self.crop is not None and self.crop < 0:
@@ -74,10 +71,8 @@ class Box(NamedTuple):
         """Cut the box out of the rows and columns at `axis` and `axis + 1`."""
         rows, columns = slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
         part = array[(slice(None),) * axis + (rows, columns)]
-        pad = [(0, 0)] * array.ndim
-        pad[axis] = (0, self.height - part.shape[axis])
-        pad[axis + 1] = (0, self.width - part.shape[axis + 1])
-        return np.pad(part, pad)
+        pad = {axis: (0, self.height - part.shape[axis]), axis + 1: (0, self.width - part.shape[axis + 1])}
+        return np.pad(part, [pad.get(number, (0, 0)) for number in range(array.ndim)])
 
 
 @dataclass(frozen=True)
@@ -104,9 +99,9 @@ def ingest(tree: str | Path, out: str | Path, options: ImportOptions) -> ImportR
     tree, out = Path(tree), Path(out)
     if not tree.is_dir():
         raise InputError(f"{tree}: no such folder; give the root of a {options.layout} tree")
-    sources = READERS[options.layout](tree)[: options.limit]
+    sources = [read() for read in LAYOUTS[options.layout].list_samples(tree)[: options.limit]]
     boxes = [crop_box(source.truth().mask, options.crop) for source in sources]
-    scenes = _scenes(sources, boxes, options)
+    scenes = _describe_scenes(sources, boxes, options)
     _claim(out, scenes)
     written = 0
     suspicions = read_record(out / RECORD).get("suspicions", {}) if (out / RECORD).is_file() else {}
@@ -115,7 +110,7 @@ def ingest(tree: str | Path, out: str | Path, options: ImportOptions) -> ImportR
         for source, box, scene in bar:
             if is_whole(out / scene.file, scene):
                 continue
-            shard, found = _shard(source, box, scene, options)
+            shard, found = _read_shard(source, box, scene, options)
             write_shard(out / scene.file, shard)
             written += 1
             if found:
@@ -125,7 +120,7 @@ def ingest(tree: str | Path, out: str | Path, options: ImportOptions) -> ImportR
     return ImportReport(written, len(scenes) - written, scenes, suspicions)
 
 
-def _scenes(sources: Sequence[Source], boxes: Sequence[Box], options: ImportOptions) -> list[SceneSpec]:
+def _describe_scenes(sources: Sequence[Source], boxes: Sequence[Box], options: ImportOptions) -> list[SceneSpec]:
     """Describe each sample as a manifest line; fields only a renderer has are zero."""
     scenes = []
     # `_` parts shape and material.
@@ -156,8 +151,8 @@ def crop_box(mask: np.ndarray, margin: int | None) -> Box:
     return Box(sides[0][0], sides[1][0], sides[0][1], sides[1][1])
 
 
-def _shard(source: Source, box: Box, scene: SceneSpec, options: ImportOptions) -> tuple[Shard, list[str]]:
-    """Read one sample; also tell what looks flipped in it."""
+def _read_shard(source: Source, box: Box, scene: SceneSpec, options: ImportOptions) -> tuple[Shard, list[str]]:
+    """Read one sample; also return what looks flipped in it."""
     truth = source.truth()
     images, bits = source.stack(truth.mask.shape)
     exposure = source.exposure()
@@ -165,21 +160,8 @@ def _shard(source: Source, box: Box, scene: SceneSpec, options: ImportOptions) -
     normals, mask = box.cut(truth.normals), box.cut(truth.mask)
     if options.y_down:
         normals = normals * np.array([1.0, -1.0, 1.0], np.float32)
-    found = frame.faults(images, normals, mask, scene.light_directions())
-    provenance = _provenance(source, truth, box, scene, options, bits, exposure)
-    shard = Shard(
-        scene_id=scene.id, images=to_half(images), normals=normals, depth=np.zeros(mask.shape, np.float32), mask=mask,
-        coverage=mask.astype(np.float32), light_directions=scene.light_directions(),
-        provenance=provenance | {"frame_check": "; ".join(found) or "passed"},
-    )  # fmt: skip
-    return shard, found
-
-
-def _provenance(
-    source: Source, truth: Truth, box: Box, scene: SceneSpec, options: ImportOptions, bits: int, exposure: float | None
-) -> dict[str, str | int | float]:
-    """Say where the scene comes from and what of it is unknown."""
-    return {
+    found = frame.find_faults(images, normals, mask, scene.light_directions())
+    provenance: dict[str, str | int | float] = {
         "spec": scene.digest(),
         "shape": scene.shape,
         "material": scene.material,
@@ -192,8 +174,14 @@ def _provenance(
         "normals": truth.origin.name,
         "depth": "unknown, zeros",
         "coverage": "unknown, the mask",
-        "crop": f"top {box.top}, left {box.left}, of {truth.mask.shape[0]}x{truth.mask.shape[1]}",
+        "crop": f"top {box.top}, left {box.left}, of {size_text(truth.mask.shape)}",
+        "frame_check": "; ".join(found) or "passed",
     }
+    shard = Shard(
+        scene_id=scene.id, images=to_half(images), normals=normals, depth=np.zeros(mask.shape, np.float32), mask=mask,
+        coverage=mask.astype(np.float32), light_directions=scene.light_directions(), provenance=provenance,
+    )  # fmt: skip
+    return shard, found
 
 
 def _claim(out: Path, scenes: Sequence[SceneSpec]) -> None:

@@ -17,7 +17,7 @@ from pipelines.cli import main
 from pipelines.evaluate.benchmarks.lit_photographs import object_folders
 from pipelines.evaluate.report.sections import FOLDER, Section, SectionWriter, read_sections
 from pipelines.rendering.render_data import write_preview
-from render.exchange.folders import claim
+from render.exchange.export import claim
 from render.records.shards import read_shard, write_shard
 from render.shared import files
 from render.shared.errors import InputError

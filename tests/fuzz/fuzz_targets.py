@@ -387,7 +387,7 @@ def _read_tree(folder: Path, path: Path) -> None:
 
 def _read_records(folder: Path, path: Path) -> None:
     from pipelines.evaluate.report.sections import read_sections
-    from render.exchange.folders import read_record
+    from render.exchange.layouts.foreign_samples import read_record
 
     if path.name == "section.json":
         read_sections(folder)

@@ -15,8 +15,8 @@ from pipelines.evaluate.benchmarks import suite
 from pipelines.evaluate.benchmarks.stacks import MARGIN, Images, build_object
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.shared.flags import from_flags
-from render.exchange.foreign_samples import Source
-from render.exchange.read_diligent import diligent_sources
+from render.exchange.layouts import LAYOUTS
+from render.exchange.layouts.foreign_samples import Source
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.images import bit_depth, read_image, to_unit
@@ -119,7 +119,7 @@ def diligent_objects(tree: Path, config: DiligentConfig) -> list[TestObject]:
     """
     if not tree.is_dir():
         raise InputError(f"{tree}: no such folder; give DiLiGenT's pmsData, the folder above it, or one <object>PNG")
-    found = {source.name: source for source in diligent_sources(tree)}
+    found = {source.shape: source for source in (read() for read in LAYOUTS["diligent"].list_samples(tree))}
     names = [name for name in OBJECTS if name in found] + [name for name in found if name not in OBJECTS]
     return [_object(found[name], config) for name in names]
 
@@ -127,12 +127,12 @@ def diligent_objects(tree: Path, config: DiligentConfig) -> list[TestObject]:
 def _object(source: Source, config: DiligentConfig) -> TestObject:
     """Read what is small, and refer to the images."""
     truth = source.truth()
-    drop = _BEAR_CORRUPT if source.name == "bear" and config.bear == 76 else 0
+    drop = _BEAR_CORRUPT if source.shape == "bear" and config.bear == 76 else 0
     if drop >= len(source.images):
         raise InputError(f"{source.folder}: {len(source.images)} images, --bear 76 drops the first {drop}")
     files = [source.folder / name for name in source.images[drop:]]
     return build_object(
-        source.name, Images.of_files(files, lambda path: _read(path, config.bits)), truth.mask,
+        source.shape, Images.of_files(files, lambda path: _read(path, config.bits)), truth.mask,
         source.directions[drop:], source.intensities[drop:], normals=truth.normals, margin=config.margin,
         files=[source.folder / "mask.png", truth.origin], settings=(config.bits,),
     )  # fmt: skip

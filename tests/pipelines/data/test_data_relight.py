@@ -5,10 +5,10 @@ import json
 import cv2
 import numpy as np
 import pytest
-from exchange_rules import check_tree
 from stage_scenes import write_stage
 
 from pipelines.cli import main
+from render.exchange.tree_check import check_tree
 from render.records.manifest import read_manifest
 from render.records.shards import read_shard
 from render.shared.images import read_image
@@ -36,7 +36,7 @@ def test_a_constant_environment_makes_the_images_it_must(capsys, folder, tmp_pat
     assert main(argv) == 0
     text = capsys.readouterr().out
     assert "2 scenes of 3 images as unips, 2 written now" in text
-    assert check_tree(tmp_path / "tree", "unips", source=folder).violations == []
+    assert check_tree(tmp_path / "tree", "unips", shards=folder).violations == []
     assert "constant:0: 50% of its light comes from behind" in text
     scene = read_manifest(folder)[0]
     shard = read_shard(folder / scene.file, scene)
@@ -51,6 +51,10 @@ def test_a_constant_environment_makes_the_images_it_must(capsys, folder, tmp_pat
     assert len(record["lighting"]) == 3 and record["lighting"][0]["lights"][0]["map"].startswith("constant:")
     assert "light_directions" not in record
     assert main(argv) == 0 and "0 written now, 2 kept" in capsys.readouterr().out
+    assert main([*argv, "--check"]) == 0
+    assert "2 samples of 3 lights; every rule of its loaders holds" in capsys.readouterr().out
+    (place / "mask.png").unlink()
+    assert main([*argv, "--check"]) == 1 and "mask.png: no such picture" in capsys.readouterr().out
     assert "mixed was" in fails(capsys, *argv[2:], "--seed", "1")
 
 

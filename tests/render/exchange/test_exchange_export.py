@@ -1,11 +1,10 @@
-"""Exported trees: what the loaders of each layout get from them, names, exposure, resuming, and the rule checker.
+"""Exported trees: what the loaders of each layout get from them, names, exposure and resuming.
 
 The readers here follow the description of each loader (docs/reference/formats.md), not the package's own.
 """
 
 import errno
 import json
-import os
 import re
 import shutil
 from pathlib import Path
@@ -13,37 +12,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from exchange_rules import check_tree
-from exchange_support import LIGHTS, SCENES, SIZE, write_folder
+from exchange_support import LIGHTS, SCENES, SIZE
 from PIL import Image
 from scipy.io import loadmat
 
-from pipelines.cli import main
-from render.exchange import layouts
-from render.exchange.export import export, select
-from render.exchange.layouts import LAYOUTS, image_names
-from render.exchange.names import legal_name, unique_names, view_places
-from render.exchange.samples import ExportOptions
+from render.exchange.export import ExportOptions, export
+from render.exchange.layouts import LAYOUTS, layout_base
+from render.exchange.layouts.layout_base import image_names, legal_name, unique_names
+from render.exchange.tree_check import check_tree
 from render.records.manifest import SceneSpec, View, read_manifest
 from render.records.shards import read_shard
 from render.shared.errors import InputError
 from render.shared.tables import natural_key
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data")
-    write_folder(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def trees(data, tmp_path_factory) -> dict[str, Path]:
-    """Return a tree of every layout with the default options, read-only by convention."""
-    root = tmp_path_factory.mktemp("trees")
-    for layout in LAYOUTS:
-        export(data, root / layout, ExportOptions(layout=layout), read_manifest(data))
-    return {layout: root / layout for layout in LAYOUTS}
 
 
 def shard(data: Path, name: str):
@@ -144,7 +124,7 @@ def test_diligent_loader_with_random_intensities(data, tmp_path):
         np.testing.assert_allclose(numbers.reshape(SIZE, SIZE, 3), normals, atol=1e-6)
         assert np.asarray(Image.open(root / object_name / "mask.png")).max() == 255
     assert not np.array_equal(drawn[SCENES[0][0]], drawn[SCENES[1][0]])  # one view, but lit differently
-    assert check_tree(tmp_path, "diligent", source=data).violations == []
+    assert check_tree(tmp_path, "diligent", shards=data).violations == []
 
 
 def test_unips_loader(trees, data):
@@ -166,7 +146,7 @@ def test_unips_loader(trees, data):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_exported_trees_keep_every_rule(trees, data, layout):
-    report = check_tree(trees[layout], layout, source=data)
+    report = check_tree(trees[layout], layout, shards=data)
     assert report.violations == [] and report.samples == len(SCENES) and report.lights == (LIGHTS, LIGHTS)
     assert [line for line in report.warnings if "128x128" in line] == report.warnings  # the trees of tests are small
     assert len(report.warnings) == (layout == "psfcn")
@@ -199,7 +179,7 @@ def test_exposure(data, tmp_path):
 def test_export_goes_on_where_it_stopped_and_ends_the_same(data, trees, tmp_path, monkeypatch):
     scenes = read_manifest(data)
     options = ExportOptions(layout="psfcn")
-    real, calls = layouts.write_png, []
+    real, calls = layout_base.write_png, []
 
     def failing(path, pixels):
         calls.append(path)
@@ -208,13 +188,13 @@ def test_export_goes_on_where_it_stopped_and_ends_the_same(data, trees, tmp_path
             raise OSError(errno.ENOSPC, "No space left on device")
         real(path, pixels)
 
-    monkeypatch.setattr(layouts, "write_png", failing)
+    monkeypatch.setattr(layout_base, "write_png", failing)
     with pytest.raises(InputError, match=r"cannot be written \(No space left on device\); free space") as caught:
         export(data, tmp_path / "tree", options, scenes)
     assert "\n" not in str(caught.value)
     left = [path for path in (tmp_path / "tree").rglob("*") if ".tmp" in path.name]
     assert left == [] and not (tmp_path / "tree" / "train_mtrl.txt").exists()
-    monkeypatch.setattr(layouts, "write_png", real)
+    monkeypatch.setattr(layout_base, "write_png", real)
     report = export(data, tmp_path / "tree", options, scenes[:2])
     assert (report.written, report.kept) == (1, 1)
     report = export(data, tmp_path / "tree", options, scenes)  # the rest, later
@@ -268,16 +248,6 @@ def test_bad_options(options, message):
         ExportOptions(**options)
 
 
-def test_selection(data):
-    scenes = read_manifest(data)
-    assert [scene.id for scene in select(scenes, split="train", limit=1)] == ["blobby-00001-v0-m0"]
-    assert [scene.id for scene in select(scenes, ids=["sphere-gold"])] == ["sphere-gold"]
-    with pytest.raises(InputError, match="unknown scene 'sphere-golt'; did you mean 'sphere-gold'"):
-        select(scenes, ids=["sphere-golt"])
-    with pytest.raises(InputError, match="no scene of 4 is left"):
-        select(scenes, ids=["sphere-gold"], split="train")
-
-
 def test_names_are_legal_and_unique():
     assert legal_name("stripes:7:/data/merl/chrome.binary+fits/blue fabric.yaml") == "stripes-7-chrome-blue-fabric"
     assert legal_name("lambertian:0.5") == "lambertian-0-5" and legal_name("#/石") == "unnamed"
@@ -294,128 +264,4 @@ def test_two_files_of_one_name_in_one_view_stay_apart():
     common = {"seed": 0, "split": "train", "shape": "sphere", "view": View(), "lights": ((0.0, 0.0, 1.0),), "size": 8,
               "spp": 1, "bounces": 0}  # fmt: skip
     scenes = [SceneSpec(id=f"s-{k}", material=f"{folder}/gold.yaml", **common) for k, folder in enumerate("ab")]
-    assert [tuple(place) for place in view_places(scenes).values()] == [("sphere", "gold-1"), ("sphere", "gold-2")]
-
-
-@pytest.fixture
-def tree(trees, tmp_path) -> Path:
-    shutil.copytree(trees["psfcn"], tmp_path / "tree")
-    return tmp_path / "tree"
-
-
-SAMPLE = "Images/blobby-00001-v0/blue-fabric"
-LIST = f"{SAMPLE}/blobby-00001-v0_blue-fabric.txt"
-NORMALS = "Images/blobby-00001-v0/blobby-00001-v0_normal.png"
-
-
-def replace(path: str, old: str, new: str):
-    def change(root: Path) -> None:
-        text = (root / path).read_text()
-        assert old in text
-        (root / path).write_text(text.replace(old, new, 1))
-
-    return change
-
-
-def repaint(path: str, edit, flags: int = cv2.IMREAD_UNCHANGED):
-    return lambda root: cv2.imwrite(str(root / path), edit(cv2.imread(str(root / path), flags)))
-
-
-def flip_lights(root: Path) -> None:
-    rows = [line.split(" ") for line in lines(root / LIST)]
-    (root / LIST).write_text("".join(f"{a} {x} {-float(y)} {z}\n" for a, x, y, z in rows))
-
-
-def background(value: int):
-    def edit(pixels: np.ndarray) -> np.ndarray:
-        pixels[0, 0] = value
-        return pixels
-
-    return edit
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (replace(LIST, "000.png ", "000#.png "), "has a '#', which loaders take for a comment"),
-        (replace(LIST, "000.png ", "000.png  "), "with single spaces"),
-        (replace(LIST, "000.png ", "000.png\t"), "with single spaces"),
-        (replace(LIST, "\n", " 1.0\n"), "lines have from 4 to 5 fields"),
-        (replace(LIST, "000.png", "001.png"), "an image is listed twice"),
-        (replace(LIST, "000.png 0.", "000.png 3."), "light 1 has length"),
-        (replace(LIST, "000.png 0.", "000.png x."), "are not numbers"),
-        (replace(LIST, "000.png", "missing.png"), "missing.png: no such picture"),
-        (replace("train_mtrl.txt", "/blue", "/deep/blue"), "with exactly one '/'"),
-        (replace("train_mtrl.txt", "/blue", "/b#ue"), "has a '#'"),
-        (replace("val_mtrl.txt", "v1/lambertian-0-5", "v0/blue-fabric"), "keep it in one list"),
-        (lambda root: (root / "val_mtrl.txt").unlink(), "val_mtrl.txt: missing; training opens both lists"),
-        (repaint(f"{SAMPLE}/001.png", lambda p: p, cv2.IMREAD_GRAYSCALE), "1 channel"),
-        (repaint(f"{SAMPLE}/001.png", lambda p: p[:-1]), "one size"),
-        (repaint(f"{SAMPLE}/001.png", lambda p: p.astype(np.uint16) * 257), "16 bits, the others 8"),
-        (lambda root: os.truncate(root / SAMPLE / "002.png", 90), "damaged"),
-        (repaint(NORMALS, background(0)), "background pixels are not 127 or 128"),
-        (repaint(NORMALS, lambda p: (p // 2) + 64), "are no unit normals"),
-        (repaint(NORMALS, lambda p: 255 - p), "normals point into the object|the mask differs"),
-        (flip_lights, "lights fit the shading better with y negated"),
-        (lambda root: [cv2.imwrite(str(path), np.zeros((SIZE, SIZE, 3), np.uint8)) for path in
-                       (root / SAMPLE).glob("*.png")], "all images are black"),
-    ],
-)  # fmt: skip
-def test_the_checker_names_what_is_broken(tree, damage, message, capfd):
-    damage(tree)
-    report = check_tree(tree, "psfcn")
-    assert report.violations and any(re.search(message, line) for line in report.violations), report.violations
-    assert all("\n" not in line and line.startswith(str(tree)) for line in report.violations)
-    assert "libpng" not in capfd.readouterr().err
-
-
-def test_the_checker_compares_with_the_shards(tree, data):
-    coded = cv2.imread(str(tree / NORMALS), cv2.IMREAD_UNCHANGED)
-    rows, columns = np.nonzero((coded != 128).any(-1))
-    coded[rows[0], columns[0]] = 128
-    cv2.imwrite(str(tree / NORMALS), coded)
-    assert check_tree(tree, "psfcn").violations == []
-    assert len(check_tree(tree, "psfcn", source=data).violations) == 2  # both materials of the view
-    assert "mask differs" in check_tree(tree, "psfcn", source=data).violations[0]
-
-
-def test_custom_rules(trees, tmp_path):
-    shutil.copytree(trees["custom"], tmp_path / "tree")
-    folder = tmp_path / "tree" / "sphere-gold"
-    (folder / "light_intensities.txt").write_text("1\n" * LIGHTS)
-    assert "1 column(s) where 3 are needed" in check_tree(tmp_path / "tree", "custom").violations[0]
-    (folder / "light_intensities.txt").write_text("1 1 1\n" * (LIGHTS - 1))
-    assert f"{LIGHTS - 1} rows for {LIGHTS} images" in check_tree(tmp_path / "tree", "custom").violations[0]
-    (folder / "light_intensities.txt").unlink()
-    (folder / "names.txt").write_text("".join(f"{name}\n" for name in reversed(image_names(LIGHTS))))
-    assert any("not in natural order" in line for line in check_tree(tmp_path / "tree", "custom").violations)
-
-
-def test_the_command_line(data, tmp_path, capsys):
-    out = str(tmp_path / "tree")
-    assert main(["data", "export", str(data), "--layout", "psfcn", "--out", out, "--check", "--split", "train"]) == 0
-    told = capsys.readouterr().out
-    assert "2 scenes as psfcn, 2 written now, 0 kept\nclipped: 0.00%" in told and "val_mtrl.txt is empty" in told
-    assert "--check does nothing any more" in told
-    assert check_tree(out, "psfcn", source=data).violations == []
-    capsys.readouterr()
-    for arguments, message in (
-        (["--layout", "psfcn"], "required: --out"),
-        (["--layout", "psfcn", "--out", out, "--exposure", "loud"], "expected a positive number or 'auto'"),
-        (["--layout", "psfn", "--out", out], "did you mean 'psfcn'"),
-        (["--layout", "unips", "--out", out], "layout was 'psfcn'"),
-    ):
-        assert main(["data", "export", str(data), *arguments]) == 2
-        error = capsys.readouterr().err
-        assert message in error and error.strip().count("\n") == 0
-
-
-def test_missing_shards(data, tmp_path, capsys):
-    folder = tmp_path / "data"
-    shutil.copytree(data, folder)
-    (folder / "shards" / "sphere-gold.exr").unlink()
-    command = ["data", "export", str(folder), "--layout", "unips", "--out", str(tmp_path / "tree")]
-    assert main(command) == 2
-    assert "1 of 4 shards are missing, the first is 'sphere-gold'" in capsys.readouterr().err
-    assert main([*command, "--skip-missing"]) == 0
-    assert "3 scenes as unips" in capsys.readouterr().out
+    assert list(LAYOUTS["psfcn"].name_folders(scenes).values()) == ["Images/sphere/gold-1", "Images/sphere/gold-2"]

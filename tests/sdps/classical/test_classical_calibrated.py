@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from classical_scenes import Scene, glossy, hills, lambertian, lights, sphere
 
-from render.exchange.read_diligent import diligent_sources
+from render.exchange.layouts import LAYOUTS
 from render.shared.errors import InputError
 from sdps.classical.least_squares import least_squares
 from sdps.classical.robust import low_rank_least_squares, position_threshold, robust_least_squares
@@ -123,7 +123,8 @@ def test_the_diligent_ball(tmp_path):
     """4.17 degrees with all 96 images and no handling of shadows: the benchmark's own baseline."""
     with zipfile.ZipFile(Path(DATA) / "diligent_ball.zip") as archive:
         archive.extractall(tmp_path)
-    (source,) = diligent_sources(tmp_path / "ballPNG")
+    (read,) = LAYOUTS["diligent"].list_samples(tmp_path / "ballPNG")
+    source = read()
     truth = source.truth()
     images, _ = source.stack(truth.mask.shape)  # divided by the intensities
 
