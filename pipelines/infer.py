@@ -107,10 +107,10 @@ def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:
 
 def describe(findings: "Sequence[Finding]") -> str:
     """Write the findings, one a line, the gravest first."""
-    return "".join(f"{_MARKS[finding.level]}{finding.text}{_named(finding.images)}\n" for finding in findings)
+    return "".join(f"{_MARKS[finding.level]}{finding.text}{_list_images(finding.images)}\n" for finding in findings)
 
 
-def _named(images: Sequence[str]) -> str:
+def _list_images(images: Sequence[str]) -> str:
     if not images:
         return ""
     more = f", and {len(images) - _MOST_LISTED} more" if len(images) > _MOST_LISTED else ""
@@ -153,7 +153,7 @@ def _section(result: "Inference") -> SectionWriter:
     shown = pictures.tone_map(lit, pictures.auto_exposure(lit[None], mask[box]))
     tiles = [
         Tile("a photograph", shown),
-        Tile(f"mask ({photos.mask_origin})", _masked(shown, mask[box])),
+        Tile(f"mask ({photos.mask_origin})", _tint_outside(shown, mask[box])),
         Tile("normals", pictures.normal_map(result.normals[box], mask[box]), "normals"),
         Tile("depth, near is bright", depth_picture(result, box)),
     ]
@@ -166,7 +166,7 @@ def _section(result: "Inference") -> SectionWriter:
     if result.refinement is not None:
         writer.strip("Refinement", _refinement_pictures(result.refinement, box, mask[box]))
     elif result.expected_error is not None:
-        writer.strip("How sure the network is", [_expected_picture(result.expected_error[box], mask[box])])
+        writer.strip("How sure the network is", [_draw_expected_errors(result.expected_error[box], mask[box])])
     return writer
 
 
@@ -189,12 +189,12 @@ def _refinement_pictures(found: "RefinedEstimate", box: tuple[slice, slice], mas
     return [
         Tile("normals before", pictures.normal_map(found.start.normals[box], mask), "normals"),
         Tile("moved (yellow: 20 degrees)", pictures.error_map(np.where(mask, moved, np.nan), 20.0)),
-        _expected_picture(expected, mask),
+        _draw_expected_errors(expected, mask),
         Tile(f"not explained (yellow: {most:.2f})", pictures.error_map(np.where(mask, residual, np.nan), most)),
     ]
 
 
-def _expected_picture(expected: np.ndarray, mask: np.ndarray) -> Tile:
+def _draw_expected_errors(expected: np.ndarray, mask: np.ndarray) -> Tile:
     """Return a picture of the errors to expect, in degrees."""
     return Tile("error to expect (yellow: 20 degrees)", pictures.error_map(np.where(mask, expected, np.nan), 20.0))
 
@@ -207,7 +207,7 @@ def _brightest(result: "Inference") -> slice:
     return slice(number, number + 1)
 
 
-def _masked(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
+def _tint_outside(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
     """Tint what lies outside the mask, so that a wrong mask is seen at once."""
     tint = np.array([255.0, 80.0, 160.0])
     outside = 0.45 * picture.astype(np.float32) + 0.55 * tint
@@ -224,7 +224,7 @@ def depth_picture(result: "Inference", box: tuple[slice, ...] = ()) -> np.ndarra
 
 def _tables(result: "Inference") -> tuple[Table, ...]:
     """Return the checks, the figures and the lights as tables."""
-    findings = tuple((finding.level, finding.text + _named(finding.images)) for finding in result.findings)
+    findings = tuple((finding.level, finding.text + _list_images(finding.images)) for finding in result.findings)
     notes = tuple(("note", note) for note in result.photos.notes)
     checks = Table(title="Checks", header=("level", "what"), rows=(*findings, *notes), prose=(1,))
     facts = result.summary()
@@ -262,5 +262,5 @@ def _refinement_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         ("refined", "yes" if about["kept"] else f"no: {about['doubt']}"),
         ("refinement moved normals, lights", f"{about['normals_moved_degrees']}°, {about['lights_moved_degrees']}°"),
         ("error of the refined normals to expect", f"{about['expected_normal_error_degrees']}°"),
-        ("photographs not explained", f"{len(unexplained)}{_named(unexplained)}"),
+        ("photographs not explained", f"{len(unexplained)}{_list_images(unexplained)}"),
     ]

@@ -26,7 +26,7 @@ from render.materials.model import Material
 from render.materials.surfaces import Surface
 from render.planning import light_sets
 from render.records.manifest import SceneSpec, View, claim
-from render.running.rendered_view import RenderedView, rendered_views
+from render.running.rendered_view import RenderedView, trace_views
 from render.shapes import TriangleMesh, registry
 from render.shapes.files.mesh_file import from_trimesh
 from render.shared.errors import InputError
@@ -167,7 +167,7 @@ def render_views(
     first = SceneSpec(
         id="view-0", split="test", shape=str(shape) if isinstance(shape, str | Path) else "mesh",
         material=covers[0].name, view=_view(rotation, scale, offset, camera_distance), size=size, spp=spp,
-        bounces=bounces, seed=seed, **_lit(_lights(lights), light_distance),
+        bounces=bounces, seed=seed, **_read_lights(_lights(lights), light_distance),
     )  # fmt: skip
     return _render(_shape(shape), covers, first)
 
@@ -186,10 +186,10 @@ def _render(mesh: TriangleMesh, covers: Sequence[Surface], first: SceneSpec) -> 
     from render.materials.kernels.packed import PackedSurfaces
 
     scenes = [replace(first, id=f"view-{number}", material=cover.name) for number, cover in enumerate(covers)]
-    return rendered_views(build(mesh), scenes, PackedSurfaces(covers, mesh), range(len(covers)))
+    return trace_views(build(mesh), scenes, PackedSurfaces(covers, mesh), range(len(covers)))
 
 
-def _lit(directions: np.ndarray, distance: float | Sequence[float] | None) -> dict[str, Any]:
+def _read_lights(directions: np.ndarray, distance: float | Sequence[float] | None) -> dict[str, Any]:
     """Return the lights of a scene and, of near ones, their distances, or say what is wrong with these."""
     found: dict[str, Any] = {"lights": tuple(map(tuple, directions.tolist()))}
     if distance is None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from lab.bench.bench_scenes import BenchClassicalConfig, add_size, large_object, size_from
 from lab.shared.memory import apart, peak_gib, timed
-from pipelines.shared.flags import add_out, picked
+from pipelines.shared.flags import add_out, pick_names
 from pipelines.shared.text_tables import render_text
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import Shard, read_shard
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Score every scene, time every step, print the tables and write bench_surface.json."""
-    config, steps = size_from(args), picked("step", args.steps, STEPS)
+    config, steps = size_from(args), pick_names("step", args.steps, STEPS)
     scenes = [(folder, spec) for folder in args.folders for spec in read_manifest(folder)]
     shapes: dict[str, list[dict[str, Any]]] = {}
     rows = []

@@ -15,7 +15,7 @@ from pipelines.evaluate.report.sections import Section, SectionWriter, save_pict
 from pipelines.evaluate.results import tables_text
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import presets
-from pipelines.shared.flags import picked, split_list
+from pipelines.shared.flags import pick_names, split_list
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, read_json, write_json
@@ -57,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
         0, or 1 where a figure was left out.
     """
     preset, out = presets.from_arguments(args)
-    names = picked("figure", args.figures, FIGURES)
+    names = pick_names("figure", args.figures, FIGURES)
     if args.draws < 1:
         raise InputError(f"--draws must be at least 1, got {args.draws}")
     config = inference_config(preset.test)
@@ -100,7 +100,7 @@ def _find_default(name: str, out: Path) -> str:
     members = COMBINATIONS[name].members() if name in COMBINATIONS else (name,)
     if all(pretrained.trained_file(out, member).is_file() for member in members):
         return name
-    return pretrained.SHIPPED + name if set(members) <= set(pretrained.shipped()) else NONE
+    return pretrained.SHIPPED + name if set(members) <= set(pretrained.list_shipped()) else NONE
 
 
 def write(name: str, drawn: Panel, bench: Workbench) -> None:

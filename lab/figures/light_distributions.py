@@ -8,7 +8,7 @@ from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
-from pipelines.shared.pictures import spread
+from pipelines.shared.pictures import spread_evenly
 from pipelines.shared.text_tables import number
 
 SCENES = 3  # per shape
@@ -30,7 +30,7 @@ def make(bench: Workbench) -> Panel:
     wanted, folder = bench.merltest()
     drawings, rows, values = [], [], {}
     for shape in shapes_of(wanted):
-        chosen = spread([scene for scene in wanted if scene.shape == shape], min(SCENES, bench.config.pictures))
+        chosen = spread_evenly([scene for scene in wanted if scene.shape == shape], min(SCENES, bench.config.pictures))
         panels: Shown = {}
         objects = (((scene, item), item) for scene, item in bench.objects(chosen, folder, bench.config))
         for (scene, item), runner, result in bench.evaluation.run(objects, runners, len(chosen), f"lights, {shape}"):

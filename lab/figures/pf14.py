@@ -14,7 +14,7 @@ from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.results import Mean, mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts, scenes
-from pipelines.shared.pictures import spread
+from pipelines.shared.pictures import spread_evenly
 from render.materials import library
 from render.planning import light_sets
 from render.planning.plan import material_pool
@@ -60,7 +60,7 @@ def groups(chosen: tuple[str, ...]) -> dict[str, list[str]]:
         raise LeftOut(f"pf14 needs materials of {', '.join(GROUPS[1:])}; add some to test.materials")
     named = [name for name in pool if name.startswith("lambertian:")]
     share = kept / sum(len(kinds[group]) for group in GROUPS[1:])
-    some = spread(albedos(), max(1, round(share * LAMBERTIAN)))
+    some = spread_evenly(albedos(), max(1, round(share * LAMBERTIAN)))
     return {"lambertian": named or some} | {group: names for group, names in found.items() if names}
 
 

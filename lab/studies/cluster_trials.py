@@ -32,7 +32,7 @@ import dask
 import distributed
 
 from lab.shared.memory import resident_bytes
-from pipelines.rendering.render_data import planned_scenes
+from pipelines.rendering.render_data import plan_scenes
 from pipelines.shared import presets
 from pipelines.shared.cluster import dask_pool
 from pipelines.shared.cluster.cluster_config import ClusterChoice
@@ -53,7 +53,7 @@ def kills(times: int, seed: int, disturbed: Callable[[presets.Preset, Path, rand
     rng, preset, bad = random.Random(seed), presets.load("smoke", TINY), 0
     with tempfile.TemporaryDirectory() as temporary:
         plain = Path(temporary) / "plain"
-        scenes = planned_scenes(preset, plain)
+        scenes = plan_scenes(preset, plain)
         render_supervised(scenes, plain)
         expected = content(plain)
         for number in range(times):
@@ -72,7 +72,7 @@ def kills(times: int, seed: int, disturbed: Callable[[presets.Preset, Path, rand
 
 def killed_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
     """Render on two workers, one of which is killed while scenes are at work; return how many scenes are done."""
-    scenes = planned_scenes(preset, folder)
+    scenes = plan_scenes(preset, folder)
     with cluster(2, 1) as (address, client):
         pids, moments = list(client.run(os.getpid).values()), []
 
@@ -94,7 +94,7 @@ def killed_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
 
 def restarted_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
     """Render while the scheduler is killed and, with its workers, started again; return how many scenes are done."""
-    scenes = planned_scenes(preset, folder)
+    scenes = plan_scenes(preset, folder)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipelines.shared.flags import add_cache_argument
 from render.records.manifest import MANIFEST, SceneSpec, manifest_text, read_manifest
-from render.records.mirror import display_name, open_folder, shard_path, stored_size
+from render.records.mirror import display_name, measure_stored, open_folder, shard_path
 from render.records.packs import PACK, TARS, pack_tar, plan_tars, plan_text
 from render.records.shards import is_sealed
 from render.shared.errors import InputError
@@ -31,9 +31,9 @@ def main(args: argparse.Namespace) -> int:
     if not args.tar_mb > 0 or args.seed < 0:
         raise InputError(f"--tar-mb must be above 0 and --seed from 0 up, got {args.tar_mb:g} and {args.seed}")
     with open_folder(args.folder, args.cache_gb) as folder:
-        scenes = rendered(folder, skip_missing=args.skip_missing)
+        scenes = list_scenes(folder, skip_missing=args.skip_missing)
         by_id = {scene.id: scene for scene in scenes}
-        sizes = [stored_size(folder, scene)[0] for scene in scenes]
+        sizes = [measure_stored(folder, scene)[0] for scene in scenes]
         plan = plan_tars(scenes, sizes, round(args.tar_mb * 1e6), args.seed)
         store = Store(address(args.out) or f"file://{Path(args.out).resolve()}")
         there = {name for name in store.files() if name.startswith(f"{TARS}/")}
@@ -53,17 +53,17 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def rendered(folder: Path, *, skip_missing: bool) -> list[SceneSpec]:
+def list_scenes(folder: Path, *, skip_missing: bool) -> list[SceneSpec]:
     """Return the scenes to pack, in the order of the manifest.
 
     Raises:
         InputError: scenes that are still to be rendered, unless they are skipped.
     """
-    from sdps.data.scene_store import finished_scenes
+    from sdps.data.scene_store import list_finished
 
     scenes = read_manifest(folder)
     ready = {scene.id for split in {scene.split for scene in scenes}
-             for scene in finished_scenes(folder, split, skip_missing=skip_missing)}  # fmt: skip
+             for scene in list_finished(folder, split, skip_missing=skip_missing)}  # fmt: skip
     return [scene for scene in scenes if scene.id in ready]
 
 

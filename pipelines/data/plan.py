@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from pipelines.rendering.render_data import add_run_arguments, planned_scenes
+from pipelines.rendering.render_data import add_run_arguments, plan_scenes
 from pipelines.shared import presets
 from render.planning import budget
 from render.planning.chunks import view_groups
@@ -32,7 +32,7 @@ def main(args: argparse.Namespace) -> int:
     preset, out = presets.from_arguments(args)
     options = RunOptions(workers=args.workers, keep_free=round(args.keep_free * 1e9))
     with mirror.open_folder(out / "data", purpose="run") as folder:
-        scenes = planned_scenes(preset, folder)
+        scenes = plan_scenes(preset, folder)
         found = survey(folder, scenes)
         left = [scene for scene in scenes if scene.id not in found.done]
         sys.stdout.write(f"{mirror.display_name(folder)}: {composition(scenes)}\n")

@@ -107,7 +107,7 @@ def _plots(directions: np.ndarray, counts: PlanCounts, sample: Sample) -> dict[s
 
 def gallery(shown: Sequence[tuple[SceneSpec, np.ndarray]]) -> list[tuple[str, str, int, int]]:
     """Return (caption, data URI, width, height) of the scenes, of the best quality that keeps the page small."""
-    uris = _encoded([strip for _, strip in shown])
+    uris = _encode_pictures([strip for _, strip in shown])
     return [
         (_caption(scene), uri, strip.shape[1], strip.shape[0]) for (scene, strip), uri in zip(shown, uris, strict=True)
     ]
@@ -115,7 +115,7 @@ def gallery(shown: Sequence[tuple[SceneSpec, np.ndarray]]) -> list[tuple[str, st
 
 def _stages(stages: Sequence[Stage]) -> list[dict[str, Any]]:
     """Return what the page's script needs of scenes that are shown under each light."""
-    uris = _encoded([stage.sheet for stage in stages])
+    uris = _encode_pictures([stage.sheet for stage in stages])
     return [
         {
             "caption": _caption(stage.scene),
@@ -133,7 +133,7 @@ def _caption(scene: SceneSpec) -> str:
     return f"{scene.id}: {scene.shape}, {scene.material} ({scene.split})"
 
 
-def _encoded(shown: Sequence[np.ndarray]) -> list[str]:
+def _encode_pictures(shown: Sequence[np.ndarray]) -> list[str]:
     """Return data URIs of the best quality that keeps all of them below the budget."""
     for quality in QUALITIES:
         uris = [pictures.data_uri(picture, quality=quality) for picture in shown]

@@ -60,9 +60,9 @@ class Sample:
 
 def read_sample(folder: Path, there: Sequence[SceneSpec], count: int) -> Sample:
     """Read the scenes to be shown, and some more for the histograms, one shard at a time."""
-    shown = {there[place].id for place in _spread(len(there), count)}
-    places = np.union1d(_spread(len(there), count), _spread(len(there), MEASURED))
-    staged = set(pictures.spread(sorted(shown), STAGES))
+    shown = {there[place].id for place in _spread_evenly(len(there), count)}
+    places = np.union1d(_spread_evenly(len(there), count), _spread_evenly(len(there), MEASURED))
+    staged = set(pictures.spread_evenly(sorted(shown), STAGES))
     sample = Sample()
     for place in progress_bar(places, unit="shard", desc="preview"):
         scene = there[place]
@@ -81,7 +81,7 @@ def read_sample(folder: Path, there: Sequence[SceneSpec], count: int) -> Sample:
     return sample
 
 
-def _spread(length: int, count: int) -> np.ndarray:
+def _spread_evenly(length: int, count: int) -> np.ndarray:
     """Return up to `count` places spread evenly over `range(length)`."""
     return np.unique(np.linspace(0, length - 1, min(count, length)).round().astype(int))
 
@@ -93,17 +93,17 @@ def _some(values: np.ndarray) -> np.ndarray:
 def strip(shard: Shard) -> np.ndarray:  # (128, 512, 3) uint8
     """Show the normals and three images (or the material weights and two) under one exposure, at most 128 high."""
     picture = pictures.preview_strip(shard, lights=3)
-    return pictures.fitted(picture, SIDE)
+    return pictures.fit_height(picture, SIDE)
 
 
 def stage(scene: SceneSpec, shard: Shard) -> Stage:
     """Lay out the normals of a shard and its images, at most 96 high, under one exposure."""
-    chosen = pictures.spread(range(len(shard.images)), STAGE_LIGHTS)
+    chosen = pictures.spread_evenly(range(len(shard.images)), STAGE_LIGHTS)
     exposure = pictures.auto_exposure(shard.images[chosen], shard.mask)
     shown = [pictures.normal_map(shard.normals, shard.mask)]
     shown += [pictures.tone_map(shard.images[number], exposure) for number in chosen]
     side = min(STAGE_SIDE, shard.mask.shape[0])
-    cells = [pictures.fitted(picture, side) for picture in shown]
+    cells = [pictures.fit_height(picture, side) for picture in shown]
     height, width = cells[0].shape[:2]
     sheet = np.full((-(-len(cells) // STAGE_COLUMNS) * height, STAGE_COLUMNS * width, 3), 255, np.uint8)
     for number, cell in enumerate(cells):

@@ -12,7 +12,7 @@ from pipelines.evaluate.report.sections import Section, SectionWriter, Table
 from pipelines.evaluate.results import mean, publish
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import presets, scenes
-from pipelines.shared.flags import picked, split_list
+from pipelines.shared.flags import pick_names, split_list
 from render.materials import surfaces
 from render.records.manifest import SceneSpec
 from sdps.classical import registry
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Render or reuse the scenes, run the methods, print the tables and write results.json."""
     preset, out = presets.from_arguments(args)
-    names = picked("method", args.methods, registry.METHODS)
+    names = pick_names("method", args.methods, registry.METHODS)
     runners = tuple(Runner(parse(name, pretrained.require), pretrained.require) for name in names)
     bench, rows = Workbench(preset, out, runners), []
     for lights in split_list(args.light_sets) or LIGHT_SETS:

@@ -23,7 +23,7 @@ from pipelines.evaluate.results import mean, tables_text, weights_of
 from pipelines.evaluate.workbench import Workbench, lit_object
 from pipelines.shared import presets, using
 from pipelines.shared.cluster import cluster_config
-from pipelines.shared.pictures import spread
+from pipelines.shared.pictures import spread_evenly
 from pipelines.shared.presets import Preset, TestConfig
 from pipelines.shared.text_tables import number
 from render.records.manifest import SceneSpec
@@ -262,7 +262,7 @@ def choose(results: Sequence[SceneScores], name: str, count: int) -> list[SceneS
     chosen = []
     for shape in dict.fromkeys(result.scene.shape for result in results):
         ranked = sorted((r for r in results if r.scene.shape == shape), key=lambda r: _error(r, name))
-        chosen += spread(ranked, count)
+        chosen += spread_evenly(ranked, count)
     return chosen
 
 

@@ -50,9 +50,9 @@ def tiles(item: TestObject, found: Found, shown: Sequence[str], truth: str = "tr
 def _brightest(item: TestObject) -> np.ndarray:  # (H, W, 3)
     """Return the brightest of some images spread over all."""
     images = item.load()
-    candidates = [images[k : k + 1][0] for k in pictures.spread(range(len(images)), _LIT_CANDIDATES)]
+    candidates = [images[k : k + 1][0] for k in pictures.spread_evenly(range(len(images)), _LIT_CANDIDATES)]
     return max(candidates, key=lambda image: float(image[item.mask].mean()))
 
 
 def _fit(picture: np.ndarray) -> np.ndarray:
-    return pictures.fitted(picture, _SHOWN_HEIGHT) if picture.shape[0] > _SHOWN_HEIGHT else picture
+    return pictures.fit_height(picture, _SHOWN_HEIGHT) if picture.shape[0] > _SHOWN_HEIGHT else picture

@@ -102,7 +102,7 @@ def models_main(args: argparse.Namespace) -> int:
 
 def materials_main(args: argparse.Namespace) -> int:
     """List the chosen materials: category and error of the fit, or that they are measured or vary."""
-    chosen = _chosen(args.category, args.materials)
+    chosen = _choose_materials(args.category, args.materials)
     for name in chosen:
         sys.stdout.write(f"{name:<28} {_about(surfaces.load(name))}\n")
     sys.stdout.write(
@@ -125,7 +125,7 @@ def _about(surface: surfaces.Surface) -> str:
     return f"{material.category:<16} {error}"
 
 
-def _chosen(category: str | None, wanted: list[str] | None) -> list[str]:
+def _choose_materials(category: str | None, wanted: list[str] | None) -> list[str]:
     """Return the built-in materials, of one category if given, or the `wanted` names, categories and files."""
     if wanted:
         if category is not None:
@@ -166,11 +166,11 @@ def _material_sheet(names: list[str]) -> pictures.Image.Image:
         part = rough[first : first + _ROW]
         for shape, view in (("sphere", View(scale=0.95)), (_BLOB, _BLOB_VIEW)):
             for name in part:
-                (image,) = _rendered(shape, [name], view, size=160, spp=128, bounces=2)
+                (image,) = _render_materials(shape, [name], view, size=160, spp=128, bounces=2)
                 tiles.append((_label(name), pictures.tone_map(image, 1.2)))
     for first in range(0, len(plain), 16):
         part = plain[first : first + 16]
-        shown = _rendered("sphere", part, View(scale=0.95), size=120, spp=64, bounces=0)
+        shown = _render_materials("sphere", part, View(scale=0.95), size=120, spp=64, bounces=0)
         tiles += [(_label(name), pictures.tone_map(image, 1.2)) for name, image in zip(part, shown, strict=True)]
     return pictures.contact_sheet(tiles, columns=min(_ROW, len(rough)) if rough else min(10, len(tiles)))
 
@@ -186,12 +186,12 @@ def _shape_sheet() -> pictures.Image.Image:
     tiles = []
     for name in _SHAPES:
         view = View(scale=0.98) if name == "bunny" else _TURNED
-        (image,) = _rendered(name, ["lambertian:0.8"], view, size=160, spp=256, bounces=2)
+        (image,) = _render_materials(name, ["lambertian:0.8"], view, size=160, spp=256, bounces=2)
         tiles.append((name, pictures.tone_map(image)))
     return pictures.contact_sheet(tiles, columns=8)
 
 
-def _rendered(
+def _render_materials(
     shape: str, materials: list[str], view: View, *, size: int, spp: int, bounces: int
 ) -> Iterator[np.ndarray]:
     """Yield an image (H, W, 3) of a shape in each material under one light."""

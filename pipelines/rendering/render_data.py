@@ -68,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
         mirror.open_folder(out / "data", purpose="run") as folder,
         open_pool(cluster, folder, timeout=options.timeout) as pool,
     ):
-        scenes = planned_scenes(preset, folder)
+        scenes = plan_scenes(preset, folder)
         mirror.publish(folder)  # other machines, and `sdps data status`, see the plan
         summary = render_supervised(scenes, folder, options, pool=pool)
         if summary.lines:
@@ -77,7 +77,7 @@ def main(args: argparse.Namespace) -> int:
     return 1 if summary.failed or summary.skipped else 0
 
 
-def planned_scenes(preset: presets.Preset, folder: Path) -> list[SceneSpec]:
+def plan_scenes(preset: presets.Preset, folder: Path) -> list[SceneSpec]:
     """Return the plan of a data folder, written there with the configuration if it has none yet.
 
     Raises:

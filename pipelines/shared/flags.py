@@ -71,7 +71,7 @@ def split_list(values: list[str] | None) -> list[str]:
     return [item.strip() for value in values or [] for item in value.split(",") if item.strip()]
 
 
-def picked(kind: str, values: list[str] | None, known: Iterable[str]) -> list[str]:
+def pick_names(kind: str, values: list[str] | None, known: Iterable[str]) -> list[str]:
     """Return the names of a flag that takes a list, or all that are known.
 
     Raises:

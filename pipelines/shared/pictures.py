@@ -73,7 +73,7 @@ def weight_map(weights: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3
     return picture
 
 
-def fitted(picture: np.ndarray, side: int) -> np.ndarray:  # (h, w, 3) uint8
+def fit_height(picture: np.ndarray, side: int) -> np.ndarray:  # (h, w, 3) uint8
     """Bring a picture to a height of `side`: averaged down, or up by whole pixels where it is smaller."""
     height, width = picture.shape[:2]
     if height == side:
@@ -104,14 +104,14 @@ def scene_sheet(scenes: Sequence[SceneSpec], folder: Path, count: int = 24) -> I
         InputError: a shard is missing or damaged.
     """
     tiles = []
-    for scene in spread(scenes, count):
+    for scene in spread_evenly(scenes, count):
         shape = scene.shape if len(scene.shape) < 20 else scene.shape.split(":")[0]
         strip = preview_strip(read_shard(shard_path(folder, scene), scene), lights=3)
         tiles.append((f"{shape}, {scene.material}"[:60], strip))
     return contact_sheet(tiles, columns=min(3, len(tiles)))
 
 
-def spread(items: Sequence[T], count: int) -> list[T]:
+def spread_evenly(items: Sequence[T], count: int) -> list[T]:
     """Return up to `count` items, spread evenly over a sequence from its first to its last."""
     places = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
     return [items[place] for place in places]

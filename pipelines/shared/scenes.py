@@ -61,7 +61,7 @@ def slug(name: str) -> str:
     Folders are dropped; of a measured material the suffix stays, so that `chrome.binary` is not taken for `chrome`. The
     materials of a spatially varying name are joined by two hyphens: `stripes-7-chrome--blue-fabric`.
     """
-    pattern, materials = surfaces.split(name)
+    pattern, materials = surfaces.split_name(name)
     if pattern:
         return f"{pattern.kind}-{pattern.seed}-" + "--".join(slug(part) for part in materials)
     if name.startswith((f"{textured.MAPS}:", f"{textured.UV}:")):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pipelines.rendering.render_data import planned_scenes
+from pipelines.rendering.render_data import plan_scenes
 from pipelines.shared.presets import Preset
 from pipelines.shared.stream_config import StreamConfig
 from render.records.manifest import MANIFEST, SceneSpec, read_manifest
@@ -20,7 +20,7 @@ from sdps.training.distributed import Team
 from sdps.training.stages import Stage
 
 
-def open_streamed(
+def stream_scenes(
     scenes: Sequence[SceneSpec], options: SampleOptions, config: StreamConfig, *, batch: int, **places: Any
 ) -> StreamedScenes:
     """Return the source of batches that renders the training scenes of a plan; its renderer starts with `batches`.
@@ -37,19 +37,19 @@ def open_streamed(
     """
     scenes = [scene for scene in scenes if scene.split == "train"]
 
-    def open_stream(start: int) -> RenderedStream:
+    def start_stream(start: int) -> RenderedStream:
         return RenderedStream(
             scenes, seed=options.seed, start=start, depth=config.depth, threads=config.threads, recycle=config.recycle,
             timeout=config.timeout,
         )  # fmt: skip
 
     return StreamedScenes(
-        scenes, open_stream, options, batch=batch, window=min(config.window, max(len(scenes), batch)),
+        scenes, start_stream, options, batch=batch, window=min(config.window, max(len(scenes), batch)),
         fresh=config.fresh, **places,
     )  # fmt: skip
 
 
-def streamed(preset: Preset, data: Path, stage: Stage, here: Team, config: StreamConfig) -> StreamedScenes:
+def open_stream(preset: Preset, data: Path, stage: Stage, here: Team, config: StreamConfig) -> StreamedScenes:
     """Return the source that renders a preset's training scenes while `stage` learns from them.
 
     Only the plan is written to `data`, and the shards of the scenes held out for validation, if the stage validates.
@@ -67,7 +67,7 @@ def streamed(preset: Preset, data: Path, stage: Stage, here: Team, config: Strea
     if here.leads:
         _prepare(preset, data, validate=stage.config.validation_scenes > 0)
     here.wait()
-    return open_streamed(
+    return stream_scenes(
         read_manifest(data), stage.sample_options(), config, batch=stage.config.batch_scenes,
         pin_memory=here.device.type == "cuda", rank=here.rank, world=here.world,
     )  # fmt: skip
@@ -75,7 +75,7 @@ def streamed(preset: Preset, data: Path, stage: Stage, here: Team, config: Strea
 
 def _prepare(preset: Preset, data: Path, *, validate: bool) -> None:
     """Write the plan, and render the scenes held out."""
-    scenes = read_manifest(data) if (data / MANIFEST).is_file() else planned_scenes(preset, data)
+    scenes = read_manifest(data) if (data / MANIFEST).is_file() else plan_scenes(preset, data)
     held_out = [scene for scene in scenes if scene.split == "val"]
     if validate and held_out:
         render_supervised(held_out, data)

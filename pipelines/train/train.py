@@ -88,14 +88,14 @@ def train_run(
     from sdps.training.trainer import train
 
     run, out = preset.run(name), runs.folder
-    trained = {use: required(out, needed) for use, needed in run.requires.items()}
+    trained = {use: load_required(out, needed) for use, needed in run.requires.items()}
     stage = create_stage(name, run.model, run.config, trained)
     folder = out / MODELS_FOLDER / name
     source = None
     if args.stream:
-        from pipelines.train.streaming import streamed
+        from pipelines.train.streaming import open_stream
 
-        source = streamed(preset, data, stage, here, preset.stream)
+        source = open_stream(preset, data, stage, here, preset.stream)
     result = train(stage, data, folder, source=source, tensorboard=args.tensorboard, on_save=lambda: runs.send(name))
     if here.leads:
         presets.save_resolved(preset, folder)
@@ -116,7 +116,7 @@ def document(folder: Path, data: Path, weights: Path) -> None:
     write_model_card(folder / "MODEL_CARD.md", weights, data)
 
 
-def required(out: Path, name: str) -> "TrainedModel":
+def load_required(out: Path, name: str) -> "TrainedModel":
     """Load the weights that a run needs: those of another, shipped ones, or a file's."""
     from sdps.methods.pretrained import is_run, require, trained_file
     from sdps.models.checkpoint import load_weights

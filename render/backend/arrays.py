@@ -55,7 +55,7 @@ def packet(source: "mi.Float", entry: "mi.UInt32", width: int, active: "mi.Bool 
     return dr.gather(mi.ArrayXf, source, entry, active, shape=(width, dr.width(entry)))
 
 
-def interleaved(values: Sequence, width: int) -> "mi.Float":
+def interleave(values: Sequence, width: int) -> "mi.Float":
     """Return Float arrays (N) as one flat array (N * width) for `packet`, padded with zeros."""
     count = max(dr.width(value) for value in values)
     flat = dr.zeros(mi.Float, count * width)
@@ -79,7 +79,7 @@ class Columns:
             width = min(16, 1 << (len(left) - 1).bit_length())
             width = width // 2 if 4 * len(left) < 3 * width else width  # no more than a quarter is padding
             some, left = left[:width], left[width:]
-            self._packets.append((interleaved(some, width), width, len(some)))
+            self._packets.append((interleave(some, width), width, len(some)))
 
     def at(self, entry: "mi.UInt32") -> list:
         """Return the values at entries, Floats and tuples of Floats."""

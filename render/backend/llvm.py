@@ -7,7 +7,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from render.backend.variant import KNOWN_GOOD, OLDEST, REMEDY, find_llvm, unpacked_folders, works
+from render.backend.variant import KNOWN_GOOD, OLDEST, REMEDY, find_llvm, list_unpacked_folders, works
 from render.shared.errors import InputError
 from render.shared.files import atomic_folder
 
@@ -29,7 +29,7 @@ def fetch() -> str:
     """
     if shutil.which("apt-get") is None or shutil.which("dpkg-deb") is None:
         raise InputError(f"libLLVM cannot be fetched (this machine has no apt-get); {REMEDY}")
-    target = unpacked_folders()[0]
+    target = list_unpacked_folders()[0]
     with tempfile.TemporaryDirectory() as folder:
         settings = _prepare(Path(folder))
         said = _run(["apt-get", *settings, "update"], fail=False)

@@ -63,7 +63,7 @@ def llvm_version(path: Path) -> int | None:
     return None
 
 
-def unpacked_folders() -> list[Path]:
+def list_unpacked_folders() -> list[Path]:
     """Return the folders that may hold a libLLVM unpacked by `render.backend.llvm`, the one it unpacks into first.
 
     A run with a cache of its own uses what was fetched into the user's.
@@ -73,7 +73,7 @@ def unpacked_folders() -> list[Path]:
 
 def find_llvm() -> list[tuple[int, Path]]:
     """Return the (major version, path) of every libLLVM found, each library once, best candidate first."""
-    places = [(root, pattern.lstrip("/")) for root in (*unpacked_folders(), Path("/")) for pattern in _SEARCH]
+    places = [(root, pattern.lstrip("/")) for root in (*list_unpacked_folders(), Path("/")) for pattern in _SEARCH]
     found: dict[Path, tuple[int, Path]] = {}
     for root, pattern in places:
         for path in sorted(root.glob(pattern)):
@@ -101,7 +101,7 @@ def load_companions(llvm: Path) -> list[Path]:
 
     The system looks for them in its own folders only, but takes those that are loaded. Any other libLLVM has none.
     """
-    root = next((root for root in unpacked_folders() if llvm.resolve().is_relative_to(root.resolve())), None)
+    root = next((root for root in list_unpacked_folders() if llvm.resolve().is_relative_to(root.resolve())), None)
     if root is None:
         return []
     loaded, wanted = [], [llvm]

@@ -59,7 +59,7 @@ CONTENT = (
           "check the signs of normals and lights (x right, y up, z to the camera) and the order of the lights",
           light_checks.shading),
     Check("attached", ERROR, "dark where n.l is negative", "look for ambient light, or lights in another order",
-          light_checks.attached_shadows),
+          light_checks.check_attached_shadows),
     Check("exposure", WARNING, "bright enough for half precision", "check the irradiance (pi) and the material",
           light_checks.exposure),
     Check("unresolved", NOTE, "shading tells the handedness", "nothing to do unless most scenes are listed",

@@ -50,7 +50,7 @@ def measure_agreement(shard: Shard) -> Agreement:
     normals, intensity, lights = _object_pixels(shard)
     if not len(normals):
         return Agreement(float("nan"), dict.fromkeys(FLIPS, float("nan")))
-    ranks = _centred_ranks(intensity)
+    ranks = _rank_centred(intensity)
     upright = _correlation(ranks, normals, lights)
     margins = {}
     for name, direction in FLIPS.items():
@@ -109,7 +109,7 @@ def black_images(shard: Shard, limits: Limits) -> Complaints:
         yield f"{share:.0%} of the lights that face the object leave it black (the first is number {first})", share
 
 
-def attached_shadows(shard: Shard, limits: Limits) -> Complaints:
+def check_attached_shadows(shard: Shard, limits: Limits) -> Complaints:
     """Pixels turned from the light (n.l < -0.15) are dark, but for interreflections.
 
     The median over all such pairs of pixel and light, relative to the mean of pairs with n.l > 0.15.
@@ -153,7 +153,7 @@ def _cosines(lights: np.ndarray, normals: np.ndarray) -> np.ndarray:  # (L, P)
     return np.einsum("lpc,pc->lp", lights, normals)
 
 
-def _centred_ranks(values: np.ndarray) -> np.ndarray:
+def _rank_centred(values: np.ndarray) -> np.ndarray:
     """Return the ranks along the first axis, ties shared, minus their mean."""
     ranks = rankdata(values, axis=0)
     return ranks - ranks.mean(axis=0)
@@ -161,6 +161,6 @@ def _centred_ranks(values: np.ndarray) -> np.ndarray:
 
 def _correlation(ranks: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:  # (P,)
     """Correlate centred ranks (L, P) with those of max(n.l, 0), lights (L, P, 3); 0 where either is constant."""
-    expected = _centred_ranks(np.maximum(_cosines(lights, normals), 0.0))
+    expected = _rank_centred(np.maximum(_cosines(lights, normals), 0.0))
     norm = np.sqrt((ranks**2).sum(axis=0) * (expected**2).sum(axis=0))
     return (ranks * expected).sum(axis=0) / np.where(norm > 0, norm, 1.0)

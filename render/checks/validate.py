@@ -131,7 +131,7 @@ def validate(
         left=sum(scene.id not in present for scene in scenes),
         checked=len(chosen),
         findings=tuple(sorted(findings, key=_rank)),
-        statistics=_spread(statistics),
+        statistics=_summarise_measures(statistics),
         limits=limits,
         manifest=file_hash(folder / MANIFEST),
         skipped=tuple(name for name, has in (("checksum", sums), ("weights", varying)) if not has),
@@ -191,7 +191,7 @@ def _rank(finding: Finding) -> tuple[int, float, str]:
     return list(CHECKS).index(finding.check), -finding.severity, finding.where
 
 
-def _spread(statistics: Sequence[SceneStatistics]) -> dict[str, dict[str, float]]:
+def _summarise_measures(statistics: Sequence[SceneStatistics]) -> dict[str, dict[str, float]]:
     """Summarise each measure over the shards."""
     if not statistics:
         return {}

@@ -29,7 +29,7 @@ def bounce(
         chosen, u, v = random_variates(vertices.sample, stream(seed, (first << 8) + depth))
     lobe, _, _ = random_variates(vertices.sample, stream(seed, (first << 8) + 128 + depth))
     if any(normal is not None for normal in vertices.turned):
-        towards, density, factors = _mixed_frames(vertices, surfaces, chosen, lobe, mi.Point2f(u, v))
+        towards, density, factors = _draw_mixed_frames(vertices, surfaces, chosen, lobe, mi.Point2f(u, v))
     else:
         frame = mi.Frame3f(vertices.normal)
         wi = frame.to_local(vertices.wi)
@@ -50,7 +50,7 @@ def bounce(
     return ray, throughput
 
 
-def _mixed_frames(vertices: Vertices, surfaces: PackedSurfaces, chosen: Any, lobe: Any, point: Any) -> tuple:
+def _draw_mixed_frames(vertices: Vertices, surfaces: PackedSurfaces, chosen: Any, lobe: Any, point: Any) -> tuple:
     """Do the same where some surfaces have a relief: each of these is drawn for alone, the others together.
 
     Returns:

@@ -130,7 +130,7 @@ def normal_spread(scene: Any, camera: Any, prim: Any, uv: Any) -> tuple:
         uv: (N) barycentric coordinates of corners 1 and 2.
     """
     corners = scene.triangles(prim)
-    centre, spread = centroid(corners), _spread(corners, uv.x, uv.y, camera)
+    centre, spread = centroid(corners), _solid_angle_ratio(corners, uv.x, uv.y, camera)
     dr.eval(centre, spread)
     return centre, spread
 
@@ -316,7 +316,7 @@ def _draw(
     p0, p1, p2 = corners.positions
     point = p0 + b1 * (p1 - p0) + b2 * (p2 - p0)
     facet = dr.normalize(dr.cross(p1 - p0, p2 - p0))
-    spread = _spread(corners, b1, b2, camera)
+    spread = _solid_angle_ratio(corners, b1, b2, camera)
     dr.eval(point, normal, facet, prim, light, spread, s)
     return point, normal, facet, prim, light, spread, s
 
@@ -326,7 +326,7 @@ def _edges(normals: tuple) -> tuple:
     return normals[0], normals[1] - normals[0], normals[2] - normals[0]
 
 
-def _spread(corners: Any, b1: Any, b2: Any, camera: Any) -> Any:
+def _solid_angle_ratio(corners: Any, b1: Any, b2: Any, camera: Any) -> Any:
     """Return d(solid angle) / d(image area) at barycentric coordinates of corners 1 and 2; zero where it is unsafe.
 
     With m = N b / |N b| the solid angle is |det N| / |N b|^3 per unit of barycentric area, and the image area is the

@@ -14,7 +14,7 @@ from render.kernel.bounces import bounce
 from render.kernel.camera import Camera
 from render.kernel.emitters import DistantLights, NearLights, place
 from render.kernel.vertices import Vertices, take
-from render.kernel.visibility import WORD, grouped_visibility, probe_count, probed_visibility, visibility
+from render.kernel.visibility import WORD, group_visibility, probe_count, probe_visibility, visibility
 from render.materials.kernels.packed import PackedSurfaces
 from render.materials.kernels.textures.cover import Place
 from render.records.manifest import View
@@ -97,7 +97,7 @@ def trace(
         segments = _segments(sample, spp, size * size)
         rays = {"scene": scene, "position": position, "normal": normal, "facet": facet, "emitters": emitters}
         if depth == 0:
-            seen = _seen(rays, len(lights), sample, spp, segments, probe)
+            seen = _find_lights(rays, len(lights), sample, spp, segments, probe)
         else:
             seen = None if composed else visibility(**rays, lights=len(lights), coherent=False)
         centre, spread = highlights.normal_spread(scene, camera, prim, uv) if depth == 0 and halves else (None, None)
@@ -107,20 +107,20 @@ def trace(
         if depth < bounces:
             ray, throughput = bounce(depths[-1], surfaces, seed, depth + 1, first, spp, composed)
     if composed and len(depths) > 1:
-        depths[1:] = _seen_together(scene, depths[1:], emitters, len(lights))
+        depths[1:] = _find_lights_together(scene, depths[1:], emitters, len(lights))
     mirrors = (scene, camera, emitters, halves, len(lights), surfaces, spp, seed, first)
     glints = highlights.find(*mirrors) if halves and depths else None
     shared = emitters, parallel, halves, len(lights), size, spp
     return Paths(tuple(depths), glints, *shared, *_sums(depths, camera, surfaces, scene.mesh, spp))
 
 
-def _seen_together(scene: Any, depths: list[Vertices], emitters: Any, lights: int) -> list[Vertices]:
+def _find_lights_together(scene: Any, depths: list[Vertices], emitters: Any, lights: int) -> list[Vertices]:
     """Find the lights that the vertices of several depths see, which they share with others close to them."""
     positions, normals, facets = (
         np.concatenate([[np.array(row) for row in column] for column in columns], axis=1)  # row by row: see `place`
         for columns in zip(*((vertices.position, vertices.normal, vertices.facet) for vertices in depths), strict=True)
     )
-    bits = grouped_visibility(scene, positions, normals, facets, emitters, lights)
+    bits = group_visibility(scene, positions, normals, facets, emitters, lights)
     total, first, found = opaque(mi.UInt32(positions.shape[1])), 0, []
     for vertices in depths:
         width, lane = opaque(mi.UInt32(vertices.count)), dr.arange(mi.UInt32, vertices.count * -(-lights // WORD))
@@ -132,12 +132,12 @@ def _seen_together(scene: Any, depths: list[Vertices], emitters: Any, lights: in
     return found
 
 
-def _seen(rays: dict[str, Any], lights: int, sample: Any, spp: int, segments: tuple, probe: bool) -> Any:
+def _find_lights(rays: dict[str, Any], lights: int, sample: Any, spp: int, segments: tuple, probe: bool) -> Any:
     """Return what the camera's hits see, whose samples share it where they may."""
     if not probe:
         return visibility(**rays, lights=lights, coherent=True)
     probes = sample % opaque(mi.UInt32(spp)) < opaque(mi.UInt32(probe_count(spp)))
-    return probed_visibility(**rays, lights=lights, probes=probes, segments=segments[1:])
+    return probe_visibility(**rays, lights=lights, probes=probes, segments=segments[1:])
 
 
 def _camera_rays(camera: Camera, spp: int, seed: int, first: int) -> tuple["mi.Ray3f", "mi.UInt32"]:

@@ -47,7 +47,7 @@ def visibility(scene: Any, position: Any, normal: Any, facet: Any, emitters: Any
     return _cast(scene, position, normal, facet, emitters, lights, coherent)[0]
 
 
-def probed_visibility(
+def probe_visibility(
     scene: Any, position: Any, normal: Any, facet: Any, emitters: Any, lights: int, probes: Any, segments: tuple
 ) -> Any:
     """Do the same at the camera's hits, sorted by pixel, asking every light only where the probes disagree.
@@ -77,7 +77,7 @@ def probed_visibility(
     return _complete(scene, (position, normal, facet), emitters, bitmask, probes, agreed, segments, lights)
 
 
-def grouped_visibility(
+def group_visibility(
     scene: Any, positions: np.ndarray, normals: np.ndarray, facets: np.ndarray, emitters: Any, lights: int
 ) -> Any:
     """Do the same at vertices in any order, of which those share that lie in one cell and face one way.
@@ -98,7 +98,7 @@ def grouped_visibility(
     )
     probes = upload(mi.UInt32, rank) < _LEAST_PROBES
     segments = upload(mi.UInt32, start.astype(np.uint32)), upload(mi.UInt32, length.astype(np.uint32))
-    bits = probed_visibility(scene, mi.Point3f(position), normal, facet, emitters, lights, probes, segments)
+    bits = probe_visibility(scene, mi.Point3f(position), normal, facet, emitters, lights, probes, segments)
     width, lane = opaque(mi.UInt32(count)), dr.arange(mi.UInt32, count * groups)
     word = lane // width * width
     bitmask = dr.gather(mi.UInt32, bits, word + dr.gather(mi.UInt32, upload(mi.UInt32, place), lane - word))

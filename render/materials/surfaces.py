@@ -63,7 +63,7 @@ class Surface:
         )
 
 
-def split(name: str) -> tuple[Pattern | None, tuple[str, ...]]:
+def split_name(name: str) -> tuple[Pattern | None, tuple[str, ...]]:
     """Split a name into its pattern, if it has one, and the names of its materials; nothing is loaded.
 
     Raises:
@@ -106,5 +106,5 @@ def load(name: str) -> Surface:
     Raises:
         InputError: an unknown pattern or material (with the nearest), or a file that cannot be read.
     """
-    pattern, names = split(str(name))
+    pattern, names = split_name(str(name))
     return Surface(str(name), tuple(library.load(part) for part in names), pattern)

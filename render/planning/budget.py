@@ -105,7 +105,7 @@ def recent_pace(lines: Sequence[dict[str, Any]], workers: int) -> Pace | None:
     return Pace(statistics.median(seconds), workers) if seconds else None
 
 
-def sampled_pace(lines: Sequence[dict[str, Any]], loads: float, workers: int) -> Pace | None:
+def estimate_pace(lines: Sequence[dict[str, Any]], loads: float, workers: int) -> Pace | None:
     """Estimate the pace of a whole run from a sample whose views are spread over many shapes.
 
     Args:

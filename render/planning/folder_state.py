@@ -89,12 +89,12 @@ def scene_rates(runs: Sequence[Sequence[dict[str, Any]]]) -> dict[str, float | N
         # Over all, the first scene's own time counts; in a window, the first scene is only its start.
         whole = len(recent) == len(times)
         start = min((first for first, _ in spans), default=0.0) if whole else recent[0]
-        elapsed = covered([(max(first, start), last) for first, last in spans if last > start])
+        elapsed = measure_union([(max(first, start), last) for first, last in spans if last > start])
         rates[name] = 3600 * (len(recent) - (not whole)) / elapsed if elapsed > 0 else None
     return rates
 
 
-def covered(spans: Sequence[tuple[float, float]]) -> float:
+def measure_union(spans: Sequence[tuple[float, float]]) -> float:
     """Return the length of the union of intervals: machines that work at the same time count once."""
     total, end = 0.0, float("-inf")
     for first, last in sorted(spans):

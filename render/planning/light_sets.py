@@ -15,7 +15,7 @@ from render.shared.config import read_yaml
 from render.shared.errors import InputError, unknown
 from render.shared.files import read_text
 from render.shared.seeds import generator
-from render.shared.tables import numbered_lines
+from render.shared.tables import number_lines
 
 MAX_ANGLE = 88.0  # degrees; beyond it the image is black but for rim pixels
 BIASED_MIN_Y = -0.1
@@ -123,7 +123,7 @@ def load(name: str) -> np.ndarray:  # (L, 3)
         raise unknown("light set", name, known, "or give a file of directions")
     if path.suffix in (".yaml", ".yml"):
         return check(read_yaml(path).get("directions"), name)
-    lines = [(number, line.partition("#")[0].strip()) for number, line in numbered_lines(read_text(path))]
+    lines = [(number, line.partition("#")[0].strip()) for number, line in number_lines(read_text(path))]
     lines = [(number, line) for number, line in lines if line]
     return check([line.replace(",", " ").split() for _, line in lines], name, [number for number, _ in lines])
 

@@ -196,21 +196,21 @@ def _views(config: DataConfig, family: str, number: int, shape: str) -> list[Vie
     """Draw the poses of a shape, or None when one of them cannot be framed as asked."""
     if not config.is_framed(family):
         return [
-            _seen(config, (family, number, view), generator(config.seed, family, number, view, "view"))
+            _draw_pose(config, (family, number, view), generator(config.seed, family, number, view, "view"))
             for view in range(config.views)
         ]
     from render.shapes import load
 
     mesh, views = load(shape), []
     for view in range(config.views):
-        pose = _framed_view(config, family, (family, number, view), mesh)
+        pose = _draw_view(config, family, (family, number, view), mesh)
         if pose is None:
             return None
         views.append(pose)
     return views
 
 
-def _seen(config: DataConfig, keys: tuple[Any, ...], rng: np.random.Generator) -> View:
+def _draw_pose(config: DataConfig, keys: tuple[Any, ...], rng: np.random.Generator) -> View:
     """Draw a pose, and the camera's distance where it is perspective."""
     pose = random_view(config, keys[0], rng)
     halves = generator(config.seed, *keys, "cameras")
@@ -234,7 +234,7 @@ def _near(config: DataConfig, keys: tuple[Any, ...]) -> tuple[float, ...]:
     return _distances(config.near_light_distance, config.light_count, rng)
 
 
-def _framed_view(config: DataConfig, family: str, keys: tuple[Any, ...], mesh: Any) -> View | None:
+def _draw_view(config: DataConfig, family: str, keys: tuple[Any, ...], mesh: Any) -> View | None:
     """Draw poses until one, or one of its tiles, shows enough of the shape."""
     from render.planning.framing import measure, tile_view
 
@@ -242,7 +242,7 @@ def _framed_view(config: DataConfig, family: str, keys: tuple[Any, ...], mesh: A
     least = max(config.min_foreground.get(family, 0.0), EMPTY)
     for attempt in range(POSES_TRIED):
         again = (attempt,) if attempt else ()
-        pose = _seen(config, keys, generator(config.seed, *keys, "view", *again))
+        pose = _draw_pose(config, keys, generator(config.seed, *keys, "view", *again))
         framing = measure(mesh, pose, tiles)
         fits = (framing.foreground >= least) & (framing.spread >= config.min_normal_spread.get(family, 0.0))
         if fits.any():

@@ -64,7 +64,7 @@ def family(shape: str) -> str:
 def components(material: str) -> tuple[str, ...]:
     """Return the plain materials of a name; several for a spatially-varying one (`stripes:7:chrome+steel`)."""
     try:
-        return surfaces.split(material)[1]
+        return surfaces.split_name(material)[1]
     except InputError:
         return (material,)
 

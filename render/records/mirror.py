@@ -330,7 +330,7 @@ def select_rendered(folder: str | Path, scenes: Iterable[SceneSpec]) -> list[Sce
     return [scene for scene in scenes if (folder / scene.file).is_file()]
 
 
-def stored_size(folder: Path, scene: SceneSpec) -> tuple[int, str]:
+def measure_stored(folder: Path, scene: SceneSpec) -> tuple[int, str]:
     """Return a shard's bytes and what distinguishes it from one written later.
 
     Raises:

@@ -41,7 +41,7 @@ def plan_tars(scenes: Sequence[SceneSpec], sizes: Sequence[int], limit: int, see
         filled, number, name = limit, -1, ""
         for place in generator(seed, "pack", split).permutation(places):
             scene, size = scenes[place], sizes[place]
-            needed = _padded_size(size) + _padded_size(len(scene.line()))
+            needed = _pad_size(size) + _pad_size(len(scene.line()))
             if filled + needed > limit:
                 filled, number = 0, number + 1
                 name = f"{TARS}/{split}-{number:06d}.tar"
@@ -51,7 +51,7 @@ def plan_tars(scenes: Sequence[SceneSpec], sizes: Sequence[int], limit: int, see
     return plan
 
 
-def _padded_size(size: int) -> int:
+def _pad_size(size: int) -> int:
     """Return what a member takes in a tar, header included."""
     return _BLOCK * (1 + -(-size // _BLOCK))
 

@@ -64,7 +64,7 @@ class Mismatch(InputError):
 
 
 @cache
-def installed() -> dict[str, str]:
+def describe_installation() -> dict[str, str]:
     """Return what decides the bytes of shards, as installed here: versions, code, fitted materials."""
     found = {name: version for name, version in provenance.versions().items() if name != "python"}
     materials = hashlib.sha256()
@@ -81,7 +81,7 @@ def requirements(shapes: Iterable[str], materials: Iterable[str]) -> dict[str, s
 
     parts = {part for material in set(materials) for part in components(material)}
     places = {*map(registry.own_file, shapes), *map(library.own_file, parts)}
-    return installed() | {f"{_FILE}{place}": _content_hash(place) for place in places if place is not None}
+    return describe_installation() | {f"{_FILE}{place}": _content_hash(place) for place in places if place is not None}
 
 
 def _content_hash(place: Path) -> str:

@@ -75,13 +75,13 @@ class RenderedView:
         return Shard(
             scene_id=scene.id, images=to_half(self.images), normals=self.normals, depth=self.depth, mask=self.mask,
             coverage=self.coverage, light_directions=self.light_directions, weights=self.weights,
-            materials=surface_names.split(scene.material)[1] if self.weights is not None else (),
+            materials=surface_names.split_name(scene.material)[1] if self.weights is not None else (),
             light_positions=self.light_positions, objects=self.objects,
             provenance=_describe(scene),
         )  # fmt: skip
 
 
-def rendered_views(
+def trace_views(
     built: "Scene", scenes: Sequence[SceneSpec], surfaces: "PackedSurfaces", only: Sequence[int]
 ) -> Iterator[RenderedView]:
     """Trace the rays of a view now; shade its scenes one by one as they are asked for.

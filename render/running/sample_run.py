@@ -54,13 +54,13 @@ def render_sample(scenes: list[SceneSpec], options: RunOptions) -> Sample:
     measured = [(by_id[line["id"]], line["bytes"]) for line in summary.lines]
     ids, sampled = {scene.id for scene in scenes}, set(by_id)
     loads = len(cut(scenes, ids, workers)) / len(scenes) / (len(cut(picked, sampled, workers)) / len(picked))
-    pace = budget.sampled_pace(_settled(summary.lines, by_id), loads, workers)
+    pace = budget.estimate_pace(_drop_first_views(summary.lines, by_id), loads, workers)
     assert pace is not None  # there are lines
     failures = [line["reason"] for line in summary.failed]
     return Sample(len(views), len(summary.lines), pace, measured, failures)
 
 
-def _settled(lines: list[dict[str, Any]], by_id: dict[str, SceneSpec]) -> list[dict[str, Any]]:
+def _drop_first_views(lines: list[dict[str, Any]], by_id: dict[str, SceneSpec]) -> list[dict[str, Any]]:
     """Leave out the first view of every process, which loads libraries and compiles kernels, if others are left."""
     first = {line["worker"]: by_id[line["id"]].seed for line in reversed(lines)}
     return [line for line in lines if by_id[line["id"]].seed != first[line["worker"]]] or lines

@@ -16,7 +16,7 @@ from render.materials.kernels.packed import pack
 from render.planning.chunks import cut
 from render.records.manifest import SceneSpec
 from render.records.shards import Shard, is_whole, write_shard
-from render.running.rendered_view import rendered_views
+from render.running.rendered_view import trace_views
 from render.shapes import load as load_shape
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
@@ -118,7 +118,7 @@ def group_shards(
     only = [number for number, scene in enumerate(group) if scene.id in missing]
     with stages.time("render"):
         surfaces = pack([scene.material for scene in group], built.mesh)
-        views = rendered_views(built, group, surfaces, only)
+        views = trace_views(built, group, surfaces, only)
     stages.spread("view", len(only))
     for view in stages.each("render", views):
         yield view.scene, view.shard()

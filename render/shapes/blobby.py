@@ -69,11 +69,11 @@ def blobby(seed: int) -> TriangleMesh:
     rng = seeds.generator(seed, "blobby")
     kind = ("radial", "flowing", "merged")[rng.integers(3)]
     if kind == "merged":
-        return polygonise(merged_balls(rng), half_size=1.8, triangles=60_000).normalised()
-    return displaced_sphere(rng, draw_parameters(rng, flowing=kind == "flowing")).normalised()
+        return polygonise(merge_balls(rng), half_size=1.8, triangles=60_000).normalised()
+    return displace_sphere(rng, draw_parameters(rng, flowing=kind == "flowing")).normalised()
 
 
-def merged_balls(rng: np.random.Generator) -> Field:
+def merge_balls(rng: np.random.Generator) -> Field:
     """Merge a chain of balls, each grown onto an earlier one, and cover the whole with smooth noise."""
     centres, radii = [np.zeros(3)], [rng.uniform(0.4, 0.7)]
     for _ in range(int(rng.integers(1, 9))):
@@ -85,14 +85,14 @@ def merged_balls(rng: np.random.Generator) -> Field:
     middle = np.mean(centres, axis=0)
     extent = max(float(np.linalg.norm(centre - middle)) + radius for centre, radius in zip(centres, radii, strict=True))
     balls = [sdf.ball((c - middle) / extent, r / extent) for c, r in zip(centres, radii, strict=True)]
-    solid = sdf.warped(sdf.union(balls, rng.uniform(0.08, 0.35)), vector_waves(rng, 1.5, 4), rng.uniform(0.0, 0.12))
+    solid = sdf.warp(sdf.union(balls, rng.uniform(0.08, 0.35)), vector_waves(rng, 1.5, 4), rng.uniform(0.0, 0.12))
     frequency = np.exp(rng.uniform(np.log(4), np.log(11)))
     waves = scalar_waves(rng, frequency, frequency * rng.uniform(1.2, 2.5))
     relief = sdf.furrows(waves, 0.4) if rng.random() < 0.4 else waves
-    return sdf.displaced(solid, relief, rng.uniform(0.0, 0.3) / frequency)
+    return sdf.displace(solid, relief, rng.uniform(0.0, 0.3) / frequency)
 
 
-def displaced_sphere(rng: np.random.Generator, parameters: BlobParameters) -> TriangleMesh:
+def displace_sphere(rng: np.random.Generator, parameters: BlobParameters) -> TriangleMesh:
     """Displace and carry the unit sphere; normals are exact, from tangents pushed through every map.
 
     Args:

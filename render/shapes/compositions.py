@@ -90,7 +90,7 @@ def links(rng: np.random.Generator) -> list[TriangleMesh]:
         tube = ring * rng.uniform(0.2, 0.33)
         form = sdf.torus([0, 0, 0], ring, tube, sdf.rotation("x", roll))
         if rng.random() < 0.6:
-            form = sdf.displaced(form, scalar_waves(rng, 4, 30, slope=1.2), tube * rng.uniform(0.02, 0.08))
+            form = sdf.displace(form, scalar_waves(rng, 4, 30, slope=1.2), tube * rng.uniform(0.02, 0.08))
         link = _move(_mesh(form, 1.2), np.array([position, 0, 0]))
         if number:
             link = _move(link, np.array([1.0, 0, 0]) * free_path(link, chain[-1], np.array([1.0, 0, 0])))

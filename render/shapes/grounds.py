@@ -20,7 +20,7 @@ def ground(rng: np.random.Generator) -> Field:
     else:
         slab = sdf.box([0, -THICKNESS, 0], [size, THICKNESS, size * rng.uniform(0.8, 1)], 0.03)
     if rng.random() < 0.4:
-        slab = sdf.displaced(slab, scalar_waves(rng, 2, 25, slope=1.5), rng.uniform(0.005, 0.02))
+        slab = sdf.displace(slab, scalar_waves(rng, 2, 25, slope=1.5), rng.uniform(0.005, 0.02))
     return slab
 
 
@@ -35,15 +35,15 @@ def corner(rng: np.random.Generator) -> Field:
         slabs.append(sdf.box([-half + wall, height - 2 * wall, 0], [wall, height, half], 0.02))
     stage = sdf.union(slabs, rng.choice([0.02, 0.1]))
     if rng.random() < 0.4:
-        stage = sdf.displaced(stage, scalar_waves(rng, 3, 30, slope=1.3), rng.uniform(0.004, 0.015))
+        stage = sdf.displace(stage, scalar_waves(rng, 3, 30, slope=1.3), rng.uniform(0.004, 0.015))
     return stage
 
 
 def bowl(rng: np.random.Generator) -> Field:
     """Build a bowl or dish on a foot, its rim at y = 0 and of radius 1 outside, round or with a waved wall."""
     wall, depth = rng.uniform(0.04, 0.09), rng.uniform(0.45, 0.95)
-    outside = sdf.squeezed(sdf.ball([0, 0, 0], 1.0), [1, depth, 1])
-    inside = sdf.squeezed(sdf.ball([0, 0, 0], 1 - wall), [1, (depth - wall) / (1 - wall), 1])
+    outside = sdf.squeeze(sdf.ball([0, 0, 0], 1.0), [1, depth, 1])
+    inside = sdf.squeeze(sdf.ball([0, 0, 0], 1 - wall), [1, (depth - wall) / (1 - wall), 1])
     shell = sdf.subtraction(outside, inside)
     lobes, amount = int(rng.integers(5, 13)), rng.choice([0.0, rng.uniform(0.01, 0.03)])
     below = sdf.halfspace([0, 1, 0], 0.0)
@@ -64,8 +64,8 @@ def niche(rng: np.random.Generator) -> Field:
     block = sdf.box([0, top / 2 - THICKNESS, -deep / 2], [radius + 0.3, top / 2 + THICKNESS, deep / 2 + 0.12], 0.03)
     if rng.random() < 0.6:  # an apse: half a cylinder under a quarter of a ball
         hollow = sdf.union([
-            sdf.squeezed(sdf.cylinder([0, 2, 0], radius, 2), [1, high / 4, deep / radius]),
-            sdf.placed(sdf.squeezed(sdf.ball([0, 0, 0], radius), [1, 1, deep / radius]), [0, high, 0]),
+            sdf.squeeze(sdf.cylinder([0, 2, 0], radius, 2), [1, high / 4, deep / radius]),
+            sdf.place(sdf.squeeze(sdf.ball([0, 0, 0], radius), [1, 1, deep / radius]), [0, high, 0]),
         ])  # fmt: skip
         front = sdf.box([0, high / 2, 0.5], [radius, high / 2, 0.5])
         hollow = sdf.union([hollow, front])
@@ -74,7 +74,7 @@ def niche(rng: np.random.Generator) -> Field:
     floor = sdf.box([0, -THICKNESS, 0.3], [radius + 0.3, THICKNESS, 0.65], 0.02)
     stage = sdf.union([sdf.subtraction(block, hollow, 0.02), floor])
     if rng.random() < 0.4:
-        stage = sdf.displaced(stage, scalar_waves(rng, 4, 30, slope=1.3), rng.uniform(0.003, 0.012))
+        stage = sdf.displace(stage, scalar_waves(rng, 4, 30, slope=1.3), rng.uniform(0.003, 0.012))
     return stage
 
 
@@ -86,7 +86,7 @@ def hollow(rng: np.random.Generator) -> Field:
 def shell(rng: np.random.Generator) -> Field:
     """Build a thick shell with round windows through which its inside is seen."""
     size, wall = np.exp(rng.normal(0, 0.12, 3)), rng.uniform(0.05, 0.12)
-    body = sdf.squeezed(sdf.ball([0, 0, 0], 1.0), size / size.max())
+    body = sdf.squeeze(sdf.ball([0, 0, 0], 1.0), size / size.max())
     solid = sdf.subtraction(body, lambda p: body(p) + np.float32(wall), 0.02)
     for way in _ways(rng, int(rng.integers(2, 7))):
         solid = sdf.subtraction(solid, sdf.cone([0, 0, 0], 1.2 * way, 0.05, rng.uniform(0.3, 0.65)), 0.04)

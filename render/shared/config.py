@@ -79,7 +79,7 @@ def parse_yaml(text: str, where: str) -> Any:
     try:
         check_digits(text)
         value = yaml.safe_load(text)
-        return _unshared(value, [_MOST_VALUES]) if "&" in text else value
+        return _copy_aliases(value, [_MOST_VALUES]) if "&" in text else value
     # The library lets through what its conversions raise: ValueError of dates, KeyError of `!!bool maybe`, and
     # RecursionError of lists in lists.
     except Exception as error:
@@ -89,7 +89,7 @@ def parse_yaml(text: str, where: str) -> Any:
         raise InputError(f"{where}:{line} is not valid YAML ({reason}); correct it there") from error
 
 
-def _unshared(value: Any, left: list[int]) -> Any:
+def _copy_aliases(value: Any, left: list[int]) -> Any:
     """Copy what references within YAML share, so that a change in one place is none in another; `left` counts down."""
     if not isinstance(value, dict | list | tuple):
         return value
@@ -98,8 +98,8 @@ def _unshared(value: Any, left: list[int]) -> Any:
         raise ValueError(f"references within it make more than {_MOST_VALUES:,} values of it")
     try:
         if isinstance(value, dict):
-            return {key: _unshared(item, left) for key, item in value.items()}
-        return type(value)(_unshared(item, left) for item in value)
+            return {key: _copy_aliases(item, left) for key, item in value.items()}
+        return type(value)(_copy_aliases(item, left) for item in value)
     except RecursionError:
         raise ValueError("nested too deeply, or a reference to what holds it") from None
 

@@ -42,7 +42,7 @@ def unknown(kind: str, name: str, known: Iterable[str], remedy: str = "") -> Inp
     return InputError(f"unknown {kind} {name!r}{hint}{'; ' + remedy if remedy else ''}")
 
 
-def listed(names: Sequence[str], most: int = 10) -> str:
+def list_names(names: Sequence[str], most: int = 10) -> str:
     """Write names one after another; of many the first, and how many more there are."""
     if len(names) <= most + 1:
         return ", ".join(names)

@@ -107,7 +107,7 @@ class Store:
         found = self._patiently("list", "", lambda: driver.find(root, detail=True))
         prefix = len(root.rstrip("/")) + 1
         return {
-            name[prefix:]: _stored(info)
+            name[prefix:]: _read_description(info)
             for name, info in found.items()
             if len(name) > prefix and not is_temporary(name.rpartition("/")[2])  # being written, in a folder
         }
@@ -118,7 +118,7 @@ class Store:
         def one(name: str) -> Stored | None:
             driver, root = self._open()
             try:
-                return _stored(self._patiently("look at", name, lambda: driver.info(f"{root}/{name}")))
+                return _read_description(self._patiently("look at", name, lambda: driver.info(f"{root}/{name}")))
             except Missing:
                 return None
 
@@ -197,7 +197,7 @@ def _put(driver: Any, path: str, data: bytes, **mode: str) -> None:
         Path(part).unlink(missing_ok=True)
 
 
-def _stored(info: dict[str, Any]) -> Stored:
+def _read_description(info: dict[str, Any]) -> Stored:
     """Return what the project needs of a driver's description."""
     return Stored(int(info.get("size") or 0), str(next((info[key] for key in _VERSIONS if info.get(key)), "")))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from render.shared.errors import InputError, listed
+from render.shared.errors import InputError, list_names
 from render.shared.files import read_text
 
 UNIT_TOLERANCE = 0.01
@@ -33,7 +33,7 @@ def lines_text(lines: Sequence[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def numbered_lines(text: str) -> list[tuple[int, str]]:
+def number_lines(text: str) -> list[tuple[int, str]]:
     """Return the lines of a text with their numbers from 1, as an editor counts them, blank ones included.
 
     `str.splitlines` breaks lines at characters where no editor does.
@@ -48,7 +48,7 @@ def read_names(path: str | Path) -> list[str]:
         InputError: missing or empty file, a '#' (NumPy, which several loaders parse with, takes it for a comment),
             or a name twice.
     """
-    names = [line.strip() for _, line in numbered_lines(read_text(path)) if line.strip()]
+    names = [line.strip() for _, line in number_lines(read_text(path)) if line.strip()]
     if not names:
         raise InputError(f"{path}: no name in it; write one per line")
     for name in names:
@@ -57,7 +57,7 @@ def read_names(path: str | Path) -> list[str]:
     if len(set(names)) < len(names):
         twice = [name for name, count in Counter(names).items() if count > 1]
         be = "is" if len(twice) == 1 else "are"
-        raise InputError(f"{path}: {listed(list(map(repr, twice)))} {be} listed twice; remove one of the lines")
+        raise InputError(f"{path}: {list_names(list(map(repr, twice)))} {be} listed twice; remove one of the lines")
     return names
 
 
@@ -68,7 +68,7 @@ def read_numbers(path: str | Path, columns: int, rows: int | None = None, what: 
         InputError: missing file, another number of rows or columns, or NaN or infinity.
     """
     table = []
-    for number, fields in ((number, line.split()) for number, line in numbered_lines(read_text(path))):
+    for number, fields in ((number, line.split()) for number, line in number_lines(read_text(path))):
         if not fields:
             continue
         if len(fields) != columns:
@@ -86,7 +86,7 @@ def line_of_row(path: str | Path, row: int) -> int:
     Raises:
         InputError: missing file.
     """
-    return [number for number, line in numbered_lines(read_text(path)) if line.strip()][row]
+    return [number for number, line in number_lines(read_text(path)) if line.strip()][row]
 
 
 def read_light_list(path: str | Path) -> tuple[list[str], np.ndarray]:
@@ -117,7 +117,7 @@ def read_light_list(path: str | Path) -> tuple[list[str], np.ndarray]:
         raise InputError(f"{path}: lines have from {min(widths)} to {max(widths)} fields; give all the same number")
     if len(set(names)) < len(names):
         twice = [name for name, count in Counter(names).items() if count > 1]
-        raise InputError(f"{path}: an image is listed twice ({listed(twice)}); give each light an image of its own")
+        raise InputError(f"{path}: an image is listed twice ({list_names(twice)}); give each light an image of its own")
     return names, check_directions(np.asarray(directions), path, names)
 
 
@@ -151,8 +151,8 @@ def check_directions(directions: np.ndarray, path: str | Path, names: Sequence[s
 def _all(names: Sequence[str], places: Sequence[int]) -> str:
     """Name all lights at these places."""
     if names:
-        return f" ({listed([names[place] for place in places])})"
-    return f" (lights {listed([str(place + 1) for place in places])})" if len(places) > 1 else ""
+        return f" ({list_names([names[place] for place in places])})"
+    return f" (lights {list_names([str(place + 1) for place in places])})" if len(places) > 1 else ""
 
 
 def _floats(fields: Sequence[str], where: str) -> list[float]:

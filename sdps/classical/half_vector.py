@@ -78,7 +78,7 @@ def half_vector(
     if _FEWEST <= len(images) < _ENOUGH:
         _log.warning("half-vector symmetry wants %d images or more, got %d; expect rough normals", _ENOUGH, len(images))
     if light_directions is None:
-        scene, start, notes = _uncalibrated(images, mask, seed)
+        scene, start, notes = _solve_uncalibrated(images, mask, seed)
     else:
         known = calibrate(images, mask, light_directions, intensities, weights=MEAN, minimum=_FEWEST)
         lights = unit(known.directions)
@@ -120,7 +120,7 @@ def _normals(
     return np.where((after < before)[:, None], carried, start), intensities, len(chosen)
 
 
-def _uncalibrated(images: np.ndarray, mask: np.ndarray, seed: int) -> tuple[_Scene, np.ndarray, Notes]:
+def _solve_uncalibrated(images: np.ndarray, mask: np.ndarray, seed: int) -> tuple[_Scene, np.ndarray, Notes]:
     """Choose the bas-relief transformation by the asymmetry of some pixels; return lights, normals (P, 3) and notes."""
     prepared = prepare(images, mask, front="diffuse", minimum=_FEWEST, seed=seed)
     start = equal_intensity(prepared.factors)

@@ -32,13 +32,13 @@ def equal_intensity(factors: Factors) -> Gbr:
     The spread of log |G^-1 s| is minimised from several depth scales; lambda stays within [1/8, 8].
     """
 
-    def spread(parameters: np.ndarray) -> np.ndarray:  # (L,)
+    def measure_spread(parameters: np.ndarray) -> np.ndarray:  # (L,)
         gbr = Gbr(parameters[0], parameters[1], float(np.exp(parameters[2])))
         strength = np.log(np.maximum(np.linalg.norm(gbr.lights(factors.lights), axis=0), 1e-12))
         return strength - strength.mean()
 
     limit = np.array([8.0, 8.0, np.log(8.0)])
     starts = [np.array([0.0, 0.0, start]) for start in (-0.7, 0.0, 0.7)]
-    found = [optimize.least_squares(spread, start, bounds=(-limit, limit)) for start in starts]
+    found = [optimize.least_squares(measure_spread, start, bounds=(-limit, limit)) for start in starts]
     mu, nu, depth = min(found, key=lambda item: item.cost).x
     return Gbr(float(mu), float(nu), float(np.exp(depth)))

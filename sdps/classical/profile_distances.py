@@ -82,7 +82,7 @@ def profile_distances(
         inverse = np.where(gains > 0.0, 1.0 / np.maximum(gains, 1e-3), 1.0).astype(np.float32)
     mean = _mean_direction(lights)
     directions, intensities = lights.directions.astype(np.float32), lights.intensities.astype(np.float32)
-    maps = observations.to_map(_spread(normalise(shapes), rows, normals))
+    maps = observations.to_map(_spread_normals(normalise(shapes), rows, normals))
     return Estimate(maps, directions, intensities, notes=Notes(residual=residual, light_mean=mean))
 
 
@@ -163,7 +163,7 @@ def decompose(angles: np.ndarray, start: np.ndarray | None = None, limit: int = 
     """
     cosines = np.cos(np.minimum(angles, np.pi))
     weights = (angles < _TRUSTED).astype(np.float64)
-    normals = _scaled(cosines)[0] if start is None else start
+    normals = _scale_classically(cosines)[0] if start is None else start
     for _ in range(limit):
         matrices, targets = normal_equations(normals, cosines, weights)
         solved = np.linalg.solve(matrices + 1e-6 * np.eye(3), targets[..., None])[..., 0]
@@ -182,7 +182,7 @@ def orient(normals: np.ndarray, rows: np.ndarray, outward: np.ndarray) -> np.nda
     return turned * [1.0, 1.0, np.sign(turned[:, 2].mean()) or 1.0]
 
 
-def _scaled(cosines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _scale_classically(cosines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return classical scaling to three dimensions, (S, 3) unit, and the four largest eigenvalues, relative."""
     values, vectors = linalg.eigsh(cosines, k=4, which="LA", v0=np.ones(len(cosines)))
     order = np.argsort(values)[::-1]
@@ -200,7 +200,7 @@ def _first_inverse(profiles: np.ndarray) -> np.ndarray:  # (L,)
     return (1.0 / np.maximum(level, 0.5 * max(float(np.median(level)), 1e-12))).astype(np.float32)
 
 
-def _spread_samples(unit: np.ndarray, usable: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+def _choose_samples(unit: np.ndarray, usable: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return rows far from each other (farthest-point rule) among ten times as many random ones."""
     pool = rng.permutation(usable)[: 10 * count]
     if len(pool) <= count:
@@ -229,7 +229,7 @@ def _embed_samples(
         )
     around = np.argsort(np.arctan2(outward[:, 1], outward[:, 0]))
     picked = around[np.unique(np.linspace(0, len(edge) - 1, min(len(edge), max(count // 8, 12))).astype(int))]
-    inside = _spread_samples(unit, usable, count - len(picked), rng)
+    inside = _choose_samples(unit, usable, count - len(picked), rng)
     rows = np.unique(np.concatenate([inside, edge[picked]]))
     ways = geodesics(unit[rows], min(_NEIGHBOURS, len(rows) - 1))
     joined = np.isfinite(ways[np.isfinite(ways).sum(1).argmax()])
@@ -252,7 +252,7 @@ def _solve(
             "lights, or noise"
         )
     beta = along if slope == "contour" else distribution
-    spectrum = _scaled(np.cos(np.minimum(beta * ways, np.pi)))[1]
+    spectrum = _scale_classically(np.cos(np.minimum(beta * ways, np.pi)))[1]
     if spectrum[2] < 0.02:
         raise InputError("the profiles vary along one direction only; coplanar lights or a cylindrical object")
     normals = orient(decompose(beta * ways), places, outward)
@@ -283,7 +283,9 @@ def _contour_slope(ways: np.ndarray, outward: np.ndarray) -> tuple[float, float]
     return float(slope), float(np.corrcoef(angles[near], ways[near])[0, 1])
 
 
-def _spread(vectors: np.ndarray, rows: np.ndarray, normals: np.ndarray, nearest: int = 6) -> np.ndarray:  # (P, 3)
+def _spread_normals(
+    vectors: np.ndarray, rows: np.ndarray, normals: np.ndarray, nearest: int = 6
+) -> np.ndarray:  # (P, 3)
     """Give every profile the mean normal of the samples with the nearest profiles, the nearer the more."""
     sampled = vectors[rows]
     result = np.empty((len(vectors), 3), np.float64)

@@ -132,7 +132,7 @@ def integrate(
         "torn": float(torn),
         "iterations": iterations,
     }
-    return Depth(mask=mask, **_laid_out(graph, mask, z), **diagnostics, seconds=time.perf_counter() - started)
+    return Depth(mask=mask, **_lay_out(graph, mask, z), **diagnostics, seconds=time.perf_counter() - started)
 
 
 def check_normals(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -224,7 +224,7 @@ def _shares(graph: _Graph, z: np.ndarray, sharpness: float) -> np.ndarray:
     return shares
 
 
-def _laid_out(graph: _Graph, mask: np.ndarray, z: np.ndarray) -> dict[str, Any]:
+def _lay_out(graph: _Graph, mask: np.ndarray, z: np.ndarray) -> dict[str, Any]:
     """Centre the components, measure the residuals, and return both as `Depth` holds them."""
     joined = coo_matrix((np.ones(graph.edges.shape[1], np.int8), tuple(graph.edges)), (graph.count, graph.count))
     components, labels = connected_components(joined, directed=False)
@@ -265,14 +265,14 @@ def _integrate_large(normals: np.ndarray, mask: np.ndarray, sharpness: float, mo
     if sharpness:
         del weights
         with share(0.3, 1.0):
-            iterations, weights = _reweighted(slopes, inside, z, sharpness, most)
+            iterations, weights = _reweight(slopes, inside, z, sharpness, most)
     return Depth(
-        mask=mask, below=below, iterations=iterations, **_laid_out_large(slopes, inside, z, weights, mask.shape, box),
+        mask=mask, below=below, iterations=iterations, **_lay_out_large(slopes, inside, z, weights, mask.shape, box),
         seconds=time.perf_counter() - started,
     )  # fmt: skip
 
 
-def _laid_out_large(
+def _lay_out_large(
     slopes: Slopes,
     inside: np.ndarray,
     z: np.ndarray,
@@ -315,7 +315,7 @@ def _slopes(normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...]) -> tu
     return slopes, flat / int(mask.sum())
 
 
-def _reweighted(
+def _reweight(
     slopes: Slopes, inside: np.ndarray, z: np.ndarray, sharpness: float, most: int
 ) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
     """Reweight the one-sided equations as `_bilateral` does, z (h, w) in place.

@@ -229,7 +229,7 @@ def _gather(across: np.ndarray, down: np.ndarray, right: np.ndarray, z: np.ndarr
 
 
 @numba.njit(parallel=True, cache=True)
-def _spread(coarse: np.ndarray, mask: np.ndarray, z: np.ndarray) -> None:
+def _add_correction(coarse: np.ndarray, mask: np.ndarray, z: np.ndarray) -> None:
     """Add the correction of 2x2 pixels to each of them."""
     for r in numba.prange(z.shape[0]):
         for c in range(z.shape[1]):
@@ -275,7 +275,7 @@ class Cycle:
             _relax(self.across, self.down, right, z, colour)
         below = np.empty(self.coarser.mask.shape, np.float32)
         _gather(self.across, self.down, right, z, below)
-        _spread(self.coarser(below), self.mask, z)
+        _add_correction(self.coarser(below), self.mask, z)
         for colour in (1, 0):
             _relax(self.across, self.down, right, z, colour)
         return z

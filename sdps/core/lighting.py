@@ -96,7 +96,7 @@ class LightClasses:
         """
         values = (*azimuth_elevation(directions), intensities)
         azimuth, elevation, intensity = (
-            _shared_weights(part, *span) for part, span in zip(values, self._spans(), strict=True)
+            _share_weights(part, *span) for part, span in zip(values, self._spans(), strict=True)
         )
         return azimuth, elevation, intensity
 
@@ -133,7 +133,7 @@ class LightClasses:
         return unit_direction(azimuth, elevation), intensity
 
 
-def _shared_weights(values: torch.Tensor, low: float, high: float, count: int) -> torch.Tensor:
+def _share_weights(values: torch.Tensor, low: float, high: float, count: int) -> torch.Tensor:
     """Return (..., K) weights of the bin centres around each of values (...)."""
     position = ((values - low) / (high - low) * count - 0.5).clamp(0.0, count - 1.0)
     centres = torch.arange(count, device=values.device, dtype=position.dtype)

@@ -63,7 +63,7 @@ def arithmetic(precision: str = "auto", device: str | torch.device = "cpu") -> A
         InputError: an unknown precision.
     """
     check_precision(precision)
-    return _resolved(precision, torch.device(device).type)
+    return _resolve(precision, torch.device(device).type)
 
 
 def check_precision(precision: str) -> None:
@@ -77,7 +77,7 @@ def check_precision(precision: str) -> None:
 
 
 @cache
-def _resolved(precision: str, device: str) -> Arithmetic:
+def _resolve(precision: str, device: str) -> Arithmetic:
     ratio, source = _speed(device)
     fast = ratio >= _WORTHWHILE
     said = f"bfloat16 is {ratio:.2g} times as fast as float32 here ({source})"
@@ -97,13 +97,13 @@ def _speed(device: str) -> tuple[float, str]:
         return ratio, f"{name}, compute capability {capability[0]}.{capability[1]}; by its kind, not measured"
     if device != "cpu":
         return 0.5, f"not tried on {device}"
-    ratio = _measured(32)
+    ratio = _measure_ratio(32)
     if ratio > 0.5:  # a larger one tells better, and takes seconds only where bfloat16 is slow
-        ratio = _measured(64)
+        ratio = _measure_ratio(64)
     return ratio, f"{torch.backends.cpu.get_cpu_capability()}, measured"
 
 
-def _measured(side: int) -> float:
+def _measure_ratio(side: int) -> float:
     """Return the least time of a step in float32 over the least in bfloat16, taken in turn."""
     with torch.inference_mode(False), torch.enable_grad():  # in any mode of the caller
         ways = {dtype: _convolution_step(dtype, side) for dtype in (torch.float32, torch.bfloat16)}

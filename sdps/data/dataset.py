@@ -22,7 +22,7 @@ from render.shared.imaging.mixing import LightStage, mix, require_enough
 from render.shared.seeds import generator
 from sdps.core.symmetry import Symmetry
 from sdps.data.augment import Augmentation, augment
-from sdps.data.scene_store import PackedImages, SceneStore, StoredScene, finished_scenes, require_equal_counts
+from sdps.data.scene_store import PackedImages, SceneStore, StoredScene, list_finished, require_equal_counts
 
 _CROP_DRAWS = 8
 _WITH_DECODED = 2.5  # bytes of shards and decoded scenes together, over those of the shards
@@ -102,7 +102,7 @@ class SceneDataset(Dataset[Any]):
     ) -> None:
         self.split = split
         self.options = options
-        self.scenes = finished_scenes(Path(folder), split, skip_missing=skip_missing)
+        self.scenes = list_finished(Path(folder), split, skip_missing=skip_missing)
         self.packed = describe_packing(Path(folder), self.scenes)
         # Scenes of a set that does not fit would leave the cache before they are used a second time.
         fits = self.packed is None or self.packed.limit > _WITH_DECODED * self.packed.size

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.records.manifest import FAILED, SceneSpec, read_failed, read_manifest
-from render.records.mirror import select_rendered, shard_path, stored_size, touch_files
+from render.records.mirror import measure_stored, select_rendered, shard_path, touch_files
 from render.records.shards import read_shard
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
@@ -102,7 +102,7 @@ class SceneStore:
             return StoredScene(packed, ground[..., :3], ground[..., 3] > 0.5)
 
 
-def finished_scenes(folder: Path, split: str, *, skip_missing: bool = False) -> list[SceneSpec]:
+def list_finished(folder: Path, split: str, *, skip_missing: bool = False) -> list[SceneSpec]:
     """Return the scenes of a split that have a shard.
 
     Args:
@@ -151,7 +151,7 @@ def require_equal_counts(where: str | Path, scenes: Sequence[SceneSpec], images:
 def _identity(folder: Path, scene: SceneSpec) -> str:
     """Return a short hash of the manifest line and the file's size and time, or what a store has for these."""
     try:
-        size, version = stored_size(folder, scene)
+        size, version = measure_stored(folder, scene)
     except OSError as error:
         where = folder / scene.file
         raise InputError(f"{where}: no such shard; run `sdps render-data` to finish the folder") from error

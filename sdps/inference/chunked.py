@@ -17,7 +17,7 @@ from torch.nn import functional
 from render.shared.progress import repeat, share, stage
 from sdps.core.symmetry import Symmetry
 from sdps.inference.image_source import View
-from sdps.inference.turned_views import AnyView, TurnedView, turned_lights
+from sdps.inference.turned_views import AnyView, TurnedView, turn_lights
 from sdps.models.base import FusionNetwork, LightingNetwork, Lights, divide
 from sdps.models.cnnps import predict_normals
 
@@ -76,7 +76,7 @@ def normal_map(
         return found
     for number, symmetry in enumerate(symmetries):
         with repeat(number, len(symmetries)):
-            feature = _feature(network, TurnedView(view, symmetry), turned_lights(symmetry, lights), autocast)
+            feature = _feature(network, TurnedView(view, symmetry), turn_lights(symmetry, lights), autocast)
             with autocast():
                 found.append(network.regress_with_error(feature))
     return found

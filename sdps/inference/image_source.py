@@ -113,7 +113,7 @@ def survey(source: ImageSource, mask: np.ndarray, margin: int | None, *, stray: 
         raise InputError(f"the mask must be bool of shape {shape}, got {mask.dtype} of {mask.shape}")
     if not mask.any():
         raise InputError("the mask is empty; mark the object's pixels")
-    chosen = _sampled_pixels(int(mask.sum()), len(source))
+    chosen = _sample_pixels(int(mask.sum()), len(source))
     sample = np.empty((len(source), len(chosen), 3), np.float32)
     step = _images_at_once(shape)
     for start in range(0, len(source), step):
@@ -202,7 +202,7 @@ def _images_at_once(shape: tuple[int, int]) -> int:
     return max(1, _READ_PIXELS // (shape[0] * shape[1]))
 
 
-def _sampled_pixels(pixels: int, images: int) -> np.ndarray:
+def _sample_pixels(pixels: int, images: int) -> np.ndarray:
     """Return which of the object's pixels the exposure is measured on, ascending."""
     wanted = max(1, EXPOSURE_VALUES // (3 * images))
     if wanted >= pixels:

@@ -17,7 +17,7 @@ from sdps.inference.image_source import View
 from sdps.models.base import Lights
 
 
-def turned_lights(symmetry: Symmetry, lights: Lights | None) -> Lights | None:
+def turn_lights(symmetry: Symmetry, lights: Lights | None) -> Lights | None:
     """Turn the directions of lights."""
     return None if lights is None else lights._replace(directions=symmetry.vectors(lights.directions))
 

@@ -167,7 +167,7 @@ def find_intensities(images: ReducedImages, directions: np.ndarray, start: np.nd
         directions: (L, 3) unit, known.
         start: (L,), intensities that a network finds.
     """
-    images = _sampled(images)
+    images = _sample_pixels(images)
     start = scale_to_mean(np.asarray(start, np.float64))
     held = _PRIOR * (1.0 + (_residual(images, directions, start) / _MISFIT) ** 4)
     found = start.copy()
@@ -205,7 +205,7 @@ def _read(directions: np.ndarray, axes: np.ndarray, order: np.ndarray, sorting: 
     return Reading(axes, order, sorting, float(angle_degrees(seen, directions[order] @ axes.T).mean()))
 
 
-def _sampled(images: ReducedImages) -> ReducedImages:
+def _sample_pixels(images: ReducedImages) -> ReducedImages:
     """Return the images with some of their pixels only, the same each time."""
     chosen = generator(0, "given lights").permutation(images.values.shape[1])[:_PIXELS]
     return replace(images, values=images.values[:, np.sort(chosen)])
@@ -221,7 +221,7 @@ def _find_order(
     images: ReducedImages, files: Sequence[str], directions: np.ndarray, intensities: np.ndarray, seen: np.ndarray
 ) -> tuple[np.ndarray, str]:
     """Return which row belongs to each picture, (L,), and the order's name; the given one unless another is clear."""
-    images = _sampled(images)
+    images = _sample_pixels(images)
     plain = np.arange(len(files))
     rank = {name: place for place, name in enumerate(sorted(files))}
 

@@ -21,7 +21,7 @@ _BYTES = 60
 _MARGIN = 2
 
 
-def observed_bytes(name: str, images: int, box: float) -> float:
+def estimate_bytes(name: str, images: int, box: float) -> float:
     """Return about how much memory a method takes for so many images of a box of so many pixels."""
     whole = _BYTES * images * box
     return min(whole, PART_BYTES) if classical.METHODS[name].by_pixel else whole

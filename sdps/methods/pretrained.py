@@ -26,7 +26,7 @@ def shipped_folder() -> Path:
     return Path(str(resources.files("assets"))) / "weights"
 
 
-def shipped() -> list[str]:
+def list_shipped() -> list[str]:
     """Return the names of the shipped weights."""
     return sorted(path.stem for path in shipped_folder().glob(f"[!.]*{_SUFFIX}"))  # no file being written
 
@@ -37,7 +37,7 @@ def terms(files: Iterable[Path]) -> str:
     return TERMS if any(file.resolve().parent == folder for file in files) else ""
 
 
-def trained(out: Path | None) -> list[str]:
+def list_trained(out: Path | None) -> list[str]:
     """Return the names of the runs whose last weights lie in a folder; none where it is None."""
     files = sorted((out / MODELS_FOLDER).glob(f"*/[!.]*{_SUFFIX}")) if out is not None else []
     return [path.stem for path in files if not path.stem.endswith("-best")]
@@ -68,8 +68,8 @@ def locate(name: str, out: Path | None = None) -> Path:
     kept = shipped_folder() / f"{name.removeprefix(SHIPPED)}{_SUFFIX}"
     if name.startswith(SHIPPED) or out is None:
         return kept
-    trained = trained_file(out, name)
-    return trained if trained.is_file() or not kept.is_file() else kept
+    own = trained_file(out, name)
+    return own if own.is_file() or not kept.is_file() else kept
 
 
 def require(name: str, out: Path | None = None) -> Path:
@@ -85,7 +85,7 @@ def require(name: str, out: Path | None = None) -> Path:
         raise InputError(f"{path}: no such weights; correct the path, or name a run or `{SHIPPED}<name>`")
     plain = name.removeprefix(SHIPPED)
     if plain not in MODELS:
-        raise unknown("model or method", plain, {*trained(out), *shipped(), *MODELS, *COMBINATIONS, *METHODS})
+        raise unknown("model or method", plain, {*list_trained(out), *list_shipped(), *MODELS, *COMBINATIONS, *METHODS})
     raise InputError(f"{path}: no such weights; train them with `sdps train --models {plain}`")
 
 

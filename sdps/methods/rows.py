@@ -58,7 +58,7 @@ def lighting_methods(
         read_outs: tuple[ReadOut, ...] = ("centre", "expectation", "peak")
         others = (how for how in read_outs if how != config.read_out)
         methods += [Method(name=f"lcnet, {how}", lights="lcnet", read_out=how) for how in others]
-    available, wanted = pretrained.shipped(), {way.lights for way in ways}
+    available, wanted = pretrained.list_shipped(), {way.lights for way in ways}
     kept = [
         Method(name=label(pretrained.SHIPPED + name, NONE), lights=pretrained.SHIPPED + name, paper=MODELS[name].paper)
         for name in names
@@ -88,7 +88,7 @@ def normal_methods(out: Path, shipped: tuple[str, ...] = ALL, config: InferenceC
         InputError: `shipped` names what is not.
     """
     trained, kept = [], []
-    available = set(pretrained.shipped())
+    available = set(pretrained.list_shipped())
     fixed = config is not None and None not in (config.light_views, config.normal_views)
     for method in _every_row():
         if fixed and (method.light_views or method.normal_views):

@@ -31,7 +31,7 @@ Found = dict[tuple[Hashable, ...], Estimate]
 
 
 @cache
-def _loaded(path: Path) -> "TrainedModel":
+def _load(path: Path) -> "TrainedModel":
     """Load a model once, however many methods use it."""
     return load_model(path, default_device())
 
@@ -49,11 +49,11 @@ class Runner:
     """
 
     def __init__(self, method: Method, find: Callable[[str], Path], config: InferenceConfig | None = None) -> None:
-        self.method, self.config = method, _filled(config or InferenceConfig(), method)
+        self.method, self.config = method, _fill_config(config or InferenceConfig(), method)
         self.files = {name: find(name) for name in sorted(method.models())}
 
         def model(name: str) -> "TrainedModel | None":
-            return _loaded(self.files[name]) if name in self.files else None
+            return _load(self.files[name]) if name in self.files else None
 
         lighting, normals = (model(getattr(method, place)) for place in _PLACES)
         self.estimator = None
@@ -184,7 +184,7 @@ class Runner:
         return {item.name: item.value for item in score(estimate, mask, **truth)}
 
 
-def _filled(config: InferenceConfig, method: Method) -> InferenceConfig:
+def _fill_config(config: InferenceConfig, method: Method) -> InferenceConfig:
     """Return the configuration with what the method says where it says nothing, one view where neither does."""
     views: dict[str, Any] = {name: getattr(config, name) or getattr(method, name) or 1 for name in VIEWS}
     return replace(config, read_out=method.read_out or config.read_out, **views)

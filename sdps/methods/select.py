@@ -26,9 +26,9 @@ def lighting_rows(out: Path | None) -> list[Method]:
     def tells_lights(name: str) -> bool:
         return MODELS[model_of(name, find)].role == "lighting"
 
-    names = [name for name in pretrained.trained(out) if tells_lights(name)]
+    names = [name for name in pretrained.list_trained(out) if tells_lights(name)]
     names = sorted(names, key=lambda name: (list(MODELS).index(name) if name in MODELS else len(MODELS), name))
-    kept = [name for name in (pretrained.SHIPPED + name for name in pretrained.shipped()) if tells_lights(name)]
+    kept = [name for name in (pretrained.SHIPPED + name for name in pretrained.list_shipped()) if tells_lights(name)]
     return [parse(name, find) for name in [*names, *kept]]
 
 
@@ -40,10 +40,10 @@ def classical_rows(*, calibrated: bool) -> list[Method]:
 
 def every_method(out: Path | None, config: InferenceConfig | None = None) -> list[Method]:
     """Return every method there is: lighting models, all rows of normals, all classical methods."""
-    return selected([LEARNED, CLASSICAL], out, config)
+    return select_methods([LEARNED, CLASSICAL], out, config)
 
 
-def selected(expressions: list[str], out: Path | None, config: InferenceConfig | None = None) -> list[Method]:
+def select_methods(expressions: list[str], out: Path | None, config: InferenceConfig | None = None) -> list[Method]:
     """Return the methods of `--methods`, each once; `learned` and `classical` stand for all of a kind."""
     found: list[Method] = []
     fixed = config is not None and config.light_views is not None  # then no row has views of its own
@@ -59,7 +59,7 @@ def selected(expressions: list[str], out: Path | None, config: InferenceConfig |
     return list({method.name: method for method in found}.values())
 
 
-def shown(chosen: list[Method]) -> list[str]:
+def list_shown(chosen: list[Method]) -> list[str]:
     """Return the names of the methods whose normals are worth a picture, the main one first."""
     giving = [method for method in chosen if method.normals and method.normals != CONSTANT]
     if len(giving) <= _MOST_SHOWN:
@@ -80,7 +80,7 @@ def runs_folder(folder: Path | None) -> Path | None:
     if folder is None:
         return None
     base = folder.resolve().parent if folder.resolve().name == pretrained.MODELS_FOLDER else folder
-    if not pretrained.trained(base):
+    if not pretrained.list_trained(base):
         raise InputError(
             f"{folder}: no trained weights under {pretrained.MODELS_FOLDER}/; give the --out of `sdps train`"
         )

@@ -88,7 +88,7 @@ def metric_figure(runs: Mapping[str, Rows], value: str, title: str) -> Figure:
     with rc_context(_STYLE):
         figure = Figure(figsize=(4.6, 2.6), dpi=_DPI, layout="constrained")
         axes = figure.add_subplot()
-        _draw_runs(axes, runs, value, "minutes" if all(map(_timed, runs.values())) else "step")
+        _draw_runs(axes, runs, value, "minutes" if all(map(_has_times, runs.values())) else "step")
         axes.set_ylabel(title)
         if len(runs) > 1:
             axes.legend()
@@ -100,7 +100,7 @@ def _draw_runs(axes: Axes, runs: Mapping[str, Rows], value: str, against: str) -
     for place, (name, rows) in enumerate(runs.items()):
         places, values = series(rows, value)
         if against != "step":
-            if not _timed(rows):
+            if not _has_times(rows):
                 continue
             places = _hours(rows, places) * (60 if against == "minutes" else 1)
         marker = "o" if value.startswith("val_") else None
@@ -158,7 +158,7 @@ def _from_zero(axes: Axes) -> tuple[float, float]:
 
 def _hours_above(axes: Axes, rows: Rows, *, label: bool) -> None:
     """Add an axis of hours above, where the run's time is known."""
-    if not _timed(rows):
+    if not _has_times(rows):
         axes.spines["top"].set_visible(False)
         return
     above = axes.secondary_xaxis("top", functions=(partial(_hours, rows), partial(_hours, rows, inverse=True)))
@@ -167,7 +167,7 @@ def _hours_above(axes: Axes, rows: Rows, *, label: bool) -> None:
     above.tick_params(labelsize=8)
 
 
-def _timed(rows: Rows) -> bool:
+def _has_times(rows: Rows) -> bool:
     return len(_clock(rows)[0]) > 1
 
 

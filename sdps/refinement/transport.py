@@ -94,7 +94,7 @@ def _height(field: np.ndarray, row: Any, column: Any) -> Any:
 
 
 @numba.njit(cache=True)
-def _blocked(field: np.ndarray, start: Any, way: Any, steps: int) -> bool:
+def _is_blocked(field: np.ndarray, start: Any, way: Any, steps: int) -> bool:
     """Return whether the surface rises above one of the `steps` - 1 points reached from `start` in steps of `way`."""
     x, y, z = start
     for _ in range(1, steps):
@@ -117,7 +117,7 @@ def _shadows(field: np.ndarray, points: np.ndarray, lights: np.ndarray, lit: np.
             steps = field.shape[0] + field.shape[1]
             if way[2] > 0:
                 steps = min(steps, int((top - start[2]) / way[2]) + 2)
-            lit[p, i] = not _blocked(field, start, way, steps)
+            lit[p, i] = not _is_blocked(field, start, way, steps)
 
 
 @numba.njit(parallel=True, cache=True)
@@ -136,5 +136,5 @@ def _form_factors(
                 continue
             steps = max(int(max(abs(dx), abs(dy))), 1)
             tx, ty, tz = above[q, 0] - start[0], above[q, 1] - start[1], above[q, 2] - start[2]
-            if not _blocked(field, start, (tx / steps, ty / steps, tz / steps), steps):
+            if not _is_blocked(field, start, (tx / steps, ty / steps, tz / steps), steps):
                 factors[p, q] = leaves * arrives * area[q] / (np.pi * squared * max(squared, area[q] / np.pi))

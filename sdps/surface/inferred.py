@@ -216,7 +216,7 @@ class Inference:
         channels = {f"normal.{axis}": np.ascontiguousarray(normals[..., k]) for k, axis in enumerate("XYZ")}
         header = {"ps:frame": "x right, y up, z to the camera", "ps:method": self.method}
         write_exr(folder / "normal.exr", [("normal", header, {**channels, "mask": mask.astype(np.float32)})])
-        write_png(folder / "normal.png", _coded(normals))
+        write_png(folder / "normal.png", _encode_normals(normals))
         write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
         if len(self.light_directions):
             write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains)
@@ -285,7 +285,7 @@ def _about_refined(found: RefinedEstimate, photos: Photographs) -> dict[str, Any
     }
 
 
-def _coded(normals: np.ndarray) -> np.ndarray:  # (H, W, 3) uint16
+def _encode_normals(normals: np.ndarray) -> np.ndarray:  # (H, W, 3) uint16
     """Return normals as colours, (n + 1) / 2, a few rows at a time."""
     parts = (normals[rows].astype(np.float64) for rows in _bands(normals[..., 0]))
     return np.concatenate([quantise((some + 1.0) / 2.0, 16) for some in parts])

@@ -17,7 +17,7 @@ from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.core.integration import LARGE
 from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES
-from sdps.methods.on_box import observed_bytes
+from sdps.methods.on_box import estimate_bytes
 from sdps.methods.runner import Runner
 from sdps.models.base import NormalNetwork
 from sdps.photos import Photographs
@@ -185,7 +185,7 @@ def _memory(size: Size, runner: Runner) -> float:
     kept = 29.0 * size.frame  # normals, mask, error to expect, and what they are cut from
     stages = [16.0 * size.file + 30.0 * size.frame, 70.0 * size.frame]
     if runner.method.normals in classical.METHODS:
-        stages.append(observed_bytes(runner.method.normals, size.pictures, size.box))
+        stages.append(estimate_bytes(runner.method.normals, size.pictures, size.box))
     elif runner.estimator is not None:
         tile = min(size.box, _tile_pixels(size, runner)) if runner.estimator.normals is not None else 0.0
         stages.append(kept + tile * TILE_BYTES / _tile_pixels(size, runner) if tile else kept)

@@ -176,7 +176,7 @@ def test_what_is_half_written_is_neither_trained_nor_an_object_nor_in_the_way(tm
     half = tmp_path / "models" / "nenet" / "nenet.safetensors"
     half.parent.mkdir(parents=True)
     temporary_path(half, suffix=True).touch()
-    assert pretrained.trained(tmp_path) == []
+    assert pretrained.list_trained(tmp_path) == []
     for folder in (tmp_path / "cat", temporary_path(tmp_path / "dog")):
         folder.mkdir()
         (folder / "light_directions.txt").touch()

@@ -65,7 +65,7 @@ def run(tmp_path, monkeypatch):
         chosen = tuple(item for names in kinds.values() for item in names)
         config = replace(preset.test, shapes=("bunny",), materials=chosen, lights=name)
         write_scenes(config, tmp_path / "figures" / scenes.slug(name))
-    monkeypatch.setattr(pretrained, "shipped", list)  # as if none travelled with the package
+    monkeypatch.setattr(pretrained, "list_shipped", list)  # as if none travelled with the package
     torch.set_num_threads(1)
 
     def call(*arguments):
@@ -189,7 +189,7 @@ def test_methods_are_read_and_told_apart(tmp_path):
 
 
 def test_default_methods_are_those_with_weights(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(pretrained, "shipped", list)
+    monkeypatch.setattr(pretrained, "list_shipped", list)
     names = [method.name for method in eval_figures.wanted_methods([], tmp_path)]
     assert names == ["pf14", "least-squares, true lights"] and "classical methods only" in caplog.text
     for name in ("lcnet", "nenet"):

@@ -8,7 +8,7 @@ import pytest
 
 from lab.studies import join_scenes
 from render.records.manifest import SceneSpec, View, read_manifest, write_manifest
-from sdps.data.scene_store import finished_scenes
+from sdps.data.scene_store import list_finished
 
 
 def plan(folder: Path, names: list[str], finished: list[str]) -> Path:
@@ -26,7 +26,7 @@ def test_finished_scenes_of_both_are_joined_in_order_and_again_with_the_same_res
     for _ in range(2):
         assert join_scenes.main([str(first), str(second), "--out", str(tmp_path / "out")]) == 0
     assert [scene.id for scene in read_manifest(tmp_path / "out")] == ["s1", "s2"]
-    assert [scene.id for scene in finished_scenes(tmp_path / "out", "train")] == ["s1", "s2"]
+    assert [scene.id for scene in list_finished(tmp_path / "out", "train")] == ["s1", "s2"]
     assert (tmp_path / "out" / "shards" / "s2.exr").read_text() == "b"
 
 

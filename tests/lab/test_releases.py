@@ -51,7 +51,7 @@ def test_shipped_weights_are_halves_with_card_and_curve(tmp_path: Path, kept: Pa
     ship(["lcnet"], tmp_path / "run", kept)
     assert all(path.read_bytes() == data for path, data in written.items())  # git sees nothing new
     assert (
-        pretrained.shipped() == ["lcnet"]
+        pretrained.list_shipped() == ["lcnet"]
         and pretrained.locate("lcnet", tmp_path / "nothing") == kept / "lcnet.safetensors"
     )
 

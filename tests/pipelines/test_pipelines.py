@@ -123,7 +123,7 @@ def test_help_lists_every_command(capsys):
 
 
 def test_train_and_evaluate_without_data_or_weights_say_what_to_run(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(pretrained, "shipped", list)  # as if none travelled with the package
+    monkeypatch.setattr(pretrained, "list_shipped", list)  # as if none travelled with the package
     assert "sdps render-data" in fails(capsys, "train", "--preset", "smoke", "--out", str(tmp_path / "none"))
     asked = (
         "evaluate",

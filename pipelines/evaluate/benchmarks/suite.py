@@ -13,7 +13,7 @@ from pipelines.evaluate.published import published_rows
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
 from pipelines.evaluate.results import object_table, publish, weights_of
 from pipelines.shared import using
-from pipelines.shared.flags import add_out, picked, split_list
+from pipelines.shared.flags import add_out, pick_names, split_list
 from render.shared.config import to_plain
 from sdps.inference.inference_config import InferenceConfig, inference_config
 from sdps.methods import select
@@ -78,7 +78,7 @@ class Benchmark:
 
 def named_methods(args: argparse.Namespace) -> list[Method]:
     """Return the methods of `--methods`; none where it is not given."""
-    return select.selected(split_list(args.methods), select.runs_folder(args.models), inference_config(args))
+    return select.select_methods(split_list(args.methods), select.runs_folder(args.models), inference_config(args))
 
 
 def evaluate(
@@ -186,11 +186,11 @@ def pick(items: Sequence[TestObject], names: list[str] | None) -> list[TestObjec
         InputError: a name that is not there.
     """
     known = {item.name: item for item in items}
-    return [known[name] for name in picked("object", names, known)]
+    return [known[name] for name in pick_names("object", names, known)]
 
 
 def pick_pictured(chosen: Sequence[Method]) -> list[str]:
     """Return the names of the methods to show, and of the first lighting model."""
-    names = select.shown(list(chosen))
+    names = select.list_shown(list(chosen))
     lights = [method.name for method in chosen if method.lights and not method.normals][:1]
     return names or lights

@@ -18,8 +18,8 @@ from pipelines.evaluate.evaluation import Found, Result, TestObject
 from pipelines.evaluate.object_pictures import ERROR_LIMIT, tiles
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
 from pipelines.evaluate.results import publish
-from pipelines.shared.flags import add_models, add_out, picked, split_list
-from pipelines.shared.pictures import contact_sheet, fitted
+from pipelines.shared.flags import add_models, add_out, pick_names, split_list
+from pipelines.shared.pictures import contact_sheet, fit_height
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
 from sdps.classical import registry
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Compare, print the table, and write results.json and a picture per object into the output folder."""
-    names, out = picked("object", args.objects, list_objects(args.folder)), args.out
+    names, out = pick_names("object", args.objects, list_objects(args.folder)), args.out
     chosen = split_list(args.methods) or [name for name, entry in registry.METHODS.items() if not entry.calibrated]
     methods = [parse(name, finder(args.models)) for name in chosen]
     if not registry.method(args.reference).calibrated:
@@ -72,7 +72,9 @@ def main(args: argparse.Namespace) -> int:
     for item in items:
         pictures = tiles(item, found, shown, "reference, lights known")
         writer.strip(item.name, pictures)
-        flat = [(text, fitted(picture, _HEIGHT)) for text, picture, _ in pictures if isinstance(picture, np.ndarray)]
+        flat = [
+            (text, fit_height(picture, _HEIGHT)) for text, picture, _ in pictures if isinstance(picture, np.ndarray)
+        ]
         with atomic_path(out / f"{item.name}.png") as temporary:
             contact_sheet(flat).save(temporary)
     objects = {

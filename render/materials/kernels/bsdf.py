@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.backend.arrays import interleaved, packet, packets
+from render.backend.arrays import interleave, packet, packets
 from render.backend.jit import dr, mi
 from render.materials import model
 from render.materials.kernels.lobes import HalfVectorLobes, cell, half_cell
@@ -48,8 +48,8 @@ class PackedMaterials(HalfVectorLobes):
         if not materials:
             raise InputError("materials: at least one is needed")
         super().__init__(tuple(material.name for material in materials), list(materials))
-        self.tables = packets(np.stack([_packed_tables(material) for material in materials]))
-        self.shadowing = packets(np.stack([_packed_shadowing(material) for material in materials]))
+        self.tables = packets(np.stack([_pack_tables(material) for material in materials]))
+        self.shadowing = packets(np.stack([_pack_shadowing(material) for material in materials]))
 
     @staticmethod
     def prepare(wi: "mi.Vector3f", wo: "mi.Vector3f", active: "mi.Bool | bool" = True) -> Coordinates:
@@ -105,7 +105,7 @@ class PackedMaterials(HalfVectorLobes):
         corner = dr.fma(index, _ROWS, lane - light * _ROWS) * _COLUMNS + column
         left, right = (_two_colours(self.tables, corner + offset) for offset in (0, 1))
         values = [left[e][c] + b * (right[e][c] - left[e][c]) for e in range(2) for c in range(3)]
-        return interleaved(values, _ROW)
+        return interleave(values, _ROW)
 
     @staticmethod
     def eval_row(rows: "mi.Float", light: "mi.UInt32", cell: tuple, azimuth: "mi.Float") -> "mi.Color3f":
@@ -137,13 +137,13 @@ def _two_colours(source: "mi.Float", entry: "mi.UInt32", active: "mi.Bool | bool
     return mi.Color3f(found[0], found[1], found[2]), mi.Color3f(found[4], found[5], found[6])
 
 
-def _packed_tables(material: Material) -> np.ndarray:
+def _pack_tables(material: Material) -> np.ndarray:
     """Return (32, 6, 2, 4): per knot the RGB table at e = 0 and e = 1, padded to four floats each."""
     both = np.stack(model.azimuth_tables(material))  # (2, 3, 32, 6)
     return np.pad(both.transpose(2, 3, 0, 1), ((0, 0), (0, 0), (0, 0), (0, 1)))
 
 
-def _packed_shadowing(material: Material) -> np.ndarray:
+def _pack_shadowing(material: Material) -> np.ndarray:
     """Return (8, 2, 4): per cell RGB at its start and the change over it, padded to four floats each."""
     knots = material.shadowing.T  # (9, 3)
     return np.pad(np.stack([knots[:-1], np.diff(knots, axis=0)], 1), ((0, 0), (0, 0), (0, 1)))

@@ -78,7 +78,7 @@ def find(folder: Path) -> Maps:
     found: dict[str, tuple[int, Source]] = {}
     unread: dict[str, Path] = {}
     for path in pictures:
-        for kind, rank, source in _meant(path):
+        for kind, rank, source in _read_kinds(path):
             if path.suffix.lower() not in SUFFIXES:
                 unread[kind] = path
             elif kind not in found or rank < found[kind][0]:
@@ -99,7 +99,7 @@ def find(folder: Path) -> Maps:
     return Maps(sources, tuple(path for path in pictures if path not in used))
 
 
-def _meant(path: Path) -> list[tuple[str, int, Source]]:
+def _read_kinds(path: Path) -> list[tuple[str, int, Source]]:
     """Return the kinds of map that a picture holds by its name, with the rank of that name and where to find them."""
     stem = _words(_CAMEL.sub("_", path.stem))
     cores = [_BEHIND.sub("", each) for each in (stem, _words(path.stem))]
@@ -121,7 +121,7 @@ def _meant(path: Path) -> list[tuple[str, int, Source]]:
     said = [
         (f"{stem}_".rfind(f"{word}_"), convention)
         for convention, words in _CONVENTIONS.items()
-        for word in _spelled(words)
+        for word in _spell_words(words)
         if re.search(f"(?:_|{'|'.join(_NORMAL[:-1])}){word}_", f"{stem}_")
     ]
     convention = max(said, default=(0, ""))[1]
@@ -133,12 +133,12 @@ def _words(text: str) -> str:
     return "_" + re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
 
 
-def _spelled(names: tuple[str, ...]) -> list[str]:
+def _spell_words(names: tuple[str, ...]) -> list[str]:
     """Return names of several words with the words apart and together."""
     return [form for name in names for form in dict.fromkeys((name.replace(" ", "_"), name.replace(" ", "")))]
 
 
-def _packed() -> dict[str, tuple[int, dict[str, int]]]:
+def _list_packed() -> dict[str, tuple[int, dict[str, int]]]:
     """Return the names of pictures that hold several maps: rank, and the channels of roughness and metallic.
 
     The order of letters or words is that of red, green and blue; occlusion (O, A, AO) is not used. Roughness and
@@ -150,7 +150,7 @@ def _packed() -> dict[str, tuple[int, dict[str, int]]]:
         for letter in ("o", "a", "ao"):
             found["".join(order).replace("o", letter)] = (20 + len(found), channels)
         rank = 20 + len(found)
-        words = {"o": _spelled((*_OCCLUSION, "occ")), "r": _spelled(_ROUGH), "m": _spelled(_METAL)}
+        words = {"o": _spell_words((*_OCCLUSION, "occ")), "r": _spell_words(_ROUGH), "m": _spell_words(_METAL)}
         for first in words[order[0]]:
             for second in words[order[1]]:
                 for third in words[order[2]]:
@@ -178,10 +178,12 @@ def _kinds() -> dict[str, tuple[str, int]]:
     found = {}
     for kind, spellings in names.items():
         for rank, name in enumerate(spellings):
-            found.update(dict.fromkeys(_spelled((name,)), (kind, rank + 10 * (kind == "gloss"))))
-    together = [f"{base}{word}" for base in _NORMAL[:-1] for words in _CONVENTIONS.values() for word in _spelled(words)]
+            found.update(dict.fromkeys(_spell_words((name,)), (kind, rank + 10 * (kind == "gloss"))))
+    together = [
+        f"{base}{word}" for base in _NORMAL[:-1] for words in _CONVENTIONS.values() for word in _spell_words(words)
+    ]
     return found | dict.fromkeys(together, ("normal", 0))
 
 
-_PACKED = _packed()
+_PACKED = _list_packed()
 _KINDS = _kinds()

@@ -66,7 +66,7 @@ def evaluate(
     single = (distribution(half[:, 2], rough**2) * smith(ci, co, rough**2))[:, None]
     zero = (1 - metal) * DIELECTRIC + metal * base
     fresnel = zero + (1 - zero) * (1 - np.clip((wi * half).sum(1), 0, 1)[:, None]) ** 5
-    lost, mean = _lost(ci, rough) * _lost(co, rough), _mean_lost(rough)
+    lost, mean = _interpolate_loss(ci, rough) * _interpolate_loss(co, rough), _mean_lost(rough)
     diffuse = base * (lost[:, :1] / mean[:, :1])
     again = multiple_scattering(base, mean[:, 1:]) * lost[:, 1:] / mean[:, 1:]
     value = single * fresnel + ((1 - metal) * diffuse + metal * again) / np.pi
@@ -92,7 +92,7 @@ def multiple_scattering(base: np.ndarray, mean: np.ndarray) -> np.ndarray:
     return average**2 * (1 - mean) / (1 - average * mean)
 
 
-def _lost(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+def _interpolate_loss(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     """Interpolate `tables()[0]`; (N, 2)."""
     lost, _ = tables()
     row, a = _cell((roughness - SMOOTHEST) / (ROUGHEST - SMOOTHEST), ROUGHNESSES)

@@ -39,8 +39,8 @@ def check(data: bytes, folder: Path | None) -> None:
     tree = _tree(data)
     if tree is None:
         return
-    used = {*_listed(tree.get("extensionsUsed"))}.union(*map(_own, _listed(tree.get("nodes"))))
-    required = set(_listed(tree.get("extensionsRequired"))) | _without_data(tree)
+    used = {*_as_list(tree.get("extensionsUsed"))}.union(*map(_own, _as_list(tree.get("nodes"))))
+    required = set(_as_list(tree.get("extensionsRequired"))) | _without_data(tree)
     for name in sorted(required, key=lambda name: name not in _COMPRESSED):
         if name in _COMPRESSED and not (name == _DRACO and importlib.util.find_spec("DracoPy")):
             raise InputError(f"is compressed with {_COMPRESSED[name]} ({name}); export it without compression")
@@ -74,7 +74,7 @@ def _tree(data: bytes) -> dict[str, Any] | None:
     return tree if isinstance(tree, dict) else None
 
 
-def _listed(value: Any) -> list[Any]:
+def _as_list(value: Any) -> list[Any]:
     return value if isinstance(value, list) else []
 
 
@@ -85,15 +85,15 @@ def _own(value: Any) -> dict[str, Any]:
 
 
 def _primitives(tree: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    for mesh in _listed(tree.get("meshes")):
-        for part in _listed(mesh.get("primitives")) if isinstance(mesh, dict) else []:
+    for mesh in _as_list(tree.get("meshes")):
+        for part in _as_list(mesh.get("primitives")) if isinstance(mesh, dict) else []:
             if isinstance(part, dict):
                 yield part
 
 
 def _accessors(tree: dict[str, Any], names: tuple[str, ...]) -> Iterator[dict[str, Any]]:
     """Yield the accessors of some attributes of all primitives, and of their indices."""
-    accessors = _listed(tree.get("accessors"))
+    accessors = _as_list(tree.get("accessors"))
     for part in _primitives(tree):
         attributes = part.get("attributes")
         places = [attributes.get(name) for name in names] if isinstance(attributes, dict) else []
@@ -110,13 +110,13 @@ def _is_normalised(accessor: dict[str, Any]) -> bool:
 def _without_data(tree: dict[str, Any]) -> set[str]:
     """Return the compressions without which a primitive has no data, whether the file says so or not."""
     found = set()
-    accessors = _listed(tree.get("accessors"))
+    accessors = _as_list(tree.get("accessors"))
     for part in _primitives(tree):
         place = (part.get("attributes") or {}).get("POSITION")
         if isinstance(place, int) and 0 <= place < len(accessors) and isinstance(accessors[place], dict):
             bare = "bufferView" not in accessors[place] and "sparse" not in accessors[place]
             found |= {name for name in _own(part) if bare and name in _COMPRESSED}
-    for buffer in _listed(tree.get("buffers")):
+    for buffer in _as_list(tree.get("buffers")):
         for name, about in _own(buffer).items():
             if name in _COMPRESSED and isinstance(about, dict) and about.get("fallback") and "uri" not in buffer:
                 found.add(name)
@@ -125,7 +125,7 @@ def _without_data(tree: dict[str, Any]) -> set[str]:
 
 def _check_files(tree: dict[str, Any], folder: Path | None) -> None:
     """Refuse a file whose buffers lie in files that are missing."""
-    for buffer in _listed(tree.get("buffers")):
+    for buffer in _as_list(tree.get("buffers")):
         uri = buffer.get("uri") if isinstance(buffer, dict) else None
         if not isinstance(uri, str) or uri.startswith("data:"):
             continue

@@ -138,11 +138,11 @@ def _of_any_form(faces: list[list[str]]) -> tuple[np.ndarray, np.ndarray]:
     joined = " ".join(texts).replace("//", "/0/") + " "
     values = _parse([joined.replace("/ ", "/0 ").replace("/", " ")], np.int64)
     if values is None or len(values) != 3 * len(texts):
-        raise InputError(_malformed(faces))
+        raise InputError(_describe_malformed(faces))
     return values.reshape(-1, 3), np.array([len(face) for face in faces])
 
 
-def _malformed(faces: list[list[str]]) -> str:
+def _describe_malformed(faces: list[list[str]]) -> str:
     form = re.compile(r"\d+(/\d*(/\d*)?)?")
     face = next((face for face in faces if not all(form.fullmatch(corner) for corner in face)), [])
     return f"'f {' '.join(face)[:60]}': expected whole numbers, as in f 1 2 3 or f 1/1/1 2/2/1 3/3/1; export it again"

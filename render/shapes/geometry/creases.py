@@ -57,7 +57,7 @@ def shade(
     flat = crosses / double[:, None]
     weights = _angles(corners) * double[:, None]
     del corners, crosses
-    fans = _split(vertices, faces, flat)
+    fans = _split_corners(vertices, faces, flat)
     owner, split = fans.owner, fans.faces
     normals = _means(split, flat, weights, len(owner))
     wanted = normals[split]
@@ -68,11 +68,11 @@ def shade(
         turned, fits = _fitting(given, flat, fans)
         wanted[fits] = turned[fits]
     if given is not None or unfit.any():
-        owner, split, normals = _parted(owner, split, wanted.reshape(-1, 3))
+        owner, split, normals = _merge_corners(owner, split, wanted.reshape(-1, 3))
     return vertices[owner], split, normals.astype(np.float32)
 
 
-def _split(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> _Fans:
+def _split_corners(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> _Fans:
     """Part the corners at sharp edges."""
     first, second, same = edge_pairs(faces)
     sharp = same | ((flat[first // 3] * flat[second // 3]).sum(1) < _LEAST)
@@ -181,7 +181,9 @@ def _fitting(given: np.ndarray, flat: np.ndarray, fans: _Fans) -> tuple[np.ndarr
     return unit * sign[..., None], fits & ~smeared[fans.faces]
 
 
-def _parted(owner: np.ndarray, faces: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _merge_corners(
+    owner: np.ndarray, faces: np.ndarray, wanted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Make one vertex of all corners with the same vertex and normal (3F, 3); as `_split`, and its normals."""
     steps = np.rint((wanted + 1) * ((1 << _KEY_BITS - 1) - 1)).astype(np.int64)
     key = owner[faces.ravel()]

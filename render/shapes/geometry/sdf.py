@@ -148,12 +148,12 @@ def subtraction(solid: Field, tool: Field, width: float = 0.0) -> Field:
     return lambda p: -smooth_min(-solid(p), tool(p), width)
 
 
-def inverted(field: Field) -> Field:
+def invert(field: Field) -> Field:
     """The outside of a solid, or a relief with hills and hollows exchanged."""
     return lambda p: -field(p)
 
 
-def bounded(field: Field, centre: Vector, radius: float, margin: float = 0.15) -> Field:
+def bound(field: Field, centre: Vector, radius: float, margin: float = 0.15) -> Field:
     """Evaluate `field`, which lies in a ball, only within `margin` of it; beyond, the distance to the ball.
 
     Exact in any smooth union of width up to `margin`; what makes many small parts affordable.
@@ -170,20 +170,20 @@ def bounded(field: Field, centre: Vector, radius: float, margin: float = 0.15) -
     return limited
 
 
-def placed(field: Field, position: Vector, frame: np.ndarray | None = None, scale: float = 1.0) -> Field:
+def place(field: Field, position: Vector, frame: np.ndarray | None = None, scale: float = 1.0) -> Field:
     """Scale `field`, turn it by `frame`, and move its origin to `position`."""
     origin, size = column(position), np.float32(scale)
     turn = np.eye(3, dtype=np.float32) if frame is None else np.asarray(frame, dtype=np.float32)
     return lambda p: field((turn.T / size) @ (p - origin)) * size
 
 
-def squeezed(field: Field, factors: Vector) -> Field:
+def squeeze(field: Field, factors: Vector) -> Field:
     """Scale `field` along the axes by `factors`; the distance is scaled by the smallest."""
     factors = column(factors)
     return lambda p: field(p / factors) * factors.min()
 
 
-def twisted(field: Field, rate: float) -> Field:
+def twist(field: Field, rate: float) -> Field:
     """Twist about the y axis by `rate` radians per unit height."""
 
     def field_of(p: np.ndarray) -> np.ndarray:
@@ -194,18 +194,18 @@ def twisted(field: Field, rate: float) -> Field:
     return field_of
 
 
-def bent(field: Field, amount: float, heading: float = 0.0) -> Field:
+def bend(field: Field, amount: float, heading: float = 0.0) -> Field:
     """Bow the y axis into a parabola, x and z shifted by `amount` times height squared towards `heading`."""
     shift = column([amount * np.cos(heading), 0, amount * np.sin(heading)])
     return lambda p: field(p - shift * (p[1] * p[1]))
 
 
-def warped(field: Field, waves: Waves, amount: float) -> Field:
+def warp(field: Field, waves: Waves, amount: float) -> Field:
     """Displace space itself by `amount` times a vector field."""
     return lambda p: field(p + np.float32(amount) * waves(p))
 
 
-def displaced(field: Field, relief: Field, amount: float) -> Field:
+def displace(field: Field, relief: Field, amount: float) -> Field:
     """Raise the surface by `amount` times `relief`; evaluated only near the surface, where it can matter."""
     reach = np.float32(6 * abs(amount))
 

@@ -56,12 +56,12 @@ def _neck_and_head(rng: np.random.Generator, chest: np.ndarray, girth: float) ->
         ear = sdf.ellipsoid([0, length / 2, 0], [0.22, length / 2 + 0.1, 0.34])
         ear = sdf.subtraction(ear, sdf.ellipsoid([0.22, length / 2 + 0.05, 0], [0.18, length / 2 - 0.1, 0.22]), 0.1)
         lie = sdf.rotation("xz", side * spread, back + rng.normal(0, 8))
-        skull = sdf.union([skull, sdf.placed(ear, [-0.25, 0.55, 0.4 * side], lie)], 0.15)
+        skull = sdf.union([skull, sdf.place(ear, [-0.25, 0.55, 0.4 * side], lie)], 0.15)
         if rng.random() < 0.15:
             tip = np.array([-0.2, 1.9, 0.9 * side])
             skull = sdf.union([skull, sdf.cone([0.1, 0.7, 0.35 * side], tip, 0.2, 0.06)], 0.1)
     skull = sdf.subtraction(skull, sdf.box([snout, -0.35 - thick * 0.35, 0], [0.6, 0.03, 1], 0.02), 0.05)
-    return centre, sdf.bounded(sdf.placed(skull, centre, frame, size), centre, 3.2 * size)
+    return centre, sdf.bound(sdf.place(skull, centre, frame, size), centre, 3.2 * size)
 
 
 def _leg(
@@ -100,7 +100,7 @@ def _leg(
     joints = np.stack([root, knee, ankle, paw])
     centre = joints.mean(axis=0)
     radius = float(np.linalg.norm(joints - centre, axis=1).max()) + muscle
-    return sdf.bounded(sdf.union(parts, 0.06), centre, radius)
+    return sdf.bound(sdf.union(parts, 0.06), centre, radius)
 
 
 def _tail(rng: np.random.Generator, hips: np.ndarray, girth: float) -> Field:
@@ -115,11 +115,11 @@ def _tail(rng: np.random.Generator, hips: np.ndarray, girth: float) -> Field:
 
 def _add_fur(rng: np.random.Generator, solid: Field) -> Field:
     """Give the animal a skin: lumps of muscle, and over them short fur, tufts or a fleece."""
-    solid = sdf.displaced(solid, scalar_waves(rng, 7, 20, count=20), rng.uniform(0.004, 0.014))
+    solid = sdf.displace(solid, scalar_waves(rng, 7, 20, count=20), rng.uniform(0.004, 0.014))
     coat = rng.random()
     if coat < 0.3:
-        return sdf.displaced(solid, drapery.folds(rng, rng.uniform(0.04, 0.07), tilt=2.0), rng.uniform(0.003, 0.01))
+        return sdf.displace(solid, drapery.folds(rng, rng.uniform(0.04, 0.07), tilt=2.0), rng.uniform(0.003, 0.01))
     if coat < 0.65:
         tufts = sdf.furrows(scalar_waves(rng, 22, 50, count=20, slope=0.5), 0.3)
-        return sdf.displaced(sdf.warped(solid, vector_waves(rng, 4, 9), 0.015), tufts, rng.uniform(0.004, 0.014))
-    return sdf.displaced(solid, scalar_waves(rng, 25, 70, count=24), rng.uniform(0.001, 0.004))
+        return sdf.displace(sdf.warp(solid, vector_waves(rng, 4, 9), 0.015), tufts, rng.uniform(0.004, 0.014))
+    return sdf.displace(solid, scalar_waves(rng, 25, 70, count=24), rng.uniform(0.001, 0.004))

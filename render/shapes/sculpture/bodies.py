@@ -108,12 +108,12 @@ def body(rng: np.random.Generator, pose: Pose, *, hair: bool = True) -> Field:
     limbs = [sdf.union(_limb_parts(joints, "arm", build), 0.035) for joints in pose.arms]
     limbs += [sdf.union(_limb_parts(joints, "leg", build), 0.04) for joints in pose.legs]
     balls = [_ball_around(joints) for joints in (*pose.arms, *pose.legs)]
-    limbs = [sdf.bounded(limb, *ball) for limb, ball in zip(limbs, balls, strict=True)]
-    skull = sdf.placed(head(rng, hair=hair), pose.head, pose.head_turn, 0.27)
-    skull = sdf.bounded(skull, pose.head, 0.24)
+    limbs = [sdf.bound(limb, *ball) for limb, ball in zip(limbs, balls, strict=True)]
+    skull = sdf.place(head(rng, hair=hair), pose.head, pose.head_turn, 0.27)
+    skull = sdf.bound(skull, pose.head, 0.24)
     whole = sdf.union([sdf.union([trunk, *limbs], 0.06), skull], 0.025)
     muscle = scalar_waves(rng, 14, 45, count=20)
-    return sdf.displaced(whole, muscle, rng.uniform(0.002, 0.008))
+    return sdf.displace(whole, muscle, rng.uniform(0.002, 0.008))
 
 
 def _ball_around(joints: np.ndarray) -> tuple[np.ndarray, float]:

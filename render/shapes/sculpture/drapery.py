@@ -24,13 +24,13 @@ def folds(rng: np.random.Generator, spacing: float, *, tilt: float = 0.25) -> Fi
     if kind < 0.35:
         pattern = sdf.furrows(waves, rng.uniform(0.15, 0.5))  # full lobes, as of heavy wool
     elif kind < 0.65:
-        pattern = sdf.inverted(sdf.furrows(waves, rng.uniform(0.2, 0.5)))  # narrow tubes, as of thin linen
+        pattern = sdf.invert(sdf.furrows(waves, rng.uniform(0.2, 0.5)))  # narrow tubes, as of thin linen
     else:
         pattern = waves
-    return sdf.warped(pattern, vector_waves(rng, 1.5, 4.5, count=8), rng.uniform(0.04, 0.2))
+    return sdf.warp(pattern, vector_waves(rng, 1.5, 4.5, count=8), rng.uniform(0.04, 0.2))
 
 
-def gathered(relief: Field, centre: sdf.Vector, radius: float) -> Field:
+def gather(relief: Field, centre: sdf.Vector, radius: float) -> Field:
     """Let the folds run together where the cloth is narrower than `radius` about the vertical through `centre`."""
     centre = sdf.column(centre)
     keep = np.array([[0], [1], [0]], np.float32)
@@ -43,7 +43,7 @@ def gathered(relief: Field, centre: sdf.Vector, radius: float) -> Field:
     return pattern
 
 
-def pleated(
+def pleat(
     rng: np.random.Generator, cloth: Field, *, top: float, bottom: float, axis: sdf.Vector | None = None
 ) -> Field:
     """Put broad and fine folds on `cloth`, deepening from `top` (y) down to `bottom`.
@@ -53,14 +53,14 @@ def pleated(
     spacing = float(np.exp(rng.uniform(np.log(0.1), np.log(0.28))))
     broad, fine = folds(rng, spacing), folds(rng, rng.uniform(0.06, 0.12), tilt=0.6)
     if axis is not None and rng.random() < 0.6:
-        broad = gathered(broad, axis, 0.3)
+        broad = gather(broad, axis, 0.3)
     height = np.float32(max(top - bottom, 1e-3))
 
     def deepening(p: np.ndarray) -> np.ndarray:
         return broad(p) * np.clip(0.4 + 0.6 * (np.float32(top) - p[1]) / height, 0.4, 1.1)
 
-    cloth = sdf.displaced(cloth, deepening, spacing * rng.uniform(0.14, 0.38))
-    return sdf.displaced(cloth, fine, np.exp(rng.uniform(np.log(0.001), np.log(0.008))))
+    cloth = sdf.displace(cloth, deepening, spacing * rng.uniform(0.14, 0.38))
+    return sdf.displace(cloth, fine, np.exp(rng.uniform(np.log(0.001), np.log(0.008))))
 
 
 def skirt(rng: np.random.Generator, pose: Pose) -> Field:
@@ -75,9 +75,9 @@ def skirt(rng: np.random.Generator, pose: Pose) -> Field:
     hem_point = [foot[0], min(ankle[1] for ankle in ankles) - 0.05, foot[2]]
     parts.append(sdf.cone(pose.pelvis, hem_point, 0.14, rng.uniform(0.16, 0.34)))
     hem = hem_point[1] + rng.choice([0.0, 0.05, rng.uniform(0.1, 0.45)])
-    cloth = pleated(rng, sdf.union(parts, rng.uniform(0.12, 0.3)), top=0.1, bottom=hem, axis=pose.waist)
+    cloth = pleat(rng, sdf.union(parts, rng.uniform(0.12, 0.3)), top=0.1, bottom=hem, axis=pose.waist)
     waves = scalar_waves(rng, 3, 9, count=8)
-    floor = sdf.displaced(sdf.halfspace([0, -1, 0], -hem), waves, rng.uniform(0.0, 0.03))
+    floor = sdf.displace(sdf.halfspace([0, -1, 0], -hem), waves, rng.uniform(0.0, 0.03))
     return sdf.intersection([cloth, floor], 0.02)
 
 
@@ -93,10 +93,10 @@ def tunic(rng: np.random.Generator, pose: Pose) -> Field:
         reach = rng.uniform(0.3, 1.0)
         for joints in pose.arms:
             parts.append(sdf.cone(joints[0], joints[0] + reach * (joints[1] - joints[0]), 0.095, 0.11))
-    cloth = pleated(rng, sdf.union(parts, 0.12), top=pose.neck[1], bottom=pose.pelvis[1])
+    cloth = pleat(rng, sdf.union(parts, 0.12), top=pose.neck[1], bottom=pose.pelvis[1])
     slant = pose.chest_turn @ sdf.rotation("z", rng.choice([0.0, rng.uniform(-50, 50)]))
     girdle = sdf.torus(pose.waist, 0.135, rng.uniform(0.025, 0.06), slant)
-    return sdf.union([cloth, sdf.displaced(girdle, folds(rng, 0.06, tilt=3), 0.012)], 0.03)
+    return sdf.union([cloth, sdf.displace(girdle, folds(rng, 0.06, tilt=3), 0.012)], 0.03)
 
 
 def mantle(rng: np.random.Generator, pose: Pose, *, hooded: bool) -> Field:
@@ -115,7 +115,7 @@ def mantle(rng: np.random.Generator, pose: Pose, *, hooded: bool) -> Field:
         nape = pose.head - 0.03 * pose.head_turn[:, 2]
         parts.append(sdf.ellipsoid(nape, [0.135, 0.165, 0.145], pose.head_turn))
         parts.append(sdf.cone(pose.head, pose.neck, 0.12, 0.1))
-    cloth = pleated(rng, sdf.union(parts, 0.14), top=pose.neck[1], bottom=pose.neck[1] + fall[1])
+    cloth = pleat(rng, sdf.union(parts, 0.14), top=pose.neck[1], bottom=pose.neck[1] + fall[1])
     if hooded:
         face = pose.head + pose.head_turn @ [0, -0.02, 0.14]
         cloth = sdf.subtraction(cloth, sdf.ellipsoid(face, [0.085, 0.125, 0.12], pose.head_turn), 0.03)
@@ -128,10 +128,10 @@ def hanging_cloth(rng: np.random.Generator) -> Field:
         profile = scalar_waves(rng, 1.5, 4, count=6)
         knot, foot = rng.uniform(0.12, 0.35), rng.uniform(0.35, 0.65)
         body = sdf.union([sdf.ball([0, 0.85, 0], knot * 1.2), sdf.cone([0, 0.8, 0], [0, -0.9, 0], knot, foot)], 0.1)
-        body = sdf.displaced(body, profile, 0.06)
-        cloth = pleated(rng, pleated(rng, body, top=0.9, bottom=-0.9, axis=[0, 0, 0]), top=0.9, bottom=-0.9)
+        body = sdf.displace(body, profile, 0.06)
+        cloth = pleat(rng, pleat(rng, body, top=0.9, bottom=-0.9, axis=[0, 0, 0]), top=0.9, bottom=-0.9)
         cloth = sdf.intersection([cloth, sdf.halfspace([0, -1, 0], 0.9), sdf.halfspace([0, 1, 0], 1.05)], 0.03)
-        return sdf.twisted(cloth, rng.normal(0, 0.8))
+        return sdf.twist(cloth, rng.normal(0, 0.8))
     return _curtain(rng)
 
 
@@ -149,6 +149,6 @@ def _curtain(rng: np.random.Generator) -> Field:
         front = np.float32(depth) * (np.sqrt(np.sin(phase) ** 2 + np.float32(0.04)) + wavy(p))
         return (p[2] - front) * np.float32(0.6)
 
-    panel = sdf.displaced(cloth, folds(rng, rng.uniform(0.08, 0.2), tilt=0.6), rng.uniform(0.003, 0.025))
-    frame = sdf.displaced(sdf.box([0, 0, 0.3], [0.8, 0.9, 0.6], 0.1), wavy, 0.05)
+    panel = sdf.displace(cloth, folds(rng, rng.uniform(0.08, 0.2), tilt=0.6), rng.uniform(0.003, 0.025))
+    frame = sdf.displace(sdf.box([0, 0, 0.3], [0.8, 0.9, 0.6], 0.1), wavy, 0.05)
     return sdf.intersection([panel, frame], 0.04)

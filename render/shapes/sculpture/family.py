@@ -44,10 +44,10 @@ def sculpture(seed: int) -> TriangleMesh:
 def weather(rng: np.random.Generator, solid: Field) -> Field:
     """Deform a shape as a whole and age its surface: a slight warp, a tremor of the chisel, and wear."""
     if rng.random() < 0.5:
-        solid = sdf.warped(solid, vector_waves(rng, 1.5, 4), rng.uniform(0.01, 0.05))
+        solid = sdf.warp(solid, vector_waves(rng, 1.5, 4), rng.uniform(0.01, 0.05))
     if rng.random() < 0.7:
         tremor = scalar_waves(rng, 15, 60, count=24, slope=rng.uniform(0.3, 1.2))
-        solid = sdf.displaced(solid, tremor, np.exp(rng.uniform(np.log(0.0007), np.log(0.011))))
+        solid = sdf.displace(solid, tremor, np.exp(rng.uniform(np.log(0.0007), np.log(0.011))))
     return solid
 
 

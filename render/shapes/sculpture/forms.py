@@ -32,7 +32,7 @@ def vessel(rng: np.random.Generator) -> Field:
     reliefs: list[Field] = [relief, sdf.furrows(relief, 0.3), sdf.cracks(relief, 0.5)]
     carved = reliefs[rng.integers(3)]
     height = rng.choice([0.0, rng.uniform(0.005, 0.03)])
-    body = sdf.displaced(body, carved, height)
+    body = sdf.displace(body, carved, height)
     # The wall must outlast the deepest hollow of the relief, about three standard deviations.
     wall = np.float32(0.06 + 3 * height)
     cavity = sdf.intersection([lambda p: outside(p) + wall, sdf.halfspace([0, -1, 0], 0.6)], 0.05)
@@ -52,8 +52,8 @@ def rock(rng: np.random.Generator) -> Field:
     size = np.exp(rng.normal(0, 0.2, 3))
     cuts = [sdf.halfspace(normal, rng.uniform(0.55, 0.9)) for normal in _directions(rng, int(rng.integers(7, 22)))]
     hull = sdf.intersection([sdf.ball([0, 0, 0], 1.0), *cuts], rng.choice([0.0, 0.03, 0.12, 0.3]))
-    stone = sdf.squeezed(hull, 0.8 * size / size.max())
-    stone = sdf.warped(stone, vector_waves(rng, 1.5, 5), rng.uniform(0.02, 0.15))
+    stone = sdf.squeeze(hull, 0.8 * size / size.max())
+    stone = sdf.warp(stone, vector_waves(rng, 1.5, 5), rng.uniform(0.02, 0.15))
     for centre in _directions(rng, int(rng.integers(0, 5))):
         stone = sdf.subtraction(stone, sdf.ball(0.7 * centre, rng.uniform(0.15, 0.4)), rng.uniform(0.02, 0.15))
     if rng.random() < 0.4:
@@ -61,12 +61,12 @@ def rock(rng: np.random.Generator) -> Field:
         axis, spread = _directions(rng, 1)[0], rng.uniform(4, 10)
         for way in np.linalg.svd(axis[None])[2][1:]:  # the two directions within a layer
             strata = strata.drawn_out(way, spread)
-        stone = sdf.displaced(stone, strata, rng.uniform(0.01, 0.03))
+        stone = sdf.displace(stone, strata, rng.uniform(0.01, 0.03))
     if rng.random() < 0.5:
         lines = sdf.cracks(scalar_waves(rng, 3, 8), rng.uniform(0.08, 0.2))
-        stone = sdf.displaced(stone, lines, rng.uniform(0.02, 0.05))
+        stone = sdf.displace(stone, lines, rng.uniform(0.02, 0.05))
     grain = scalar_waves(rng, 6, 50, count=32, slope=rng.uniform(0.8, 1.4))
-    return sdf.displaced(stone, grain, rng.uniform(0.006, 0.04))
+    return sdf.displace(stone, grain, rng.uniform(0.006, 0.04))
 
 
 def abstract(rng: np.random.Generator) -> Field:
@@ -84,13 +84,13 @@ def abstract(rng: np.random.Generator) -> Field:
         solids = [_solid(rng) for _ in range(int(rng.integers(4, 10)))]
         form = sdf.union(solids, rng.choice([0.0, 0.04, 0.15]))
         for _ in range(int(rng.integers(1, 4))):
-            hole = sdf.placed(sdf.cylinder([0, 0, 0], rng.uniform(0.1, 0.22), 2), rng.normal(0, 0.2, 3), turn(rng, 60))
+            hole = sdf.place(sdf.cylinder([0, 0, 0], rng.uniform(0.1, 0.22), 2), rng.normal(0, 0.2, 3), turn(rng, 60))
             form = sdf.subtraction(form, hole, rng.choice([0.01, 0.08]))
     if kind > 0:
-        form = sdf.bent(sdf.twisted(form, rng.normal(0, 0.9)), rng.normal(0, 0.2), rng.uniform(0, np.pi))
+        form = sdf.bend(sdf.twist(form, rng.normal(0, 0.9)), rng.normal(0, 0.2), rng.uniform(0, np.pi))
     if rng.random() < 0.5:
         waves = scalar_waves(rng, 10, 35, count=20)
-        form = sdf.displaced(form, sdf.furrows(waves, 0.3) if rng.random() < 0.5 else waves, rng.uniform(0.003, 0.015))
+        form = sdf.displace(form, sdf.furrows(waves, 0.3) if rng.random() < 0.5 else waves, rng.uniform(0.003, 0.015))
     return form
 
 

@@ -35,7 +35,7 @@ def head(rng: np.random.Generator, *, hair: bool = True) -> Field:
     features = [sdf.union(eyes), sdf.union(brows, 0.03), sdf.union(nose, 0.04), sdf.union(lips, 0.01), sdf.union(ears)]
     face = sdf.union([skull, *features], 0.035)
     # No two faces alike: bend the proportions, which also breaks the mirror symmetry.
-    face = sdf.warped(face, vector_waves(rng, 1.5, 4, count=8), rng.uniform(0.0, 0.04))
+    face = sdf.warp(face, vector_waves(rng, 1.5, 4, count=8), rng.uniform(0.0, 0.04))
     return _add_hair(rng, face) if hair else face
 
 
@@ -58,6 +58,6 @@ def _add_hair(rng: np.random.Generator, face: Field) -> Field:
     if rng.random() < 0.35:
         size = rng.uniform(0.15, 0.24)
         masses.append(sdf.cone([0, -0.33, 0.18], [0, -0.42 - size, 0.24], 0.19, size * 0.5))
-    mane = sdf.warped(sdf.union(masses, 0.1), swirl, strength * 0.3)
-    mane = sdf.displaced(mane, sdf.warped(relief, swirl, strength), rng.uniform(0.015, 0.04))
+    mane = sdf.warp(sdf.union(masses, 0.1), swirl, strength * 0.3)
+    mane = sdf.displace(mane, sdf.warp(relief, swirl, strength), rng.uniform(0.015, 0.04))
     return sdf.union([face, mane], 0.015)

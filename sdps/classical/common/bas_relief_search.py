@@ -42,7 +42,7 @@ def minimise_over_bas_reliefs(energy: Callable[[Gbr], float], starts: Sequence[G
     axes = [np.linspace(-span, span, count) for span, count in zip(_SPAN, _NODES, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     offsets = np.concatenate([np.zeros((1, 3)), 0.25 * grid, grid])
-    candidates = [_moved(start, offset) for start in starts for offset in offsets]
+    candidates = [_offset_start(start, offset) for start in starts for offset in offsets]
     coarse = [value(gbr) for gbr in progress_bar(candidates, desc="bas-relief grid", unit="candidate")]
     first = np.argsort(coarse, kind="stable")[:_REFINED]
     best, lowest = candidates[first[0]], coarse[first[0]]
@@ -52,14 +52,14 @@ def minimise_over_bas_reliefs(energy: Callable[[Gbr], float], starts: Sequence[G
         centre = candidates[index]
 
         def near(offset: np.ndarray, at: Gbr = centre) -> float:
-            return value(_moved(at, offset))
+            return value(_offset_start(at, offset))
 
         found = optimize.minimize(near, np.zeros(3), method="Nelder-Mead", options=options)
         if found.fun < lowest:
-            best, lowest = _moved(centre, found.x), float(found.fun)
+            best, lowest = _offset_start(centre, found.x), float(found.fun)
     return best, lowest
 
 
-def _moved(start: Gbr, offset: np.ndarray) -> Gbr:
+def _offset_start(start: Gbr, offset: np.ndarray) -> Gbr:
     """Return the start followed by an offset (mu, nu, log lambda); its slants are in units of the depth scale."""
     return start.then(Gbr(float(offset[0]), float(offset[1]), float(np.exp(np.clip(offset[2], -4.0, 4.0)))))

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from render.shared.errors import InputError, listed
+from render.shared.errors import InputError, list_names
 from render.shared.files import write_json
 from sdps.photos.light_files.light_columns import split_columns, upright
 from sdps.photos.light_files.light_frame import frame_matrix
@@ -86,7 +86,7 @@ def read_lights(
     if zero:
         subject = "the light of" if len(zero) == 1 else "the lights of"
         raise InputError(
-            f"{path}: {subject} {listed(zero)} {'is' if len(zero) == 1 else 'are'} 0 0 0; give the direction, or leave "
+            f"{path}: {subject} {list_names(zero)} {'is' if len(zero) == 1 else 'are'} 0 0 0; give the direction, or leave "
             "the picture out"
         )
     directions = vectors / lengths[:, None]
@@ -128,7 +128,7 @@ def find_lights(folder: Path) -> Path | None:
         return usual[0] if usual else None
     found = [path for path in sorted(folder.iterdir()) if _may_be_lights(path)]
     if len(found) > 1:
-        raise InputError(f"{folder}: several files of lights ({listed([path.name for path in found])}); name one")
+        raise InputError(f"{folder}: several files of lights ({list_names([path.name for path in found])}); name one")
     return found[0] if found else None
 
 
@@ -179,7 +179,7 @@ def _intensities(path: Path, values: np.ndarray, files: Sequence[str]) -> np.nda
     if dark:
         subject = "the intensity of" if len(dark) == 1 else "the intensities of"
         raise InputError(
-            f"{path}: {subject} {listed(dark)} {'is' if len(dark) == 1 else 'are'} not positive; correct "
+            f"{path}: {subject} {list_names(dark)} {'is' if len(dark) == 1 else 'are'} not positive; correct "
             f"{'it' if len(dark) == 1 else 'them'} or leave the {'picture' if len(dark) == 1 else 'pictures'} out"
         )
     return values.squeeze(1).astype(np.float32) if values.shape[1] == 1 else values.astype(np.float32)
@@ -202,7 +202,7 @@ def _refuse_behind(
         said = f"the light of {files[behind[0]]} has z = {directions[behind[0], 2]:.3g}, behind the object (1 of "
         said += f"{len(directions)})"
     else:
-        names = listed([files[number] for number in behind], _MOST_NAMED)
+        names = list_names([files[number] for number in behind], _MOST_NAMED)
         said = f"{len(behind)} of {len(directions)} lights have z <= 0, behind the object ({names})"
     flags = [flag.strip() for flag in frame.split(",") if flag.strip().lower() not in ("", "y-up")]
     turned = [flag for flag in flags if flag.lower() != "z-away"]

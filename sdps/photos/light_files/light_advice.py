@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from render.shared.errors import listed
+from render.shared.errors import list_names
 from sdps.methods.given_lights import AXES, LightFit, Reading
 from sdps.photos.light_files.light_frame import frame_matrix, frame_name
 
@@ -54,7 +54,7 @@ def _order(better: Reading, files: Sequence[str]) -> str:
         "reversed": "the rows fit in reversed order",
         "other": "the rows fit other pictures",
     }[better.sorting]
-    said = f" ({first})" if better.sorting != "other" else f" ({listed(owners, 8)})"
+    said = f" ({first})" if better.sorting != "other" else f" ({list_names(owners, 8)})"
     return f"{how}{said}; write each picture's name before its row"
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from scipy import io as scipy_io
 
 from render.shared.decoding import decoding
-from render.shared.errors import InputError, listed
+from render.shared.errors import InputError, list_names
 from sdps.photos.light_files.light_table import INTENSITIES, Table, Want
 
 _NAMED = re.compile(r"(l|s|(l|light)?_?(dirs?|directions?|vectors?)|lights?(_?(dirs?|directions?|sources?|vectors?))?"
@@ -130,8 +130,8 @@ def _chosen(
         found = list(small)  # its shape is what is wrong, which is said as for a text
     if len(found) != 1:
         shapes = [f"{name} ({' x '.join(map(str, entry.shape))})" for name, entry in entries.items()]
-        there = listed([*shapes, *others]) or "nothing"
-        several = f"several arrays may be lights ({listed(found or rest)})" if rest else f"holds {there}"
+        there = list_names([*shapes, *others]) or "nothing"
+        several = f"several arrays may be lights ({list_names(found or rest)})" if rest else f"holds {there}"
         wanted = " or ".join(f"{count} x {width}" for width in want.widths)
         raise InputError(f"{path}: {several}; save one array of {wanted} numbers, named {'L' if want.lights else 'E'}")
     values = _numbers(small[found[0]])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from render.shared.errors import InputError, listed
+from render.shared.errors import InputError, list_names
 from render.shared.tables import natural_key
 from sdps.photos.light_files.light_table import LIGHTS, Table, Want, are_level, are_unit, counts
 
@@ -120,19 +120,19 @@ def in_order(path: Path, table: Table, files: Sequence[str]) -> tuple[np.ndarray
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         be = "is" if len(twice) == 1 else "are"
-        raise InputError(f"{path}: {listed(twice)} {be} there twice; keep one row for each picture")
+        raise InputError(f"{path}: {list_names(twice)} {be} there twice; keep one row for each picture")
     places, note = _by_number(names, files) if all(map(str.isdecimal, names)) else _by_name(path, names, files)
     missing = [file for file, place in zip(files, places, strict=True) if place is None]
     if missing:
         raise InputError(
-            f"{path}: no row for {listed(missing)} ({len(missing)} of {len(files)} pictures lack one); its rows are "
-            f"for {listed(names, 3)}; add what is missing or correct the names"
+            f"{path}: no row for {list_names(missing)} ({len(missing)} of {len(files)} pictures lack one); its rows are "
+            f"for {list_names(names, 3)}; add what is missing or correct the names"
         )
     used = [place for place in places if place is not None]
     spare = [name for place, name in enumerate(names) if place not in set(used)]
     notes = [note] if note else []
     if spare:
-        notes.append(f"rows without a picture were not used: {listed(spare)}")
+        notes.append(f"rows without a picture were not used: {list_names(spare)}")
     return table.values[used], tuple(notes)
 
 
@@ -146,13 +146,13 @@ def _by_name(path: Path, names: Sequence[str], files: Sequence[str]) -> tuple[li
         for number, file in enumerate(files):
             found = rows.get(of_file(file), []) if places[number] is None else []
             if len(found) > 1:
-                both = listed([names[place] for place in found])
+                both = list_names([names[place] for place in found])
                 raise InputError(f"{path}: {both} all fit {file}; keep one row for each picture")
             places[number] = found[0] if found else places[number]
     used = [place for place in places if place is not None]
     if len(set(used)) < len(used):
         row = Counter(used).most_common(1)[0][0]
-        both = listed([file for file, place in zip(files, places, strict=True) if place == row])
+        both = list_names([file for file, place in zip(files, places, strict=True) if place == row])
         raise InputError(f"{path}: the row of {names[row]} fits {both}; write the names with their suffixes")
     if used or len(names) != len(files):
         return places, ""

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from render.shared.errors import InputError, listed
-from render.shared.tables import numbered_lines
+from render.shared.errors import InputError, list_names
+from render.shared.tables import number_lines
 from sdps.photos.light_files.light_columns import Heading, read_heading
 from sdps.photos.light_files.light_table import Table, Want
 
@@ -73,7 +73,7 @@ def read_text_table(path: Path, text: str, count: int, want: Want) -> Table:
     _check(path, rows, count, want, heading)
     mapped = heading is not None and (rows[0].mapped or len(rows[0].values) >= len(heading.numbers))
     if heading is not None and rows[0].mapped and heading.unused:
-        notes.append(f"columns that were not used: {listed(heading.unused)}")
+        notes.append(f"columns that were not used: {list_names(heading.unused)}")
     return Table(
         np.array([row.values for row in rows], np.float64),
         tuple(row.name for row in rows) if rows[0].name else None,
@@ -88,7 +88,7 @@ def _content(path: Path, text: str, want: Want) -> tuple[Heading | None, list[tu
     """Take comments, blank lines, titles and the heading out."""
     heading: Heading | None = None
     lines: list[tuple[int, str]] = []
-    for number, raw in numbered_lines(text):
+    for number, raw in number_lines(text):
         start = _COMMENT.search(raw)
         line, comment = (raw[: start.start()], raw[start.end() :]) if start else (raw, "")
         line = _TYPE.sub("", line.replace("\N{MINUS SIGN}", "-")).strip()

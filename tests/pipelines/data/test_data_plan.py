@@ -125,7 +125,7 @@ def test_status_of_an_interrupted_folder(tmp_path):
 
 
 def test_machines_side_by_side_count_once():
-    assert folder_state.covered([(0, 10), (5, 12), (20, 21)]) == 13
+    assert folder_state.measure_union([(0, 10), (5, 12), (20, 21)]) == 13
     assert folder_state.scene_rates([]) == {"recent_per_hour": None, "overall_per_hour": None}
 
 
@@ -176,7 +176,7 @@ def test_paces():
     lines = [{"seconds": float(k), "stages": {"shape": 1.0, "render": k - 1.0}} for k in (3, 5, 100)]
     assert budget.recent_pace(lines, 2) == Pace(5.0, 2) and budget.recent_pace([], 2) is None
     assert Pace(5.0, 2).per_hour() == 1440 and Pace(5.0, 2).left(10) == 25
-    assert budget.sampled_pace(lines[:2], 0.25, 1).seconds == pytest.approx(3.25)
+    assert budget.estimate_pace(lines[:2], 0.25, 1).seconds == pytest.approx(3.25)
     assert [budget.duration(s) for s in (45, 600, 9000, 200_000)] == ["45 s", "10 min", "2.5 h", "2.3 days"]
     assert budget.gigabytes(34e6) == "34 MB" and budget.gigabytes(1.25e9) == "1.2 GB"
     assert budget.default_workers("cuda_ad_rgb") == 1 <= budget.default_workers("llvm_ad_rgb") <= budget.cores()

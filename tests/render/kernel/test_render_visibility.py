@@ -8,7 +8,7 @@ from render import shapes
 from render.backend.jit import dr, mi
 from render.kernel import many_lights, paths, scene
 from render.kernel.emitters import DistantLights
-from render.kernel.visibility import WORD, cells, grouped_visibility, probe_count, probed_visibility, visibility
+from render.kernel.visibility import WORD, cells, group_visibility, probe_count, probe_visibility, visibility
 from render.records.manifest import View
 
 SIZE, SPP = 16, 32
@@ -148,14 +148,14 @@ def test_probes_that_do_not_face_a_light_decide_nothing():
     probes = mi.Bool([True, True, True, True, False, False, False, False] * 2)
     segments = (mi.UInt32([0, 8]), mi.UInt32([8, 8]))
     expected = bits(visibility(built, *at, lights, 2, True), 16, 2)
-    found = bits(probed_visibility(built, *at, lights, 2, probes, segments), 16, 2)
+    found = bits(probe_visibility(built, *at, lights, 2, probes, segments), 16, 2)
     np.testing.assert_array_equal(found[0], [False] * 4 + [True] * 12)
     assert not found[1].any()
     np.testing.assert_array_equal(found, expected)
-    none = probed_visibility(built, *at, lights, 2, mi.Bool([False] * 16), segments)  # nobody probes: all ask
+    none = probe_visibility(built, *at, lights, 2, mi.Bool([False] * 16), segments)  # nobody probes: all ask
     np.testing.assert_array_equal(bits(none, 16, 2), expected)
     # A pixel none of whose samples probes, beside one that does.
-    mixed = probed_visibility(built, *at, lights, 2, mi.Bool([False] * 8 + [True] * 4 + [False] * 4), segments)
+    mixed = probe_visibility(built, *at, lights, 2, mi.Bool([False] * 8 + [True] * 4 + [False] * 4), segments)
     np.testing.assert_array_equal(bits(mixed, 16, 2), expected)
 
 
@@ -197,13 +197,13 @@ def test_groups_share_what_they_would_see(heap, lights):
     at = later.position, later.normal, later.facet, emitters, lights
     asked = bits(visibility(built, *at, coherent=False), later.count, lights)
     columns = [np.array(column) for column in at[:3]]
-    shared = bits(grouped_visibility(built, *columns, emitters, lights), later.count, lights)
+    shared = bits(group_visibility(built, *columns, emitters, lights), later.count, lights)
     faced = support.spread(lights, 0.02) @ np.array(later.normal) > 0
     wrong = (asked != shared) & faced
     assert 0.2 < asked[faced].mean() < 0.8  # much is in shadow
     assert 0 < wrong.sum() / faced.sum() < 0.02
     assert shared[faced].mean() == pytest.approx(asked[faced].mean(), abs=2e-3)  # light is missed as often as added
-    free = bits(grouped_visibility(NoShadows(built.mesh), *columns, emitters, lights), later.count, lights)
+    free = bits(group_visibility(NoShadows(built.mesh), *columns, emitters, lights), later.count, lights)
     np.testing.assert_array_equal(free & faced, faced)
 
 

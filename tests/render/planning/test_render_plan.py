@@ -132,7 +132,7 @@ def test_spatially_varying_scenes_change_nothing_else():
     assert [replace(scene, material="") for scene in mixed] == [replace(scene, material="") for scene in plain]
     pool = set(material_pool(config.materials))
     for number in chosen:
-        _, names = surfaces.split(mixed[number].material)
+        _, names = surfaces.split_name(mixed[number].material)
         assert len(names) in (2, 3) and len(set(names)) == len(names) and set(names) <= pool
         assert names[0] == plain[number].material and more[number].material == mixed[number].material
     assert len({mixed[number].material.split(":")[0] for number in chosen}) == 5

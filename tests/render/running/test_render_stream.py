@@ -17,7 +17,7 @@ import pytest
 from pretend_renderer import busy, listed, pretend
 
 from pipelines.shared.stream_config import StreamConfig
-from pipelines.train.streaming import open_streamed, streamed
+from pipelines.train.streaming import open_stream, stream_scenes
 from render.planning.plan import DataConfig, plan
 from render.records.manifest import SceneSpec, View, write_manifest
 from render.records.shards import read_shard
@@ -129,7 +129,7 @@ def test_streamed_scenes_are_the_shards(simple, shards, opened, start):
 def test_batches_are_made_of_what_a_process_renders(simple, shards):
     """The whole way, from plan to batch, with a real renderer."""
     options = SampleOptions(seed=0, images=2, size=32, augmentation=PLAIN)
-    source = open_streamed(simple, options, StreamConfig(window=3, threads=1), batch=2)
+    source = stream_scenes(simple, options, StreamConfig(window=3, threads=1), batch=2)
     batch = next(source.batches(4))  # the window holds the scenes 2, 3 and 4
     source.close()
     assert not active_children()
@@ -273,12 +273,12 @@ def test_interrupt_is_left_to_the_parent(opened):
 def test_only_training_scenes_are_streamed(scenes):
     marked = [replace(scene, split="val") if scene.id.startswith("blobby-00001") else scene for scene in scenes]
     options = SampleOptions(seed=0, images=4, size=32, augmentation=Augmentation())
-    source = open_streamed(marked, options, StreamConfig(window=4), batch=2)
+    source = stream_scenes(marked, options, StreamConfig(window=4), batch=2)
     assert (source.scenes, source.window) == (8, 4)
-    assert open_streamed(marked, options, StreamConfig(), batch=2).window == 8  # more would hold scenes twice
-    assert open_streamed(marked, options, StreamConfig(), batch=10).window == 10
+    assert stream_scenes(marked, options, StreamConfig(), batch=2).window == 8  # more would hold scenes twice
+    assert stream_scenes(marked, options, StreamConfig(), batch=10).window == 10
     with pytest.raises(InputError, match=r"stream\.window 4 must be at least batch_scenes 5"):
-        open_streamed(scenes, options, StreamConfig(window=4), batch=5)
+        stream_scenes(scenes, options, StreamConfig(window=4), batch=5)
 
 
 @pytest.mark.parametrize(("field", "value"), [("window", 0), ("fresh", 0), ("depth", -1), ("threads", -1)])
@@ -293,7 +293,7 @@ def test_plan_in_the_data_folder_is_streamed_and_nothing_is_stored(scenes, tmp_p
     options = SampleOptions(seed=5, images=4, size=32, augmentation=PLAIN)
     stage = SimpleNamespace(config=config, sample_options=lambda: options)
     here = SimpleNamespace(leads=True, wait=lambda: None, rank=1, world=2, device=SimpleNamespace(type="cpu"))
-    source = streamed(SimpleNamespace(), tmp_path, stage, here, StreamConfig(window=8, fresh=0.5))
+    source = open_stream(SimpleNamespace(), tmp_path, stage, here, StreamConfig(window=8, fresh=0.5))
     assert (source.scenes, source.batch, source.window, source.fresh) == (12, 4, 8, 0.5)
     assert source.identity()["stream_seed"] == 5
     assert [path.name for path in tmp_path.iterdir()] == ["manifest.jsonl"]

@@ -18,7 +18,7 @@ from render.planning import plan as planning
 from render.planning.data_config import DataConfig
 from render.records.manifest import SceneSpec, View
 from render.records.shards import read_shard, write_shard
-from render.running.rendered_view import rendered_views
+from render.running.rendered_view import trace_views
 from render.shapes import compositions
 from render.shapes.files.mesh_file import from_trimesh
 from render.shapes.geometry.contact import CLEARANCE, free_path
@@ -192,7 +192,7 @@ def test_the_shard_keeps_the_ids(built, tmp_path):
             id=name, seed=1, split="train", shape=name, material="lambertian:0.5", view=View(),
             lights=((0.0, 0.0, 1.0),), size=16, spp=4, bounces=0,
         )  # fmt: skip
-        (view,) = rendered_views(scene.build(mesh), [spec], pack([spec.material]), [0])
+        (view,) = trace_views(scene.build(mesh), [spec], pack([spec.material]), [0])
         write_shard(tmp_path / f"{name}.exr", view.shard())
         found = read_shard(tmp_path / f"{name}.exr", spec).objects
         if name == "sphere":

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from render.planning import light_sets
-from render.shared.errors import InputError, listed
+from render.shared.errors import InputError, list_names
 from render.shared.files import parse_json, read_text
 from render.shared.tables import (
     check_directions,
     line_of_row,
-    numbered_lines,
+    number_lines,
     read_light_list,
     read_names,
     read_numbers,
@@ -20,7 +20,7 @@ from render.shared.tables import (
 
 def test_lines_are_counted_as_editors_count_them(tmp_path: Path) -> None:
     text = "a\x0cb\u2028c\r\n\r\nd\re\n"
-    assert numbered_lines(text) == [(1, "a\x0cb\u2028c"), (2, ""), (3, "d"), (4, "e"), (5, "")]
+    assert number_lines(text) == [(1, "a\x0cb\u2028c"), (2, ""), (3, "d"), (4, "e"), (5, "")]
     path = tmp_path / "table.txt"
     path.write_bytes(b"0 0 1\r\n\r\n\r\n0 1\x0c 0\r\n0 x 1\r\n")
     assert (line_of_row(path, 1), line_of_row(path, 2)) == (4, 5)
@@ -60,5 +60,5 @@ def test_sets_of_lights_name_the_line(tmp_path: Path) -> None:
 
 
 def test_many_names_are_cut() -> None:
-    assert listed(["a", "b", "c"], 2) == "a, b, c"  # one more is no longer than "1 more"
-    assert listed([str(number) for number in range(9)], 2) == "0, 1 and 7 more"
+    assert list_names(["a", "b", "c"], 2) == "a, b, c"  # one more is no longer than "1 more"
+    assert list_names([str(number) for number in range(9)], 2) == "0, 1 and 7 more"

@@ -18,7 +18,7 @@ from sdps.inference.estimator import Estimator
 from sdps.inference.image_source import survey
 from sdps.inference.tiles import PIXEL_BYTES, tiles
 from sdps.methods import on_box
-from sdps.methods.on_box import observed_bytes, run_on_box
+from sdps.methods.on_box import estimate_bytes, run_on_box
 from sdps.models.base import Lights
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.frames import FusedMap
@@ -131,9 +131,9 @@ def test_methods_by_pixel_see_some_rows_at_once(name: str, sphere: tuple, monkey
     images, mask = sphere
     whole = run_on_box(name, images, mask, (LIGHTS, None)).normals
     monkeypatch.setattr(on_box, "PART_BYTES", 8 * 2**20)
-    assert observed_bytes(name, len(images), mask.size) == 8 * 2**20
+    assert estimate_bytes(name, len(images), mask.size) == 8 * 2**20
     np.testing.assert_allclose(run_on_box(name, images, mask, (LIGHTS, None)).normals, whole, atol=1e-6)
-    assert observed_bytes("pf14", len(images), mask.size) > 8 * 2**20  # sees all at once
+    assert estimate_bytes("pf14", len(images), mask.size) > 8 * 2**20  # sees all at once
 
 
 def test_memory_does_not_grow_with_the_frame() -> None:

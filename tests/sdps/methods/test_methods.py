@@ -66,7 +66,7 @@ def test_trained_weights_come_before_shipped_ones(runs: Path, kept: Path, tmp_pa
     assert pretrained.require("lcnet", runs) == pretrained.trained_file(runs, "lcnet")
     assert pretrained.require("shipped:lcnet", runs) == kept
     assert pretrained.require("lcnet", tmp_path) == kept
-    assert pretrained.require("lcnet") == kept and pretrained.shipped() == ["lcnet"]
+    assert pretrained.require("lcnet") == kept and pretrained.list_shipped() == ["lcnet"]
     with pytest.raises(
         InputError, match=r"nenet.safetensors: no such weights; train them with `sdps train --models nenet`"
     ):

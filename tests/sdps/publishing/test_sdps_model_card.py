@@ -170,7 +170,7 @@ def test_licences(tmp_path: Path, data: Path) -> None:
 def test_pretrained_weights_say_the_same() -> None:
     """Their cards were not all written by the template as it is now."""
     cards = sorted(path for path in pretrained.shipped_folder().glob("*.md") if path.stem != "RESULTS")
-    assert len(cards) == len(pretrained.shipped())
+    assert len(cards) == len(pretrained.list_shipped())
     for card in cards:
         text = card.read_text()
         assert front_matter(text)["license_name"] == "research-use" and "research use only (`LICENSE-DATA`)" in text

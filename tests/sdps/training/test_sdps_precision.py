@@ -28,15 +28,15 @@ from sdps.training.training_config import NormalTraining
 def forgotten() -> Iterator[None]:
     """Let every test, and what follows, measure again."""
     yield
-    precision._resolved.cache_clear()
+    precision._resolve.cache_clear()
     precision._speed.cache_clear()
 
 
 def pretend(monkeypatch: pytest.MonkeyPatch, ratio: float) -> None:
     """Let bfloat16 be so many times as fast as float32."""
-    precision._resolved.cache_clear()
+    precision._resolve.cache_clear()
     precision._speed.cache_clear()
-    monkeypatch.setattr(precision, "_measured", lambda side: ratio)
+    monkeypatch.setattr(precision, "_measure_ratio", lambda side: ratio)
 
 
 @pytest.mark.parametrize(("ratio", "chosen"), [(2.3, "bfloat16"), (1.1, "float32"), (0.07, "float32")])
@@ -53,7 +53,7 @@ def test_auto_takes_bfloat16_only_where_it_is_clearly_faster(monkeypatch, ratio:
 def test_it_is_measured_once_per_process(monkeypatch: pytest.MonkeyPatch) -> None:
     pretend(monkeypatch, 2.3)
     assert arithmetic() is arithmetic("auto", "cpu")
-    monkeypatch.setattr(precision, "_measured", lambda side: 0.07)
+    monkeypatch.setattr(precision, "_measure_ratio", lambda side: 0.07)
     assert arithmetic("float32").precision == "float32" and arithmetic().precision == "bfloat16"
 
 
@@ -78,7 +78,7 @@ def test_gpus_have_bfloat16_from_ampere_on(monkeypatch, capability: tuple, chose
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "A GPU")
     precision._speed.cache_clear()
-    precision._resolved.cache_clear()
+    precision._resolve.cache_clear()
     assert arithmetic("auto", "cuda").precision == chosen
     assert arithmetic("auto", torch.device("cuda", 1)).precision == chosen
     assert "A GPU" in arithmetic("auto", "cuda").reason

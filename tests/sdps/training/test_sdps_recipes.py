@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.shared import presets
-from pipelines.train.train import in_order, required
+from pipelines.train.train import in_order, load_required
 from render.shared.errors import InputError
 from sdps.methods import pretrained
 from sdps.models.registry import MODELS
@@ -81,8 +81,8 @@ def test_runs_are_trained_after_what_they_need() -> None:
 def test_weights_that_are_there_need_no_run(tmp_path: Path) -> None:
     own = "runs.further={base: nenet, start: shipped:nenet, lights: shipped:lcnet}"
     assert in_order(presets.load("smoke", [own]), ["further"]) == ["further"]
-    assert required(tmp_path, "shipped:lcnet").name == "lcnet"
-    assert required(tmp_path, str(pretrained.shipped_folder() / "psfcn.safetensors")).name == "psfcn"
+    assert load_required(tmp_path, "shipped:lcnet").name == "lcnet"
+    assert load_required(tmp_path, str(pretrained.shipped_folder() / "psfcn.safetensors")).name == "psfcn"
     gone = tmp_path / "gone.safetensors"
     with pytest.raises(InputError, match=r"gone.safetensors: no such weights"):
         in_order(presets.load("smoke", [f"runs.further={{base: nenet, start: {gone}}}"]), ["further"])

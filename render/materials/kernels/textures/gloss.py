@@ -47,7 +47,7 @@ class Gloss:
         base = mi.Color3f(*(dr.clip(channel, 0, 1) for channel in base))
         rough = dr.clip(appearance.roughness, microfacet.SMOOTHEST, microfacet.ROUGHEST)
         row = (rough - microfacet.SMOOTHEST) * ((_ROWS - 1) / (microfacet.ROUGHEST - microfacet.SMOOTHEST))
-        coat, single = _lost(row, cosine)
+        coat, single = _interpolate_loss(row, cosine)
         mean_coat, mean_single = _mean(row)
         average = base + (1 - base) * (1 / 21)
         repeated = dr.square(average) * (1 - mean_single) / (1 - average * mean_single)
@@ -68,7 +68,7 @@ class Gloss:
         smith = 0.5 / (co * self._slope(ci) + ci * self._slope(co))
         fresnel = _fifth(1 - dr.clip(dr.dot(wi, half), 0, 1))
         value = (self._zero + (1 - self._zero) * fresnel) * (self._density(half) * smith)
-        coat, single = _lost(self._row, co)
+        coat, single = _interpolate_loss(self._row, co)
         value += self._diffuse * coat + self._again * single
         return dr.select(active, value * co, 0)
 
@@ -115,7 +115,7 @@ def _tables() -> tuple:
     return tuple(table(values) for values in microfacet.tables())
 
 
-def _lost(row: Any, cosine: Any) -> list:
+def _interpolate_loss(row: Any, cosine: Any) -> list:
     """Interpolate T_d and T_s at a fractional row and a cosine."""
     values, _ = _tables()
     first = dr.minimum(mi.UInt32(row), _ROWS - 2)

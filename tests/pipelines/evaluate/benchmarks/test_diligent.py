@@ -214,7 +214,7 @@ def test_expressions(models):
     assert (both.lights, both.normals) == ("lcnet", "least-squares")
     alone = parse("lcnet", finder(models))
     assert (alone.lights, alone.normals, alone.name) == ("lcnet", "", "lcnet")
-    learned, classic = (select.selected([kind], models) for kind in ("learned", "classical"))
+    learned, classic = (select.select_methods([kind], models) for kind in ("learned", "classical"))
     assert all(method.models() or "true lights" in method.name for method in learned)
     assert not any(method.models() for method in classic)
     names = [method.name for method in select.every_method(models)]
@@ -226,13 +226,13 @@ def test_expressions(models):
 
 
 def test_lights_over_eight_views_have_a_row_of_their_own(models):
-    learned = {method.name: method for method in select.selected(["learned"], models)}
+    learned = {method.name: method for method in select.select_methods(["learned"], models)}
     views = learned["lcnet-soft (shipped), 8 views"]
     assert (views.normals, views.light_views) == ("", 8)
     assert list(suite.lighting_only(learned, list(learned.values())))[:2] == ["lcnet", "lcnet (shipped)"]
     told = suite.lighting_only(learned, list(learned.values()))
     assert views.name in told and not any("+" in name for name in told)  # whose lights are a network's alone
-    few = select.selected(["shipped:lcnet-soft", "shipped:sdps-plus"], models)
+    few = select.select_methods(["shipped:lcnet-soft", "shipped:sdps-plus"], models)
     assert len(suite.lighting_only({method.name: method for method in few}, few)) == 2  # one view, eight views
 
 

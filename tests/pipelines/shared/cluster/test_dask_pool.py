@@ -107,8 +107,8 @@ def test_records_and_bytes_are_those_of_a_local_run(tmp_path, address):
 
 @pytest.mark.parametrize("name", ["sdps", "fitted materials", "code of the renderer"])
 def test_what_differs_is_refused(tmp_path, address, monkeypatch, name):
-    there = dict(cluster_worker.installed()) | {name: "other"}
-    monkeypatch.setattr(cluster_worker, "installed", lambda: there)
+    there = dict(cluster_worker.describe_installation()) | {name: "other"}
+    monkeypatch.setattr(cluster_worker, "describe_installation", lambda: there)
     with pytest.raises(InputError, match=rf"a worker has {name} .*, the run other; install the same sdps on both"):
         run(planned([["ok"]]), tmp_path, address)
     assert not files(tmp_path)

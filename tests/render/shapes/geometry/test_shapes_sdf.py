@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from render.shapes.blobby import BlobParameters, displaced_sphere
+from render.shapes.blobby import BlobParameters, displace_sphere
 from render.shapes.geometry import sdf
 from render.shapes.geometry.mesh import vertex_normals
 from render.shapes.geometry.noise import scalar_waves, vector_waves
@@ -65,7 +65,7 @@ def test_smooth_union_fills_the_groove_and_is_exact_away_from_it():
 def test_bounded_is_exact_near_its_ball():
     ball = sdf.ball([0.2, 0, 0], 0.3)
     at = generator(3, "test").uniform(-1, 1, (3, 500)).astype(np.float32)
-    limited = sdf.bounded(ball, [0, 0, 0], 0.5, margin=0.2)
+    limited = sdf.bound(ball, [0, 0, 0], 0.5, margin=0.2)
     near = np.linalg.norm(at, axis=0) < 0.7
     np.testing.assert_array_equal(limited(at)[near], ball(at)[near])
     assert (limited(at)[~near] > 0.19).all()
@@ -117,6 +117,6 @@ def test_blob_normals_match_its_triangles(flow):
         lumpiness=0.2, frequency=3.0, bandwidth=2.0, slope=1.0, crease=-0.5, stretch=(1, 0.8, 1.2), flow=flow,
         flow_frequency=2.0,
     )  # fmt: skip
-    mesh = displaced_sphere(generator(5, "test"), parameters)
+    mesh = displace_sphere(generator(5, "test"), parameters)
     cosine = (vertex_normals(mesh.vertices, mesh.faces.astype(np.int64)) * mesh.normals).sum(axis=1)
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 0.5

@@ -156,7 +156,7 @@ def test_names():
     assert library.load("procedural:wood:7").category == "procedural-wood"
     kinds = {library.load(f"procedural:{seed}").kind for seed in range(60)}
     assert kinds == set(KINDS)  # a seed alone draws the kind
-    pattern, names = surfaces.split("procedural:tiles:7:chrome+brass")
+    pattern, names = surfaces.split_name("procedural:tiles:7:chrome+brass")
     assert pattern.texture == "tiles" and pattern.seed == 7 and names == ("chrome", "brass")
     assert textured.without_seed("procedural:wood:7") == "procedural:wood"
     assert textured.without_seed("chrome") == "chrome"
