@@ -16,7 +16,7 @@ _HOLD = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2", "MKL_ENABL
 
 
 def kinds() -> tuple[str, ...]:
-    """Return the kinds there are to measure: one where the processor is no x86, or has nothing beyond AVX2."""
+    """Return the kinds there are to measure: one where the processor is not an x86, or has nothing beyond AVX2."""
     import torch
 
     newer = torch.backends.cpu.get_cpu_capability().startswith("AVX512")

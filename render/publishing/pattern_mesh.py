@@ -31,9 +31,7 @@ def cut(mesh: TriangleMesh, weights: Weights, edge: float) -> tuple[TriangleMesh
         The mesh, and (V, M - 1) float32 shares: column k is the share of material k + 1 in what it and those before it
         have together, as nested blends of two take it. A vertex where the pattern jumps appears once for each side.
     """
-    corners, normals, value = (
-        np.concatenate(part) for part in zip(*_split_triangles(mesh, weights, edge), strict=True)
-    )
+    corners, normals, value = (np.concatenate(part) for part in zip(*_subdivide(mesh, weights, edge), strict=True))
     pieces = (corners, normals, _shares(value))
     rows = np.concatenate([part.reshape(-1, part.shape[-1]) for part in pieces], axis=1).astype(np.float32)
     rows, corners = np.unique(rows, axis=0, return_inverse=True)
@@ -41,7 +39,7 @@ def cut(mesh: TriangleMesh, weights: Weights, edge: float) -> tuple[TriangleMesh
     return finer, rows[:, 6:]
 
 
-def _split_triangles(
+def _subdivide(
     mesh: TriangleMesh, weights: Weights, edge: float
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield finished triangles, round by round: corners (F, 3, 3), normals (F, 3, 3), weights (F, 3, M)."""

@@ -82,7 +82,7 @@ def profile_distances(
         inverse = np.where(gains > 0.0, 1.0 / np.maximum(gains, 1e-3), 1.0).astype(np.float32)
     mean = _mean_direction(lights)
     directions, intensities = lights.directions.astype(np.float32), lights.intensities.astype(np.float32)
-    maps = observations.to_map(_spread_normals(normalise(shapes), rows, normals))
+    maps = observations.to_map(_spread_out(normalise(shapes), rows, normals))
     return Estimate(maps, directions, intensities, notes=Notes(residual=residual, light_mean=mean))
 
 
@@ -283,9 +283,7 @@ def _contour_slope(ways: np.ndarray, outward: np.ndarray) -> tuple[float, float]
     return float(slope), float(np.corrcoef(angles[near], ways[near])[0, 1])
 
 
-def _spread_normals(
-    vectors: np.ndarray, rows: np.ndarray, normals: np.ndarray, nearest: int = 6
-) -> np.ndarray:  # (P, 3)
+def _spread_out(vectors: np.ndarray, rows: np.ndarray, normals: np.ndarray, nearest: int = 6) -> np.ndarray:  # (P, 3)
     """Give every profile the mean normal of the samples with the nearest profiles, the nearer the more."""
     sampled = vectors[rows]
     result = np.empty((len(vectors), 3), np.float64)

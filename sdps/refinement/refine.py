@@ -189,7 +189,7 @@ def _trace_light(problem: Problem, state: State, bounces: int) -> Problem:
     heights = integrate(laid, problem.mask, discontinuities=True).z
     found = trace(heights, problem.mask, normals, lights)
     brightest = float(np.quantile(albedo, _BRIGHTEST))
-    first, more = (found.bounced(normals, albedo / brightest, lights, count) for count in (1, bounces))
+    first, more = (found.bounce(normals, albedo / brightest, lights, count) for count in (1, bounces))
     twice = float(more.sum() / max(first.sum(), 1e-9)) - 1.0
     first *= brightest
     usable = problem.usable * torch.from_numpy(found.lit)

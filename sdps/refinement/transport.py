@@ -38,7 +38,7 @@ class Transport(NamedTuple):
     lit: np.ndarray
     factors: np.ndarray
 
-    def bounced(self, normals: np.ndarray, albedo: np.ndarray, lights: np.ndarray, bounces: int = 2) -> np.ndarray:
+    def bounce(self, normals: np.ndarray, albedo: np.ndarray, lights: np.ndarray, bounces: int = 2) -> np.ndarray:
         """Return the radiance (P, 3, L) float32 of bounced light.
 
         Args:

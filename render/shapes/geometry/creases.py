@@ -68,7 +68,7 @@ def shade(
         turned, fits = _fitting(given, flat, fans)
         wanted[fits] = turned[fits]
     if given is not None or unfit.any():
-        owner, split, normals = _merge_corners(owner, split, wanted.reshape(-1, 3))
+        owner, split, normals = _merge(owner, split, wanted.reshape(-1, 3))
     return vertices[owner], split, normals.astype(np.float32)
 
 
@@ -181,10 +181,8 @@ def _fitting(given: np.ndarray, flat: np.ndarray, fans: _Fans) -> tuple[np.ndarr
     return unit * sign[..., None], fits & ~smeared[fans.faces]
 
 
-def _merge_corners(
-    owner: np.ndarray, faces: np.ndarray, wanted: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Make one vertex of all corners with the same vertex and normal (3F, 3); as `_split`, and its normals."""
+def _merge(owner: np.ndarray, faces: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Make one vertex of all corners with the same vertex and normal (3F, 3); as `_split_corners`, and its normals."""
     steps = np.rint((wanted + 1) * ((1 << _KEY_BITS - 1) - 1)).astype(np.int64)
     key = owner[faces.ravel()]
     for axis in range(3):

@@ -86,8 +86,8 @@ def read_lights(
     if zero:
         subject = "the light of" if len(zero) == 1 else "the lights of"
         raise InputError(
-            f"{path}: {subject} {list_names(zero)} {'is' if len(zero) == 1 else 'are'} 0 0 0; give the direction, or leave "
-            "the picture out"
+            f"{path}: {subject} {list_names(zero)} {'is' if len(zero) == 1 else 'are'} 0 0 0; give the direction, or "
+            "leave the picture out"
         )
     directions = vectors / lengths[:, None]
     _refuse_behind(path, directions, files, frame, faults)

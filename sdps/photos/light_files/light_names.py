@@ -125,8 +125,8 @@ def in_order(path: Path, table: Table, files: Sequence[str]) -> tuple[np.ndarray
     missing = [file for file, place in zip(files, places, strict=True) if place is None]
     if missing:
         raise InputError(
-            f"{path}: no row for {list_names(missing)} ({len(missing)} of {len(files)} pictures lack one); its rows are "
-            f"for {list_names(names, 3)}; add what is missing or correct the names"
+            f"{path}: no row for {list_names(missing)} ({len(missing)} of {len(files)} pictures lack one); its rows "
+            f"are for {list_names(names, 3)}; add what is missing or correct the names"
         )
     used = [place for place in places if place is not None]
     spare = [name for place, name in enumerate(names) if place not in set(used)]

@@ -73,7 +73,7 @@ def test_bounced_light_is_that_of_the_renderer() -> None:
     normals = np.asarray(truth.normals)[mask]
     depth = np.asarray(truth.depth) * size / 2  # half image widths to pixels
     found = trace(depth, mask, normals, lights)
-    bounced = found.bounced(normals, np.full((mask.sum(), 3), albedo), lights)
+    bounced = found.bounce(normals, np.full((mask.sum(), 3), albedo), lights)
     expected = (made[1] - made[0])[:, mask].transpose(1, 2, 0) if made[0].shape[-1] == 3 else None
     assert expected is not None and expected.shape == bounced.shape
     assert bounced.mean() == pytest.approx(expected.mean(), rel=0.1)
@@ -102,11 +102,11 @@ def test_refinement_of_a_white_cavity_gains_from_bounced_light() -> None:
         made = refine(images, mask, true, lights, np.ones(16), directions_given=True, config=config, stray=False)
         return float(angle_degrees(made.normals[mask], normals).mean())
 
-    lit = direct + found.bounced(normals, albedo, lights, 2)
+    lit = direct + found.bounce(normals, albedo, lights, 2)
     assert off(0, direct) < 0.5  # 0.2: nothing else pulls
     assert off(2, lit) < 0.9 * off(0, lit)
 
 
 def test_no_bounces_leave_images_as_they_are() -> None:
     nothing = Transport(np.ones((2, 1), bool), np.zeros((2, 2), np.float32))
-    assert not nothing.bounced(np.eye(3)[[2, 2]], np.ones((2, 3)), np.array([[0.0, 0.0, 1.0]])).any()
+    assert not nothing.bounce(np.eye(3)[[2, 2]], np.ones((2, 3)), np.array([[0.0, 0.0, 1.0]])).any()

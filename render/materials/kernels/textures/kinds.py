@@ -66,7 +66,7 @@ class Numbers:
         """Return an entry of an array by its number."""
         return dr.gather(mi.Float, self._values, index + self._places[name])
 
-    def turned(self, name: str, point: tuple) -> tuple[Jet, Jet, Jet]:
+    def turn(self, name: str, point: tuple) -> tuple[Jet, Jet, Jet]:
         """Return coordinates multiplied by a matrix (3, 3)."""
         first = self._places[name]
         at = [dr.gather(mi.Float, self._values, mi.UInt32(first + k)) for k in range(9)]
@@ -88,7 +88,7 @@ def draw_noise(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def solid_noise(point: tuple, n: Numbers) -> Layers:
-    x, y, z = n.turned("turn", point)
+    x, y, z = n.turn("turn", point)
     large = noise(x, y, z, n.seed, _octaves(4))
     fine = noise(x * 5.3, y * 5.3, z * 5.3, n.seed + 7, _octaves(2))
     edge = n["edge"]
@@ -106,7 +106,7 @@ def draw_marble(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def solid_marble(point: tuple, n: Numbers) -> Layers:
-    x, y, z = n.turned("turn", point)
+    x, y, z = n.turn("turn", point)
     cloud = noise(x, y, z, n.seed, _octaves(5))
     other = noise(x * 1.7, y * 1.7, z * 1.7, n.seed + 11, _octaves(4))
     wave = sin((x * n["bands"] + cloud * n["warp"]) * np.pi)
@@ -125,7 +125,7 @@ def draw_wood(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def solid_wood(point: tuple, n: Numbers) -> Layers:
-    x, y, z = n.turned("turn", point)
+    x, y, z = n.turn("turn", point)
     bend = noise(x * 1.3, y * 1.3, z * 0.5, n.seed, _octaves(2))
     across = x + n["away"]
     radius = root(across * across + y * y + 1e-4)
@@ -147,7 +147,7 @@ def draw_rust(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def solid_rust(point: tuple, n: Numbers) -> Layers:
-    x, y, z = n.turned("turn", point)
+    x, y, z = n.turn("turn", point)
     patch = noise(x, y, z, n.seed, _octaves(5)) + n["spread"]
     grain = noise(x * 7.1, y * 7.1, z * 7.1, n.seed + 5, _octaves(2))
     eaten = step(patch, 0.02, 0.06)
