@@ -37,7 +37,7 @@ def make(bench: Workbench) -> Panel:
             name = runner.method.name
             panels.setdefault(scene.material, (item, []))[1].append((name, result))
             angle, gain = (result.scores.get(metric) for metric in ("direction_mae", "intensity_error"))
-            rows.append((shape, scene.material, name, *("-" if v is None else number(v) for v in (angle, gain))))
+            rows.append((shape, scene.material, name, number(angle), number(gain)))
             values[f"{scene.id} | {name}"] = {"direction_mae": angle, "intensity_error": gain}
         caption = f"{shape.capitalize()}: lights as (x, y) on the unit disc, coloured by intensity over the highest."
         drawings.append((f"lights-{shape}", caption, _chart(panels)))

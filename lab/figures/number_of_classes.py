@@ -17,7 +17,7 @@ from lab.figures.sweep import LeftOut, Panel, paper_row, shapes_of, sweep
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.results import Mean, mean
+from pipelines.evaluate.score_tables import Mean, mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number

@@ -16,7 +16,7 @@ from lab.figures.sweep import METRICS, Panel, finds, paper_row, shapes_of, sweep
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.results import Mean, mean
+from pipelines.evaluate.score_tables import Mean, mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
@@ -121,11 +121,10 @@ def _table(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
         cells = []
         for count in counts:
             middle, low, high, failed = _average(points[method.name, shape, count][metric])
-            text = number(middle) if np.isfinite(middle) else "-"
-            text += f" [{number(low)}, {number(high)}]" if high > low else ""
+            text = number(middle) + (f" [{number(low)}, {number(high)}]" if high > low else "")
             cells.append(text + (f" {failed} failed" if failed and np.isfinite(middle) else ""))
         known = _published(method, shape, metric)
-        rows.append((method.name, *cells, number(known) if known is not None else "-"))
+        rows.append((method.name, *cells, number(known)))
     title, unit = METRICS[metric]
     header = ("method", *map(str, counts), f"published, {counts[-1]}" if counts[-1] == 100 else "published, 100")
     note = f"{unit.capitalize()}, mean over materials and draws; in brackets the lowest and the highest draw."

@@ -124,7 +124,7 @@ def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Tab
         rows.append((
             curve.method, number(float(np.mean(list(curve.errors.values())))) if curve.errors else "-",
             LABELS[curve.column], number(float(np.mean(theirs))) if theirs else "-",
-            f"{rho:.2f}" if np.isfinite(rho) else "-", f"{p:.1g}" if np.isfinite(p) else "-", str(count),
+            number(rho, 2), f"{p:.1g}" if np.isfinite(p) else "-", str(count),
         ))  # fmt: skip
     note = "Mean angular error in degrees over mask pixels. Spearman's rank correlation over the materials."
     header = ("method", "mean", "published curve", "its mean, same materials", "rank correlation", "p", "materials")
@@ -136,8 +136,8 @@ def _hardest(curves: list[Curve], published: dict[str, dict[str, float]]) -> Tab
     first = curves[0].errors
     names = sorted(first, key=lambda name: first[name], reverse=True)[:HARDEST]
     rows = tuple(
-        (name, *(number(c.errors[name]) if name in c.errors else "-" for c in curves),
-         *(number(column[name]) if name in column else "-" for column in published.values()))
+        (name, *(number(c.errors.get(name)) for c in curves),
+         *(number(column.get(name)) for column in published.values()))
         for name in names
     )  # fmt: skip
     header = ("material", *(c.method for c in curves), *(f"{LABELS[name]}, published" for name in published))

@@ -11,7 +11,7 @@ from lab.figures.sweep import METRICS, LeftOut, Panel, finds, paper_row, sweep
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.published import POSTER
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.results import Mean, mean
+from pipelines.evaluate.score_tables import Mean, mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts, scenes
 from pipelines.shared.pictures import spread

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
-from pipelines.evaluate.results import mean, publish
+from pipelines.evaluate.score_tables import mean, publish
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import presets, scenes
 from pipelines.shared.flags import picked, split_list

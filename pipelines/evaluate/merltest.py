@@ -19,7 +19,7 @@ from pipelines.evaluate import published
 from pipelines.evaluate.object_pictures import ERROR_LIMIT, tiles
 from pipelines.evaluate.report import page as report
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
-from pipelines.evaluate.results import mean, tables_text, weights_of
+from pipelines.evaluate.score_tables import cell, mean, tables_text, weights_of
 from pipelines.evaluate.workbench import Workbench, lit_object
 from pipelines.shared import presets, using
 from pipelines.shared.cluster import cluster_config
@@ -208,7 +208,7 @@ def _rows(
     for row in paper if all_rows else ():
         if row not in {method.paper for method in methods}:
             figures = [figure for shape in shapes for figure in published.figures(paper, row, shape, len(metrics))]
-            cells = [MISSING + ("" if figure is None else f" ({number(figure)})") for figure in figures]
+            cells = [cell(MISSING, figure) for figure in figures]
             rows.append((row, paper[row][0], *cells))
     return tuple(sorted(rows, key=lambda row: (row[0] == "-", row[0])))
 
@@ -278,12 +278,12 @@ def _per_scene(results: Sequence[SceneScores], names: Sequence[str]) -> Table:
         for metric, about, digits in _METRICS
         if any(metric in result.scores[name] for result in results)
     ]
-
-    def cell(scores: dict[str, float], metric: str, digits: int) -> str:
-        return f"{scores[metric]:.{digits}f}" if metric in scores else "-"
-
     rows = [
-        (r.scene.shape, r.scene.material, *(cell(r.scores[name], metric, digits) for name, metric, _, digits in wanted))
+        (
+            r.scene.shape,
+            r.scene.material,
+            *(number(r.scores[name].get(metric), digits) for name, metric, _, digits in wanted),
+        )
         for r in sorted(results, key=lambda r: _error(r, names[0]), reverse=True)
     ]
     header = ("shape", "material", *(f"{name}: {about}" for name, _, about, _ in wanted))

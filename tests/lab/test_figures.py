@@ -21,7 +21,7 @@ from lab.figures import (
 )
 from pipelines.evaluate import evaluation, published
 from pipelines.evaluate.report.sections import read_sections
-from pipelines.evaluate.results import mean
+from pipelines.evaluate.score_tables import mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts, presets, scenes
 from render.planning import light_sets
@@ -168,7 +168,7 @@ def test_rank_correlation_is_that_of_the_shared_materials():
     assert np.isnan(per_material.Curve("x", {"chrome": 1.0, "brass": 2.0}, "PS_FCN").rank_correlation(curves)[0])
 
 
-def test_methods_are_read_and_told_apart(tmp_path):
+def test_methods_are_read_and_distinguished(tmp_path):
     found = {m.name: m for m in eval_figures.wanted_methods(["least-squares", "pf14", "pf14"], tmp_path)}
     assert set(found) == {"least-squares, true lights", "pf14"}
     least, maxima = found["least-squares, true lights"], found["pf14"]
@@ -182,7 +182,7 @@ def test_methods_are_read_and_told_apart(tmp_path):
     assert sweep.paper_row(blind) == "B9" and not sweep.finds(blind, "direction_mae")
     assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "bunny") == 6.9
     assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "sphere") is None
-    with pytest.raises(InputError, match="want METHOD, LIGHTS"):
+    with pytest.raises(InputError, match="want METHOD or LIGHTS"):
         eval_figures.wanted_methods(["a+b+c+d"], tmp_path)
     with pytest.raises(InputError, match="unknown"):
         eval_figures.wanted_methods(["pf-14"], tmp_path)

@@ -11,7 +11,7 @@ from pipelines.evaluate.evaluation import Evaluation, Found, TestObject
 from pipelines.evaluate.object_pictures import tiles
 from pipelines.evaluate.published import published_rows
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
-from pipelines.evaluate.results import object_table, publish, weights_of
+from pipelines.evaluate.score_tables import object_table, publish, weights_of
 from pipelines.shared import using
 from pipelines.shared.flags import add_out, picked, split_list
 from render.shared.config import to_plain

@@ -17,7 +17,7 @@ from pipelines.evaluate.benchmarks.uw_photos import list_objects, read_lights, r
 from pipelines.evaluate.evaluation import Found, Result, TestObject
 from pipelines.evaluate.object_pictures import ERROR_LIMIT, tiles
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
-from pipelines.evaluate.results import publish
+from pipelines.evaluate.score_tables import cell, mean_of_all, publish
 from pipelines.shared.flags import add_models, add_out, picked, split_list
 from pipelines.shared.pictures import contact_sheet, fitted
 from render.shared.errors import InputError
@@ -98,20 +98,14 @@ def with_reference(item: TestObject, method: str) -> TestObject:
 
 def table(items: Sequence[TestObject], found: Found, reference: str) -> Table:
     """Lay out the errors, a method a row and an object a column, the published figures in brackets."""
-    rows = []
+    names, rows = [item.name for item in items], []
     for name, results in found.items():
-        errors = [results[item.name].scores.get("normal_mae", np.nan) for item in items]
-        known = [PUBLISHED.get(name, {}).get(item.name, np.nan) for item in items]
-        pairs = zip([*errors, float(np.mean(errors))], [*known, float(np.mean(known))], strict=True)
-        rows.append((name, *(_cell(error, figure) for error, figure in pairs)))
-    header = ("method", *(item.name for item in items), "mean")
+        errors = {key: one.scores["normal_mae"] for key, one in results.items() if "normal_mae" in one.scores}
+        known = PUBLISHED.get(name, {})
+        cells = [cell(errors.get(key), known.get(key), 2) for key in names]
+        rows.append((name, *cells, cell(mean_of_all(errors, names), mean_of_all(known, names), 2)))
+    header = ("method", *names, "mean")
     return Table(title=f"Normals against {reference} (degrees)", header=header, rows=tuple(rows))
-
-
-def _cell(error: float, published: float) -> str:
-    """Write one figure, with the published one in brackets; a dash where the method failed."""
-    text = "-" if np.isnan(error) else f"{error:.2f}"
-    return text if np.isnan(published) else f"{text} ({published:.2f})"
 
 
 def figures(item: str, method: str, result: Result) -> dict[str, Any]:

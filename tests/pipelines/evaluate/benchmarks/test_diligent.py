@@ -17,7 +17,7 @@ from pipelines.evaluate.benchmarks.diligent import OBJECTS, DiligentConfig, dili
 from pipelines.evaluate.evaluation import Result
 from pipelines.evaluate.published import published_rows
 from pipelines.evaluate.report.sections import read_sections
-from pipelines.evaluate.results import object_table
+from pipelines.evaluate.score_tables import object_table
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.images import read_image, write_png

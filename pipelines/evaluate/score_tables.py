@@ -1,4 +1,4 @@
-"""What evaluations do with scores: means over objects, tables, results.json and a section of the report."""
+"""The one writer of tables: cells, means over objects, our rows above published ones, results.json and the report."""
 
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -19,6 +19,12 @@ from sdps.methods.runner import Runner
 OURS, REFUSED = "ours", "refused"
 
 
+def cell(value: float | str | None, published: float | None = None, digits: int | None = None) -> str:
+    """Write a figure, a dash where there is none, or what stands in its place, with the published one in brackets."""
+    text = value if isinstance(value, str) else number(value, digits)
+    return text if published is None else f"{text} ({number(published, digits)})"
+
+
 @dataclass(frozen=True)
 class Mean:
     """A mean over objects.
@@ -35,13 +41,12 @@ class Mean:
 
     def cell(self, published: float | None = None) -> str:
         """Write it with the published figure in brackets, and what failed."""
-        text = number(self.value) if np.isfinite(self.value) else "-"
-        text += f" ({number(published)})" if published is not None else ""
-        return text + (f" [{self.failed} of {self.count} failed]" if self.failed and self.failed < self.count else "")
+        some = 0 < self.failed < self.count
+        return cell(self.value, published) + (f" [{self.failed} of {self.count} failed]" if some else "")
 
     def plain(self) -> float | None:
         """Return the value, None where there is none, for JSON."""
-        return float(self.value) if np.isfinite(self.value) else None
+        return None if np.isnan(self.value) else self.value
 
 
 def mean(scores: Iterable[Mapping[str, float]], metric: str) -> Mean:
@@ -94,23 +99,19 @@ def object_table(
     entries += [(one.method, one.source, one.figures, one.average, ()) for one in published] if official else []
     rows = []
     for name, source, figures, printed, refused in entries:
-        cells = [REFUSED if column in refused else _figure(figures.get(column), digits) for column in columns]
-        means = [_mean(figures, present)]
-        means += [_mean(figures, known) if printed is None else printed] if official else []
-        rows.append((name, source, *cells, *(_figure(mean, digits) for mean in means)))
+        cells = [REFUSED if column in refused else number(figures.get(column), digits) for column in columns]
+        means = [mean_of_all(figures, present)]
+        means += [mean_of_all(figures, known) if printed is None else printed] if official else []
+        rows.append((name, source, *cells, *(number(mean, digits) for mean in means)))
     last = [f"mean of {len(present)}" if len(present) > 1 else "this object"]
     last += [f"all {len(known)}"] if official else []
     header, theirs = ("method", "source", *columns, *last), tuple(range(ours, len(rows)))
     return Table(title=title, header=header, rows=tuple(rows), published=theirs, note=note)
 
 
-def _mean(figures: Mapping[str, float], names: Sequence[str]) -> float | None:
+def mean_of_all(figures: Mapping[str, float], names: Sequence[str]) -> float | None:
     """Return the mean over objects, None where one has no figure."""
     return float(np.mean([figures[name] for name in names])) if all(name in figures for name in names) else None
-
-
-def _figure(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def weights_of(runners: Iterable[Runner]) -> dict[str, str]:
