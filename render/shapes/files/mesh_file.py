@@ -15,7 +15,6 @@ import trimesh
 
 from render.shapes.files import gltf_file, obj_file, off_file, ply_file, stl_file
 from render.shapes.files.corners import Corners
-from render.shapes.files.strips import from_strips
 from render.shapes.geometry import creases
 from render.shapes.geometry.mesh import TriangleMesh, vertex_normals, with_area, without_unused
 from render.shapes.geometry.windings import outward
@@ -134,9 +133,8 @@ def _place(scene: Any) -> Iterator[trimesh.Trimesh]:
         transform, name = scene.graph[node]
         part = scene.geometry[name]
         # trimesh keeps the normals of the file in its cache
-        part = part.copy(include_cache=True) if isinstance(part, trimesh.Trimesh) else from_strips(part)
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
-            yield part.apply_transform(transform)
+            yield part.copy(include_cache=True).apply_transform(transform)
 
 
 def _corners(part: trimesh.Trimesh) -> Corners:
