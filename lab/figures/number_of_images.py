@@ -29,7 +29,7 @@ Points = dict[tuple[str, str, int], dict[str, list[Mean]]]
 """(method, shape, images): for every metric one mean over materials per draw."""
 
 
-def subsets(total: int, draws: int, seed: int) -> list[tuple[int, int, np.ndarray]]:
+def draw_subsets(total: int, draws: int, seed: int) -> list[tuple[int, int, np.ndarray]]:
     """Return (images, draw, their places) with every count below `total` once per draw, and all images once."""
     chosen = []
     for draw in range(draws):
@@ -38,7 +38,7 @@ def subsets(total: int, draws: int, seed: int) -> list[tuple[int, int, np.ndarra
     return [*chosen, (total, 0, np.arange(total))]
 
 
-def part_of(item: TestObject, count: int, draw: int, places: np.ndarray) -> TestObject:
+def select_images(item: TestObject, count: int, draw: int, places: np.ndarray) -> TestObject:
     """Return an object, whose images are an array, seen in some of them only."""
     if count == len(item.true_directions):
         return item
@@ -57,11 +57,11 @@ def make(bench: Workbench) -> Panel:
         InputError: scenes that cannot be rendered or read.
     """
     wanted, folder = bench.merltest()
-    chosen = subsets(len(wanted[0].lights), bench.draws, bench.config.seed)
+    chosen = draw_subsets(len(wanted[0].lights), bench.draws, bench.config.seed)
 
     def variants(scene: SceneSpec, item: TestObject) -> Iterator[tuple[tuple[Any, ...], TestObject]]:
         for count, draw, places in chosen:
-            yield (scene.shape, count, draw), part_of(item, count, draw, places)
+            yield (scene.shape, count, draw), select_images(item, count, draw, places)
 
     points: Points = {}
     found = sweep(bench, bench.runners, (wanted, folder), variants, len(chosen), "images")

@@ -12,7 +12,7 @@ from scipy.stats import spearmanr
 from lab.figures.sweep import LeftOut, Panel, paper_row, sweep
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.workbench import Workbench, lit_object
+from pipelines.evaluate.workbench import Workbench, build_test_object
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
 from render.records.manifest import SceneSpec
@@ -85,7 +85,7 @@ def make(bench: Workbench) -> Panel:
 
     def variants(scene: SceneSpec, _: TestObject) -> Iterator[tuple[tuple[str], TestObject]]:
         for repeat in range(bench.config.repeats):
-            yield (scene.material,), lit_object(scene, folder, bench.config, repeat)
+            yield (scene.material,), build_test_object(scene, folder, bench.config, repeat)
 
     found = sweep(bench, runners, (wanted, folder), variants, bench.config.repeats, "materials")
     errors = {key: [one.scores.get("normal_mae", np.nan) for one in results] for key, results in found.items()}

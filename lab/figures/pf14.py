@@ -30,7 +30,7 @@ Means = dict[tuple[str, str, str, str], Mean]
 """(method, light set, group, metric)."""
 
 
-def albedos(count: int = LAMBERTIAN) -> list[str]:
+def list_albedos(count: int = LAMBERTIAN) -> list[str]:
     """Return Lambertian materials: a third greys from 0.1 to 0.9, the others colours of evenly spaced hues.
 
     The paper does not say which it took. A grey albedo only scales the images but for interreflection, hence colours.
@@ -44,7 +44,7 @@ def albedos(count: int = LAMBERTIAN) -> list[str]:
     return names
 
 
-def groups(chosen: tuple[str, ...]) -> dict[str, list[str]]:
+def group_materials(chosen: tuple[str, ...]) -> dict[str, list[str]]:
     """Return the materials of each group that `test.materials` leaves.
 
     All 15 + 12 + 9 + 12 where it is `all`. Otherwise the named ones; Lambertian ones that are not named are as large a
@@ -60,7 +60,7 @@ def groups(chosen: tuple[str, ...]) -> dict[str, list[str]]:
         raise LeftOut(f"pf14 needs materials of {', '.join(GROUPS[1:])}; add some to test.materials")
     named = [name for name in pool if name.startswith("lambertian:")]
     share = kept / sum(len(kinds[group]) for group in GROUPS[1:])
-    some = spread(albedos(), max(1, round(share * LAMBERTIAN)))
+    some = spread(list_albedos(), max(1, round(share * LAMBERTIAN)))
     return {"lambertian": named or some} | {group: names for group, names in found.items() if names}
 
 
@@ -75,7 +75,7 @@ def make(bench: Workbench) -> Panel:
     if not runners:
         raise LeftOut("pf14 needs methods that find lights and normals; add sdps or pf14 to --methods")
     shape = SHAPE if SHAPE in bench.config.shapes else bench.config.shapes[-1]
-    kinds = groups(bench.config.materials)
+    kinds = group_materials(bench.config.materials)
     means: Means = {}
     for lights in LIGHT_SETS:
         means |= _evaluate(bench, runners, shape, kinds, lights)

@@ -55,4 +55,4 @@ def _brightest(item: TestObject) -> np.ndarray:  # (H, W, 3)
 
 
 def _fit(picture: np.ndarray) -> np.ndarray:
-    return pictures.fitted(picture, _SHOWN_HEIGHT) if picture.shape[0] > _SHOWN_HEIGHT else picture
+    return pictures.scale_to_height(picture, _SHOWN_HEIGHT) if picture.shape[0] > _SHOWN_HEIGHT else picture

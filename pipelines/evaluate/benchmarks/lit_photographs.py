@@ -86,21 +86,21 @@ def light_stage_objects(root: Path, *, least_z: float = 0.0, gamma: float = 1.0,
         images = find_images(folder, (".exr", ".png"), len(directions), gamma)
         chosen = np.arange(len(directions))
         if len(images.files) == len(directions):  # an array holds the images in front only, and the lights' files too
-            chosen = front(directions, least_z)
-            images = _some(images, chosen)
+            chosen = pick_front(directions, least_z)
+            images = _select(images, chosen)
         matte = next((path for path in sorted(folder.glob("*matte.png"))), folder / "matte.png")
         objects.append(build_object(folder.name, images, read_mask(matte), directions[chosen], intensities[chosen],
                                     longest=longest, files=[matte], settings=(gamma,)))  # fmt: skip
     return objects
 
 
-def _some(images: Images, numbers: np.ndarray) -> Images:
+def _select(images: Images, numbers: np.ndarray) -> Images:
     """Return the images of these numbers, of a file each."""
     files, names = ([whole[number] for number in numbers] for whole in (images.files, images.names))
     return Images(lambda number: images.read(int(numbers[number])), files, names)
 
 
-def front(directions: np.ndarray, least_z: float) -> np.ndarray:
+def pick_front(directions: np.ndarray, least_z: float) -> np.ndarray:
     """Return the numbers of the lights in front of the object: z above `least_z`.
 
     Raises:
@@ -127,7 +127,7 @@ def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
     border = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]])
     mask = ~bright if border.mean() > 0.5 else bright
     if not mask.any():
-        raise InputError(f"{path}: tells no object from the background; give the object's mask")
+        raise InputError(f"{path}: shows no object in front of a background; give the object's mask")
     return mask
 
 

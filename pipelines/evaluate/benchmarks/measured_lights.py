@@ -76,13 +76,13 @@ def main(args: argparse.Namespace) -> int:
     if given:
         raise InputError(f"--methods: {given.name} is given the lights, so there is nothing to score")
     items, about = read(args)
-    items = suite.pick(items, args.objects)
+    items = suite.pick_objects(items, args.objects)
     if not chosen:  # every method that finds lights, and the paper's pair for its normals
         models = select.runs_folder(args.models)
         pairs = [method for method in select.every_method(models) if method.paper == "B1"]
         chosen = [*select.lighting_rows(models), *pairs, *select.classical_rows(calibrated=False)]
     return suite.evaluate(
-        bench, args, items, chosen, text=definition(bench, items, about, args.longest_side),
+        bench, args, items, chosen, text=describe(bench, items, about, args.longest_side),
         protocol={name: getattr(args, name) for name in ("measured_lights", "least_z", "gamma", "longest_side")},
         command=f"sdps evaluate {args.dataset} {args.data}",
     )  # fmt: skip
@@ -107,7 +107,7 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError(f"--longest-side {args.longest_side}: must be 0 or at least 16 pixels")
 
 
-def definition(bench: suite.Benchmark, items: Sequence[TestObject], about: str, longest: int) -> str:
+def describe(bench: suite.Benchmark, items: Sequence[TestObject], about: str, longest: int) -> str:
     """Say what the numbers are of."""
     images = ", ".join(f"{item.name} {len(item.true_directions)}" for item in items)
     size = f", crops averaged down to {longest} pixels" if longest else ""

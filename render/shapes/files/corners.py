@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from render.shapes.files.polygons import triangles
+from render.shapes.files.polygons import triangulate
 from render.shared.errors import InputError
 
 
@@ -50,7 +50,7 @@ def of_polygons(
         raise InputError(
             f"a face names vertex {index[bad][0]}, but the file holds 0 to {len(vertices) - 1}; repair the file"
         )
-    places = triangles(vertices[index], counts)
+    places = triangulate(vertices[index], counts)
     return Corners(
         vertices, index[places], None if uv is None else uv[places], None if normals is None else normals[places]
     )

@@ -183,11 +183,11 @@ def _mesh(found: Corners, smooth: bool) -> TriangleMesh:
     if not np.isfinite(vertices).all():
         count = int((~np.isfinite(vertices)).any(1).sum())
         raise InputError(f"{count} of {len(vertices)} vertices are not finite; repair the file")
-    vertices = vertices if smooth else _within_float32(vertices)
+    vertices = vertices if smooth else _fit_float32(vertices)
     merged, faces = _merge(vertices, faces) if smooth else _weld(vertices, faces)
     kept = with_area(merged, faces)
     if not smooth:
-        kept &= _first_of_copies(faces, kept)
+        kept &= _mark_first_copies(faces, kept)
     if not kept.any():
         raise InputError(f"all of its {len(faces)} triangles are degenerate: they have no area")
     merged, faces = without_unused(merged, faces[kept])
@@ -201,7 +201,7 @@ def _mesh(found: Corners, smooth: bool) -> TriangleMesh:
     return TriangleMesh(vertices=points, faces=split, normals=normals, uv=uv)
 
 
-def _within_float32(vertices: np.ndarray) -> np.ndarray:
+def _fit_float32(vertices: np.ndarray) -> np.ndarray:
     """Move and scale positions (V, 3) float64 so that float32 holds their shape, if it does not as they are."""
     biggest = np.abs(vertices).max()
     if not biggest > 0:
@@ -238,7 +238,7 @@ def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return vertices[first[order]], place[which][faces]
 
 
-def _first_of_copies(faces: np.ndarray, among: np.ndarray) -> np.ndarray:  # (F,) bool
+def _mark_first_copies(faces: np.ndarray, among: np.ndarray) -> np.ndarray:  # (F,) bool
     """Mark the triangles that are the first with their corners and winding; in a double-sided mesh, their corners."""
     turned = np.take_along_axis(faces, (faces.argmin(1)[:, None] + np.arange(3)) % 3, axis=1)
     side = turned[:, 1] > turned[:, 2]

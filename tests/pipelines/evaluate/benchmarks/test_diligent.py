@@ -229,11 +229,11 @@ def test_lights_over_eight_views_have_a_row_of_their_own(models):
     learned = {method.name: method for method in select.selected(["learned"], models)}
     views = learned["lcnet-soft (shipped), 8 views"]
     assert (views.normals, views.light_views) == ("", 8)
-    assert list(suite.lighting_only(learned, list(learned.values())))[:2] == ["lcnet", "lcnet (shipped)"]
-    told = suite.lighting_only(learned, list(learned.values()))
-    assert views.name in told and not any("+" in name for name in told)  # whose lights are a network's alone
+    assert list(suite.drop_repeated_lights(learned, list(learned.values())))[:2] == ["lcnet", "lcnet (shipped)"]
+    kept = suite.drop_repeated_lights(learned, list(learned.values()))
+    assert views.name in kept and not any("+" in name for name in kept)  # whose lights are a network's alone
     few = select.selected(["shipped:lcnet-soft", "shipped:sdps-plus"], models)
-    assert len(suite.lighting_only({method.name: method for method in few}, few)) == 2  # one view, eight views
+    assert len(suite.drop_repeated_lights({method.name: method for method in few}, few)) == 2  # one view, eight views
 
 
 @pytest.mark.skipif(not DATA, reason="SDPS_SHARED_DATA names no folder with diligent_ball.zip")

@@ -87,7 +87,7 @@ def test_stars_seen_from_any_side_are_cut_into_triangles_of_their_area(points):
     radius = np.where(np.arange(2 * points) % 2, 0.3, 1.0)
     turn = np.linalg.qr(np.random.default_rng(points).normal(size=(3, 3)))[0]
     star = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], 1) @ turn
-    corners = star[polygons.triangles(star, np.array([2 * points]))]
+    corners = star[polygons.triangulate(star, np.array([2 * points]))]
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert len(crosses) == 2 * points - 2
     assert np.linalg.norm(crosses, axis=1).sum() == pytest.approx(np.linalg.norm(crosses.sum(0)), rel=1e-9)
