@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.sweep import LeftOut, Panel, finds, shapes_of
+from lab.figures.sweep import Panel, choose_runners, finds, list_shapes
 from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench
@@ -18,18 +18,12 @@ Shown = dict[str, tuple[TestObject, list[tuple[str, Result]]]]
 
 
 def make(bench: Workbench) -> Panel:
-    """Evaluate and draw.
-
-    Raises:
-        LeftOut: no method that finds light directions.
-        InputError: scenes that cannot be rendered or read.
-    """
-    runners = [runner for runner in bench.runners if finds(runner.method, "direction_mae")]
-    if not runners:
-        raise LeftOut("lights needs a method that finds the lights; add sdps or pf14 to --methods")
+    """Evaluate and draw."""
+    runners = choose_runners(bench, lambda method: finds(method, "direction_mae"),
+                             "lights", "a method that finds the lights; add sdps or pf14")  # fmt: skip
     wanted, folder = bench.merltest()
     drawings, rows, values = [], [], {}
-    for shape in shapes_of(wanted):
+    for shape in list_shapes(wanted):
         chosen = spread([scene for scene in wanted if scene.shape == shape], min(SCENES, bench.config.pictures))
         panels: Shown = {}
         objects = (((scene, item), item) for scene, item in bench.objects(chosen, folder, bench.config))
@@ -49,13 +43,7 @@ def make(bench: Workbench) -> Panel:
     note = "Directions: mean angular error in degrees. Intensities: mean relative error after one least-squares scale."
     header = ("shape", "material", "method", "directions", "intensities")
     table = Table(title="Errors of the lights shown", header=header, rows=tuple(rows), note=note)
-    return Panel(
-        title="Light distributions, true and estimated",
-        text=text,
-        charts=tuple(drawings),
-        tables=(table,),
-        values=values,
-    )
+    return Panel("Light distributions, true and estimated", text, tuple(drawings), (table,), values)
 
 
 def _chart(panels: Shown) -> Figure:

@@ -4,15 +4,13 @@ Each draw puts the lights in a random order; a set of n images is the first n of
 and all objects and methods see the same ones.
 """
 
-import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.sweep import METRICS, Panel, finds, paper_row, shapes_of, sweep
+from lab.figures.sweep import METRICS, Panel, finds, list_shapes, paper_row, sweep, vary
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
@@ -42,20 +40,15 @@ def select_images(item: TestObject, count: int, draw: int, places: np.ndarray) -
     """Return an object, whose images are an array, seen in some of them only."""
     if count == len(item.true_directions):
         return item
-    digest = hashlib.sha256(item.digest.encode() + places.astype(np.int64).tobytes()).hexdigest()[:24]
-    return replace(
-        item, name=f"{item.name}, {count} images, draw {draw}", digest=digest,
+    return vary(
+        item, f"{count} images, draw {draw}", places.astype(np.int64).tobytes(),
         load=lambda: np.asarray(item.load())[places], light_directions=item.true_directions[places],
         intensities=None if item.intensities is None else item.intensities[places],
     )  # fmt: skip
 
 
 def make(bench: Workbench) -> Panel:
-    """Evaluate and draw.
-
-    Raises:
-        InputError: scenes that cannot be rendered or read.
-    """
+    """Evaluate and draw."""
     wanted, folder = bench.merltest()
     chosen = draw_subsets(len(wanted[0].lights), bench.draws, bench.config.seed)
 
@@ -70,7 +63,7 @@ def make(bench: Workbench) -> Panel:
         for metric in METRICS:
             kept[metric].append(mean((one.scores for one in results), metric))
     methods = [runner.method for runner in bench.runners]
-    shapes = shapes_of(wanted)
+    shapes = list_shapes(wanted)
     counts = tuple(dict.fromkeys(count for count, _, _ in sorted(chosen, key=lambda part: part[0])))
     text = (
         f"{len(wanted)} MERL-Test scenes ({bench.config.lights}); {bench.draws} random subsets of each number of "
@@ -78,22 +71,17 @@ def make(bench: Workbench) -> Panel:
         "Bands: from the lowest to the highest draw. Grey diamonds: the paper's figures for all images. A method given "
         "the true lights is scored on normals only."
     )
-    drawings = tuple(
+    drawn = tuple(
         (f"images-{shape}", f"{shape.capitalize()}: error against the number of images.",
          _chart(methods, shape, counts, points))
         for shape in shapes
     )  # fmt: skip
-    tables = tuple(_table(methods, shape, counts, points, metric) for shape in shapes for metric in METRICS)
-    return Panel(
-        title="Error against the number of images",
-        text=text,
-        charts=drawings,
-        tables=tuple(table for table in tables if table.rows),
-        values={
-            f"{method} | {shape} | {count}": {name: [item.plain() for item in kept[name]] for name in METRICS}
-            for (method, shape, count), kept in points.items()
-        },
-    )
+    tables = [_table(methods, shape, counts, points, metric) for shape in shapes for metric in METRICS]
+    values = {
+        f"{method} | {shape} | {count}": {name: [item.plain() for item in kept[name]] for name in METRICS}
+        for (method, shape, count), kept in points.items()
+    }
+    return Panel("Error against the number of images", text, drawn, tuple(each for each in tables if each.rows), values)
 
 
 def _average(draws: Sequence[Mean]) -> tuple[float, float, float, int]:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
-from lab.figures.sweep import LeftOut, Panel, paper_row, sweep
+from lab.figures.sweep import LeftOut, Panel, choose_runners, paper_row, sweep
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench, build_test_object
@@ -68,17 +68,10 @@ class Curve:
 
 
 def make(bench: Workbench) -> Panel:
-    """Evaluate and draw; errors are averaged over `test.repeats` draws of the intensities.
-
-    Raises:
-        LeftOut: no bunny among the shapes, or no method that gives normals.
-        InputError: scenes that cannot be rendered or read.
-    """
+    """Evaluate and draw; errors are averaged over `test.repeats` draws of the intensities."""
     if SHAPE not in bench.config.shapes:
         raise LeftOut(f"materials needs {SHAPE} in test.shapes; the published curves are for it")
-    runners = [runner for runner in bench.runners if runner.method.normals]
-    if not runners:
-        raise LeftOut("materials needs a method that gives normals; add one to --methods")
+    runners = choose_runners(bench, lambda m: bool(m.normals), "materials", "a method that gives normals; add one")
     published = read_published()
     wanted, folder = bench.merltest()
     wanted = [scene for scene in wanted if scene.shape == SHAPE]
@@ -102,18 +95,16 @@ def make(bench: Workbench) -> Panel:
         f"{bench.config.repeats} draw(s) of random intensities. Materials are in the order of the published SDPS-Net "
         "curve. Grey: the paper's curves, of its own rendering, digitised from the vector figure of its poster."
     )
+    values = {
+        curve.method: {"rank_correlation": rho if np.isfinite(rho) else None, "beside": curve.column,
+                       "normal_mae": curve.errors}
+        for curve in curves
+        for rho in curve.rank_correlation(published)[:1]
+    }  # fmt: skip
+    chart = ("materials", "Mean angular error of normals per material.", _chart(curves, order, published))
     return Panel(
-        title="Error per material",
-        text=text,
-        charts=(("materials", "Mean angular error of normals per material.", _chart(curves, order, published)),),
-        tables=(_summary(curves, published), _hardest(curves, published)),
-        values={
-            curve.method: {"rank_correlation": rho if np.isfinite(rho) else None, "beside": curve.column,
-                           "normal_mae": curve.errors}
-            for curve in curves
-            for rho in curve.rank_correlation(published)[:1]
-        },
-    )  # fmt: skip
+        "Error per material", text, (chart,), (_summary(curves, published), _hardest(curves, published)), values
+    )
 
 
 def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:

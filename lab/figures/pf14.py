@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.sweep import METRICS, LeftOut, Panel, finds, paper_row, sweep
+from lab.figures.sweep import METRICS, LeftOut, Panel, choose_runners, finds, paper_row, sweep
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.published import POSTER
 from pipelines.evaluate.report.sections import Table
@@ -65,15 +65,9 @@ def group_materials(chosen: tuple[str, ...]) -> dict[str, list[str]]:
 
 
 def make(bench: Workbench) -> Panel:
-    """Render the two light sets, evaluate and draw.
-
-    Raises:
-        LeftOut: no method that finds lights and normals itself, or no material of the groups.
-        InputError: scenes that cannot be rendered or read.
-    """
-    runners = [runner for runner in bench.runners if all(finds(runner.method, metric) for metric in METRICS)]
-    if not runners:
-        raise LeftOut("pf14 needs methods that find lights and normals; add sdps or pf14 to --methods")
+    """Render the two light sets, evaluate and draw."""
+    runners = choose_runners(bench, lambda method: all(finds(method, metric) for metric in METRICS),
+                             "pf14", "methods that find lights and normals; add sdps or pf14")  # fmt: skip
     shape = SHAPE if SHAPE in bench.config.shapes else bench.config.shapes[-1]
     kinds = group_materials(bench.config.materials)
     means: Means = {}
@@ -89,19 +83,12 @@ def make(bench: Workbench) -> Panel:
     )
     tables = tuple(_table(methods, tuple(kinds), means, metric, shape) for metric in METRICS)
     caption = "Errors by kind of reflectance; plain bars: near-uniform lights, hatched: biased lights."
-    return Panel(
-        title="Classical PF14 against SDPS-Net",
-        text=text,
-        charts=(
-            ("pf14", caption, _chart(methods, tuple(kinds), means, shape)),
-            ("pf14-lights", "The two light sets as (x, y) on the unit disc.", _light_sets()),
-        ),
-        tables=tables,
-        values={
-            "materials": kinds,
-            "means": {" | ".join(key): {"mean": m.plain(), "failed": m.failed} for key, m in means.items()},
-        },
+    drawn = (
+        ("pf14", caption, _chart(methods, tuple(kinds), means, shape)),
+        ("pf14-lights", "The two light sets as (x, y) on the unit disc.", _draw_light_sets()),
     )
+    values = {" | ".join(key): {"mean": m.plain(), "failed": m.failed} for key, m in means.items()}
+    return Panel("Classical PF14 against SDPS-Net", text, drawn, tables, {"materials": kinds, "means": values})
 
 
 def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[str, list[str]], lights: str) -> Means:
@@ -175,7 +162,7 @@ def _chart(methods: list[Method], kinds: tuple[str, ...], means: Means, shape: s
     return figure
 
 
-def _light_sets() -> Figure:
+def _draw_light_sets() -> Figure:
     figure = charts.new_figure(5.4, 2.9)
     for axes, lights in zip(figure.subplots(1, len(LIGHT_SETS)), LIGHT_SETS, strict=True):
         directions = light_sets.load(lights)
