@@ -103,11 +103,11 @@ def make(bench: Workbench) -> Panel:
     }  # fmt: skip
     chart = ("materials", "Mean angular error of normals per material.", _chart(curves, order, published))
     return Panel(
-        "Error per material", text, (chart,), (_summary(curves, published), _hardest(curves, published)), values
+        "Error per material", text, (chart,), (_summarise(curves, published), _list_hardest(curves, published)), values
     )
 
 
-def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
+def _summarise(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
     rows = []
     for curve in curves:
         rho, p, count = curve.rank_correlation(published)
@@ -122,7 +122,7 @@ def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Tab
     return Table(title=f"Error per material: {SHAPE}", header=header, rows=tuple(rows), note=note)
 
 
-def _hardest(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
+def _list_hardest(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
     """List the materials the first method finds hardest."""
     first = curves[0].errors
     names = sorted(first, key=lambda name: first[name], reverse=True)[:HARDEST]

@@ -21,9 +21,8 @@ from lab.figures import (
 )
 from pipelines.evaluate import evaluation, published
 from pipelines.evaluate.report.sections import read_sections
-from pipelines.evaluate.score_tables import mean
 from pipelines.evaluate.workbench import Workbench
-from pipelines.shared import charts, presets, scenes
+from pipelines.shared import presets, scenes
 from render.planning import light_sets
 from render.records.shards import Shard, to_half, write_shard
 from render.shared.errors import InputError
@@ -195,22 +194,6 @@ def test_default_methods_are_those_with_weights(tmp_path, monkeypatch, caplog):
     for name in ("lcnet", "nenet"):
         write_text(tmp_path / "models" / name / f"{name}.safetensors", "not read here")
     assert next(m.name for m in eval_figures.wanted_methods([], tmp_path)) == "lcnet + nenet"
-
-
-def test_a_mean_says_what_failed():
-    scores = [{"normal_mae": 4.0}, {}, {"normal_mae": 6.0}]
-    found = mean(scores, "normal_mae")
-    assert found.cell(3.5) == "5.00 (3.50) [1 of 3 failed]" and found.plain() == 5.0
-    nothing = mean(scores[1:2], "normal_mae")
-    assert nothing.cell() == "-" and nothing.plain() is None
-
-
-def test_names_beside_lines_do_not_overlap():
-    axes = charts.new_figure(4, 3).add_subplot()
-    axes.set(xlim=(0, 1), ylim=(0, 10))
-    charts.label_ends(axes, [(str(n), 5.0 + 0.01 * n, "k") for n in range(6)] + [("gone", float("nan"), "k")], gap=0.1)
-    places = sorted(text.xyann[1] for text in axes.texts)
-    assert len(places) == 6 and np.diff(places).min() > 0.099
 
 
 # ---- whole runs
