@@ -26,7 +26,7 @@ METRICS = {  # of the figures: title and unit
 
 
 class LeftOut(InputError):
-    """A figure cannot be made of these methods, shapes or materials; the others can."""
+    """A figure cannot be made of these methods, shapes or materials; other figures can."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Panel:
 
 
 Variants = Callable[[SceneSpec, TestObject], Iterable[tuple[tuple[Any, ...], TestObject]]]
-"""Of a scene: the objects to score in its place, each with what is varied."""
+"""From a scene to the objects that are scored in its place, each with what is varied."""
 Sweep = dict[tuple[Any, ...], list[Result]]
 """By (method, *what is varied): a result per scene."""
 

@@ -1,4 +1,4 @@
-"""Pictures of an evaluated object: its input, its true normals, and what methods made of them."""
+"""Pictures of an evaluated object: its input, its true normals, and what methods estimated."""
 
 from collections.abc import Sequence
 

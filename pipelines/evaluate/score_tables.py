@@ -40,7 +40,7 @@ class Mean:
     count: int
 
     def cell(self, published: float | None = None) -> str:
-        """Write it with the published figure in brackets, and what failed."""
+        """Write it with the published figure in brackets, and how many objects failed."""
         some = 0 < self.failed < self.count
         return cell(self.value, published) + (f" [{self.failed} of {self.count} failed]" if some else "")
 
@@ -120,7 +120,7 @@ def weights_of(runners: Iterable[Runner]) -> dict[str, str]:
 
 
 def publish(writer: SectionWriter, out: Path, file: Path, values: dict[str, Any], left: Collection[int] = (0,),
-            said: str = "") -> None:  # fmt: skip
+            footer: str = "") -> None:  # fmt: skip
     """Write a section of the report and results.json, and print the tables with what their numbers are.
 
     Args:
@@ -129,10 +129,10 @@ def publish(writer: SectionWriter, out: Path, file: Path, values: dict[str, Any]
         file: Gets the definition, the values and the tables as JSON.
         values: What else belongs to the results.
         left: Columns that are set flush left in the terminal.
-        said: What is printed after the tables.
+        footer: What is printed after the tables.
     """
     section = writer.section
     tables = {table.title: to_plain(table) for table in section.tables}
     write_json(file, {"definition": section.text, **values, "tables": tables})
     writer.write(out)
-    sys.stdout.write(f"{tables_text(section.tables, left)}{said}\n{section.text}\n{file}\n")
+    sys.stdout.write(f"{tables_text(section.tables, left)}{footer}\n{section.text}\n{file}\n")

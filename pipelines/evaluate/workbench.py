@@ -1,4 +1,4 @@
-"""Methods on rendered test scenes, seen as photographs under lights of unknown strength."""
+"""Run methods on rendered test scenes, which they see as photographs under lights of unknown intensity."""
 
 import hashlib
 from collections.abc import Iterable, Iterator
@@ -67,7 +67,7 @@ def build_test_object(scene: SceneSpec, folder: Path, config: TestConfig, repeat
         InputError: the shard is missing or damaged.
     """
     path = folder / scene.file
-    file = path.stat() if path.is_file() else None  # reading it tells what is wrong
+    file = path.stat() if path.is_file() else None  # a missing file is reported when it is read
     shard, digest = _read(path, scene, *((file.st_size, file.st_mtime_ns) if file else (0, 0)))
     gains = draw_intensities(scene, config, repeat)
     parts = (digest, gains.tobytes().hex())

@@ -65,8 +65,8 @@ def light_stage_objects(root: Path, *, least_z: float = 0.0, gamma: float = 1.0,
 
     Args:
         root: The folder.
-        least_z: Images are used whose unit light direction has z above it.
-        gamma: Exponent by which values of PNG files become linear.
+        least_z: Only images whose unit light direction has z above it are used.
+        gamma: Exponent that makes the values of PNG files linear.
         longest: Greatest side in pixels, 0 for no limit.
 
     Raises:
@@ -104,7 +104,7 @@ def pick_front(directions: np.ndarray, least_z: float) -> np.ndarray:
     """Return the numbers of the lights in front of the object: z above `least_z`.
 
     Raises:
-        InputError: none.
+        InputError: there are none.
     """
     chosen = np.flatnonzero(directions[:, 2] > least_z)
     if not len(chosen):
@@ -115,7 +115,7 @@ def pick_front(directions: np.ndarray, least_z: float) -> np.ndarray:
 
 
 def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
-    """Read a mask or matte of any values: what most of the image's border shows is the background.
+    """Read a mask or matte of any values: the value of most of the image's border is the background.
 
     Gourd&Apple's object is 1; the Light Stage's is dark in the original files and bright in converted ones.
 
@@ -192,10 +192,10 @@ def find_images(folder: Path, suffixes: Sequence[str], count: int, gamma: float 
         folder: The folder.
         suffixes: Of the pictures; the first that there are any of is taken.
         count: Number of lights.
-        gamma: Exponent by which integers become linear; floats are.
+        gamma: Exponent that makes integers linear; floats are linear already.
 
     Raises:
-        InputError: none, or another number than of lights.
+        InputError: there are none, or their number is not that of the lights.
     """
     packed, listed = folder / f"{folder.name}_uncalib.npy", folder / "names.txt"
     if packed.is_file():

@@ -122,7 +122,7 @@ def evaluate(
             for name, row in found.items()
         },
     }
-    publish(writer, args.out, file, values, left=(0, 1), said=list_refusals(found))
+    publish(writer, args.out, file, values, left=(0, 1), footer=list_refusals(found))
     return 0
 
 
@@ -149,7 +149,7 @@ def _about(item: TestObject) -> dict[str, Any]:
 
 
 def list_refusals(found: Found) -> str:
-    """Say which methods refused which objects, a line each."""
+    """List which methods refused which objects and why, a line each."""
     lines = [
         f"{name} refused {key}: {one.reason}" for name, row in found.items() for key, one in row.items() if one.reason
     ]
@@ -157,7 +157,7 @@ def list_refusals(found: Found) -> str:
 
 
 def drop_repeated_lights(found: Found, chosen: Sequence[Method]) -> Found:
-    """Leave out methods whose lights are those of another that tells lights alone."""
+    """Leave out methods whose lights another method, one without normals, has a row for already."""
     alone = {_lights_of(method) for method in chosen if method.lights and not method.normals}
     kept = [method.name for method in chosen if not (method.normals and _lights_of(method) in alone)]
     return {name: found[name] for name in kept}

@@ -1,4 +1,4 @@
-"""What the readers of mesh files return: triangles, and what the file says of their corners."""
+"""What the readers of mesh files return: triangles, and what the file says about their corners."""
 
 from dataclasses import dataclass
 
@@ -10,13 +10,13 @@ from render.shared.errors import InputError
 
 @dataclass(frozen=True)
 class Corners:
-    """Triangles with what the file says of their corners.
+    """Triangles with what the file says about their corners.
 
     Attributes:
         vertices: (V, 3) float64.
         faces: (F, 3) int64.
-        uv: (F, 3, 2) float64, v up; None where a face has none.
-        normals: (F, 3, 3) float64, NaN at corners without; None for a file without.
+        uv: (F, 3, 2) float64, v up; None if any face has none.
+        normals: (F, 3, 3) float64, NaN at corners that have none; None if the file has none.
     """
 
     vertices: np.ndarray

@@ -1,4 +1,4 @@
-"""What a glTF file asks of its reader, looked at before trimesh reads it: trimesh leaves out what it does not know."""
+"""Checks of a glTF file before trimesh reads it: trimesh silently leaves out what it does not know."""
 
 import importlib.util
 import json
@@ -28,11 +28,11 @@ _GLB = (b"glTF", 0x4E4F534A)  # magic, type of the JSON chunk
 
 
 def check(data: bytes, folder: Path | None) -> None:
-    """Refuse a glTF file of which trimesh would read something else than is in it.
+    """Refuse a glTF file that trimesh would misread.
 
     Args:
-        data: The `.gltf` or `.glb` file; what is neither passes, for the reader to refuse.
-        folder: Where the files lie that it names; None where it stands alone.
+        data: The `.gltf` or `.glb` file; anything else passes, for the reader to refuse.
+        folder: Where the files that it names are; None for a file on its own.
 
     Raises:
         InputError: it is compressed, requires an unknown extension, or names a file that is missing.

@@ -23,7 +23,7 @@ from render.shared.errors import InputError
 
 _GRID_BITS = 20  # positions on the same point of a grid of 2^20 steps over the mesh are one vertex
 _FARTHEST = 10  # extents from the origin, beyond which float32 would coarsen the shape
-_SIZES = (1e-12, 1e12)  # extents that float32 arithmetic bears
+_SIZES = (1e-12, 1e12)  # extents between which float32 arithmetic is exact enough
 _READERS = {"obj": obj_file.read, "off": off_file.read, "ply": ply_file.read}  # the last only where it has to
 _DOUBLE_SIDED = 0.9  # share of triangles with a copy that is wound the other way
 
@@ -58,12 +58,12 @@ def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh") -> TriangleMesh:
     """Return the triangles of a mesh as placed, with creases where they meet at more than `creases.CREASE` degrees.
 
     Equal positions are welded, so that texture seams and the facets of STL do not show. Triangles without area and
-    those that stand twice are left out, those wound against their neighbours are turned, and a closed surface is
-    turned outside out. A mesh of which float32 could not hold the shape, very far from the origin for its size or of
-    an extreme size, is moved to the origin or scaled.
+    duplicates are left out, those wound against their neighbours are turned, and a closed surface is turned outside
+    out. A mesh whose shape float32 could not hold, very far from the origin for its size or of an extreme size, is
+    moved to the origin or scaled.
 
     Args:
-        mesh: Stays as it is; of its attributes only vertices, faces and texture coordinates are used.
+        mesh: Is not changed; only its vertices, faces and texture coordinates are used.
         name: What messages call it.
 
     Raises:
@@ -78,7 +78,7 @@ def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh") -> TriangleMesh:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what trimesh and numpy say of a file from the console: it is refused in one line, or can be used."""
+    """Silence trimesh and numpy: a file is either used, or refused in one line of ours."""
     log = logging.getLogger("trimesh")
     was = log.level
     log.setLevel(logging.CRITICAL)
@@ -91,7 +91,7 @@ def _quiet() -> Iterator[None]:
 
 
 class _Neighbours(trimesh.resolvers.FilePathResolver):
-    """Finds files next to a mesh also by names that are escaped as in addresses: `my%20mesh.bin`."""
+    """Also finds files next to a mesh whose names are escaped as in addresses: `my%20mesh.bin`."""
 
     def get(self, name: str) -> bytes:
         """Return a file's content."""
@@ -102,7 +102,7 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):
 
 
 def _read(path: Path, smooth: bool) -> Corners:
-    """Read a mesh file; one that is compressed by gzip, as in `bunny.ply.gz`, is unpacked in memory."""
+    """Read a mesh file; one compressed by gzip, such as `bunny.ply.gz`, is unpacked in memory."""
     packed = path.suffix.lower() == ".gz"
     kind = Path(path.stem if packed else path.name).suffix[1:].lower()
     if kind not in trimesh.available_formats():
@@ -138,7 +138,7 @@ def _place(scene: Any) -> Iterator[trimesh.Trimesh]:
 
 
 def _corners(part: trimesh.Trimesh) -> Corners:
-    """Return the triangles of a part of a file, after a look at them."""
+    """Return the triangles of a part of a file, or refuse them."""
     vertices, faces = np.asarray(part.vertices), np.asarray(part.faces, np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise InputError("vertices and faces must have three columns; repair the file")

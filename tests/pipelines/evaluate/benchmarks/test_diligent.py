@@ -147,7 +147,7 @@ def test_foreign_objects_alone_have_no_published_rows():
     assert table.header == ("method", "source", "cone", "this object") and len(table.rows) == 1
 
 
-def test_a_refusal_is_told():
+def test_a_refusal_is_shown():
     found = {"m": {"ball": Result({}, reason="too few"), "cat": Result({"normal_mae": 2.0})}}
     table = object_table("t", found, "normal_mae", present=["ball", "cat"], known=OBJECTS, digits=2, published=())
     assert table.rows[0][2:4] == ("refused", "2.00") and table.rows[0][-2:] == ("-", "-")

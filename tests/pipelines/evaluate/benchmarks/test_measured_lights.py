@@ -98,7 +98,7 @@ def test_packed_light_stage_takes_every_image(stage):
     assert len(item.load()) == 2 and np.allclose(item.light_directions[1], directions[1] / 0.99624, atol=1e-4)
 
 
-def test_another_number_of_front_lights_than_the_papers_is_told(caplog):
+def test_another_number_of_front_lights_than_the_papers_is_logged(caplog):
     directions = np.tile([0.0, 0.0, 1.0], (253, 1))
     directions[:120, 2] = -1.0
     with caplog.at_level(logging.WARNING):
