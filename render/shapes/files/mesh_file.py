@@ -16,7 +16,7 @@ import trimesh
 from render.shapes.files import gltf_file, obj_file, off_file, ply_file, stl_file
 from render.shapes.files.corners import Corners
 from render.shapes.geometry import creases
-from render.shapes.geometry.mesh import TriangleMesh, vertex_normals, with_area, without_unused
+from render.shapes.geometry.mesh import TriangleMesh, with_area, without_unused
 from render.shapes.geometry.windings import outward
 from render.shared.decoding import decoding, largest_unpacked
 from render.shared.errors import InputError
@@ -28,7 +28,7 @@ _READERS = {"obj": obj_file.read, "off": off_file.read, "ply": ply_file.read}  #
 _DOUBLE_SIDED = 0.9  # share of triangles with a copy that is wound the other way
 
 
-def load_mesh(path: str | Path, *, smooth: bool = False) -> TriangleMesh:
+def load_mesh(path: str | Path) -> TriangleMesh:
     """Read any mesh or scene file that trimesh reads, as placed in the file.
 
     The parts of a scene are concatenated; see `from_trimesh`. Normals of the file are used where they fit its
@@ -36,7 +36,6 @@ def load_mesh(path: str | Path, *, smooth: bool = False) -> TriangleMesh:
 
     Args:
         path: OBJ, PLY, STL, glTF, GLB, OFF, ..., also compressed by gzip.
-        smooth: Shade it smoothly all over, without creases and without the file's normals.
 
     Raises:
         InputError: missing file, unreadable format, damaged content, no triangles, or non-finite positions.
@@ -46,7 +45,7 @@ def load_mesh(path: str | Path, *, smooth: bool = False) -> TriangleMesh:
         raise InputError(f"{path}: no such mesh file")
     try:
         with decoding(path, "a mesh", "export it again"), _quiet():
-            return _mesh(_read(path, smooth), smooth)
+            return _mesh(_read(path))
     except InputError as error:
         message = str(error)
         if message.startswith(str(path)):
@@ -71,7 +70,7 @@ def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh") -> TriangleMesh:
     """
     faces = np.asarray(mesh.faces, np.int64)
     try:
-        return _mesh(Corners(np.asarray(mesh.vertices, np.float64), faces, _corner_uv(mesh)), False)
+        return _mesh(Corners(np.asarray(mesh.vertices, np.float64), faces, _corner_uv(mesh)))
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
 
@@ -101,7 +100,7 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):
             return super().get(unquote(name))
 
 
-def _read(path: Path, smooth: bool) -> Corners:
+def _read(path: Path) -> Corners:
     """Read a mesh file; one compressed by gzip, such as `bunny.ply.gz`, is unpacked in memory."""
     packed = path.suffix.lower() == ".gz"
     kind = Path(path.stem if packed else path.name).suffix[1:].lower()
@@ -119,7 +118,7 @@ def _read(path: Path, smooth: bool) -> Corners:
         gltf_file.check(data, None if packed else path.parent)
     elif kind == "stl":
         data = stl_file.check(data)
-    found = None if smooth or kind not in _READERS else _READERS[kind](data)
+    found = _READERS[kind](data) if kind in _READERS else None
     if found is not None:
         return found
     resolver = None if packed else _Neighbours(str(path))
@@ -175,7 +174,7 @@ def _join(parts: list[Corners]) -> Corners:
     )
 
 
-def _mesh(found: Corners, smooth: bool) -> TriangleMesh:
+def _mesh(found: Corners) -> TriangleMesh:
     """Weld, clean, wind and shade triangles."""
     if not len(found.faces):
         raise InputError("contains no triangles; export it as a surface mesh")
@@ -183,19 +182,15 @@ def _mesh(found: Corners, smooth: bool) -> TriangleMesh:
     if not np.isfinite(vertices).all():
         count = int((~np.isfinite(vertices)).any(1).sum())
         raise InputError(f"{count} of {len(vertices)} vertices are not finite; repair the file")
-    vertices = vertices if smooth else _fit_float32(vertices)
-    merged, faces = _merge(vertices, faces) if smooth else _weld(vertices, faces)
+    merged, faces = _weld(_fit_float32(vertices), faces)
     kept = with_area(merged, faces)
-    if not smooth:
-        kept &= _mark_first_copies(faces, kept)
+    kept &= _mark_first_copies(faces, kept)
     if not kept.any():
         raise InputError(f"all of its {len(faces)} triangles are degenerate: they have no area")
     merged, faces = without_unused(merged, faces[kept])
     wound = outward(merged, faces)
     moved = (wound[:, :, None] == faces[:, None, :]).argmax(2)[..., None]  # winding the other way moves corners
     uv = None if found.uv is None else np.take_along_axis(found.uv[kept], moved, axis=1)
-    if smooth:
-        return TriangleMesh(vertices=merged, faces=wound, normals=vertex_normals(merged, wound), uv=uv)
     given = None if found.normals is None else np.take_along_axis(found.normals[kept], moved, axis=1)
     points, split, normals = creases.shade(merged, wound, given)
     return TriangleMesh(vertices=points, faces=split, normals=normals, uv=uv)
@@ -216,13 +211,6 @@ def _fit_float32(vertices: np.ndarray) -> np.ndarray:
     if np.abs(low + high).max() / 2 > _FARTHEST * extent:
         return (scaled - (low + high) / 2) * biggest
     return vertices
-
-
-def _merge(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge positions that agree to 1e-8, as trimesh does."""
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    mesh.merge_vertices()
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
 
 
 def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
