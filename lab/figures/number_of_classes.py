@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.sweep import Panel, choose_runners, list_shapes, paper_row, sweep, vary
+from lab.figures.sweep import Panel, average, choose_runners, list_shapes, paper_row, sweep, vary
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.score_tables import Mean, mean
+from pipelines.evaluate.score_tables import Mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
@@ -79,7 +79,7 @@ def make(bench: Workbench) -> Panel:
 
     corners: dict[tuple[str, str, int], list[Mean]] = {}  # by method, shape, bins
     for (*key, _), results in sweep(bench, runners, (wanted, folder), variants, 4 * len(BINS) + 1, "bins").items():
-        corners.setdefault(tuple(key), []).append(mean((one.scores for one in results), "normal_mae"))
+        corners.setdefault(tuple(key), []).append(average(results)["normal_mae"])
     errors = {key: _worst(means) for key, means in corners.items()}
     shapes = list_shapes(wanted)
     directions = light_sets.load(bench.config.lights)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.sweep import METRICS, Panel, finds, list_shapes, paper_row, sweep, vary
+from lab.figures.sweep import METRICS, Panel, average, finds, list_shapes, paper_row, sweep, vary
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.score_tables import Mean, mean
+from pipelines.evaluate.score_tables import Mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
@@ -23,8 +23,8 @@ from render.shared.seeds import generator
 from sdps.methods.method import Method
 
 COUNTS = (2, 4, 8, 16, 32, 64)
-Points = dict[tuple[str, str, int], dict[str, list[Mean]]]
-"""(method, shape, images): for every metric one mean over materials per draw."""
+Points = dict[tuple[str, str, int], list[dict[str, Mean]]]
+"""(method, shape, images): for every draw the mean of each metric over materials."""
 
 
 def draw_subsets(total: int, draws: int, seed: int) -> list[tuple[int, int, np.ndarray]]:
@@ -59,9 +59,7 @@ def make(bench: Workbench) -> Panel:
     points: Points = {}
     found = sweep(bench, bench.runners, (wanted, folder), variants, len(chosen), "images")
     for (method, shape, count, _), results in found.items():
-        kept = points.setdefault((method, shape, count), {metric: [] for metric in METRICS})
-        for metric in METRICS:
-            kept[metric].append(mean((one.scores for one in results), metric))
+        points.setdefault((method, shape, count), []).append(average(results))
     methods = [runner.method for runner in bench.runners]
     shapes = list_shapes(wanted)
     counts = tuple(dict.fromkeys(count for count, _, _ in sorted(chosen, key=lambda part: part[0])))
@@ -78,16 +76,16 @@ def make(bench: Workbench) -> Panel:
     )  # fmt: skip
     tables = [_table(methods, shape, counts, points, metric) for shape in shapes for metric in METRICS]
     values = {
-        f"{method} | {shape} | {count}": {name: [item.plain() for item in kept[name]] for name in METRICS}
-        for (method, shape, count), kept in points.items()
+        f"{method} | {shape} | {count}": {name: [draw[name].plain() for draw in draws] for name in METRICS}
+        for (method, shape, count), draws in points.items()
     }
     return Panel("Error against the number of images", text, drawn, tuple(each for each in tables if each.rows), values)
 
 
-def _average(draws: Sequence[Mean]) -> tuple[float, float, float, int]:
+def _summarise(draws: Sequence[dict[str, Mean]], metric: str) -> tuple[float, float, float, int]:
     """Return mean, lowest and highest over the draws, and how many objects failed in all of them."""
-    values = [item.value for item in draws if np.isfinite(item.value)]
-    failed = sum(item.failed for item in draws)
+    values = [draw[metric].value for draw in draws if np.isfinite(draw[metric].value)]
+    failed = sum(draw[metric].failed for draw in draws)
     if not values:
         return np.nan, np.nan, np.nan, failed
     return float(np.mean(values)), min(values), max(values), failed
@@ -108,7 +106,7 @@ def _table(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
     for method in (method for method in methods if finds(method, metric)):
         cells = []
         for count in counts:
-            middle, low, high, failed = _average(points[method.name, shape, count][metric])
+            middle, low, high, failed = _summarise(points[method.name, shape, count], metric)
             text = number(middle) + (f" [{number(low)}, {number(high)}]" if high > low else "")
             cells.append(text + (f" {failed} failed" if failed and np.isfinite(middle) else ""))
         known = _published(method, shape, metric)
@@ -128,7 +126,7 @@ def _chart(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
         for place, method in enumerate(methods):
             if not finds(method, metric):
                 continue
-            drawn = [_average(points[method.name, shape, count][metric]) for count in counts]
+            drawn = [_summarise(points[method.name, shape, count], metric) for count in counts]
             middle, low, high = (np.array(part) for part in list(zip(*drawn, strict=True))[:3])
             axes.fill_between(counts, low, high, color=charts.colour(place), alpha=0.18, lw=0)
             chart.line(place, charts.short(method.name), counts, middle)

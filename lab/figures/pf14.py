@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.sweep import METRICS, LeftOut, Panel, choose_runners, finds, paper_row, sweep
+from lab.figures.sweep import METRICS, LeftOut, Panel, average, choose_runners, finds, paper_row, sweep
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.published import POSTER
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.score_tables import Mean, mean
+from pipelines.evaluate.score_tables import Mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts, scenes
 from pipelines.shared.pictures import spread
@@ -103,9 +103,9 @@ def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[s
 
     found = sweep(bench, runners, (wanted, folder), variants, 1, lights)
     return {
-        (method, lights, group, metric): mean((one.scores for one in results), metric)
+        (method, lights, group, metric): value
         for (method, group), results in found.items()
-        for metric in METRICS
+        for metric, value in average(results).items()
     }
 
 

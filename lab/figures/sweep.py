@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.report.sections import Table
+from pipelines.evaluate.score_tables import Mean, mean
 from pipelines.evaluate.workbench import Workbench
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
@@ -78,6 +79,12 @@ def sweep(
     for key, runner, result in bench.evaluation.run(objects, runners, len(wanted) * each, about):
         found.setdefault((runner.method.name, *key), []).append(result)
     return found
+
+
+def average(results: Iterable[Result]) -> dict[str, Mean]:
+    """Return the mean of each metric over scenes."""
+    scores = [one.scores for one in results]
+    return {metric: mean(scores, metric) for metric in METRICS}
 
 
 def vary(item: TestObject, about: str, data: bytes, **changes: Any) -> TestObject:
