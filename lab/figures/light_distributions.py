@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lab.figures.sweep import Panel, choose_runners, finds, list_shapes
+from lab.shared import line_charts
 from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench
@@ -64,6 +65,6 @@ def _chart(panels: Shown) -> Figure:
                 charts.light_disc(axes, result.light_directions, gains, item.light_directions)
             angle = result.scores.get("direction_mae")
             about = "refused" if angle is None else f"{angle:.1f}° off"
-            axes.set_title(f"{charts.short(name)}\n{about}", fontsize=8)
+            axes.set_title(f"{line_charts.shorten(name)}\n{about}", fontsize=8)
     figure.colorbar(points, ax=grid, shrink=0.6, label="intensity / highest", aspect=30)
     return figure

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lab.figures.sweep import Panel, average, choose_runners, list_shapes, paper_row, sweep, vary
+from lab.shared import line_charts
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
@@ -147,12 +148,12 @@ def _table(
 def _chart(runners: list[Runner], shapes: tuple[str, ...], errors: dict[tuple[str, str, int], Mean]) -> Figure:
     figure = charts.new_figure(8.0, 4.4)
     axes, x = figure.add_subplot(), [*BINS, _INFINITY_AT]
-    chart = charts.LineChart(axes)
+    chart = line_charts.LineChart(axes)
     for place, runner in enumerate(runners):
         for style, shape in enumerate(shapes):
             y = [errors[runner.method.name, shape, count].value for count in (*BINS, _EXACT)]
-            axes.plot(x[:-1], y[:-1], color=charts.colour(place), ls=charts.LINE_STYLES[style % 4])
-            chart.line(place, f"{charts.short(runner.method.name)}, {shape}", x, y, ls=":", lw=0.8)
+            axes.plot(x[:-1], y[:-1], color=line_charts.colour(place), ls=line_charts.LINE_STYLES[style % 4])
+            chart.line(place, f"{line_charts.shorten(runner.method.name)}, {shape}", x, y, ls=":", lw=0.8)
             chart.point(f"PS-FCN, {shape}: published", x[-1], _published(runner, shape))
     axes.axvline(36, color="0.8", lw=0.8)
     chart.ticks(x, [*map(str, BINS), "∞"])

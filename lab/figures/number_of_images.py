@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lab.figures.sweep import METRICS, Panel, average, finds, list_shapes, paper_row, sweep, vary
+from lab.shared import line_charts
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
@@ -122,14 +123,14 @@ def _chart(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
     figure = charts.new_figure(8.0, 2.9 * len(shown))
     for row, (metric, (title, unit)) in enumerate(shown.items()):
         axes = figure.add_subplot(len(shown), 1, row + 1)
-        chart = charts.LineChart(axes)
+        chart = line_charts.LineChart(axes)
         for place, method in enumerate(methods):
             if not finds(method, metric):
                 continue
             drawn = [_summarise(points[method.name, shape, count], metric) for count in counts]
             middle, low, high = (np.array(part) for part in list(zip(*drawn, strict=True))[:3])
-            axes.fill_between(counts, low, high, color=charts.colour(place), alpha=0.18, lw=0)
-            chart.line(place, charts.short(method.name), counts, middle)
+            axes.fill_between(counts, low, high, color=line_charts.colour(place), alpha=0.18, lw=0)
+            chart.line(place, line_charts.shorten(method.name), counts, middle)
             if counts[-1] == 100:
                 paper = published.NORMALS.get(paper_row(method), ("",))[0]
                 chart.point(f"{paper}, published", 100, _published(method, shape, metric))

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
 from lab.figures.sweep import LeftOut, Panel, choose_runners, paper_row, sweep
+from lab.shared import line_charts
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench, build_test_object
@@ -138,14 +139,21 @@ def _list_hardest(curves: list[Curve], published: dict[str, dict[str, float]]) -
 def _chart(curves: list[Curve], order: list[str], published: dict[str, dict[str, float]]) -> Figure:
     figure = charts.new_figure(max(7.0, 2.6 + 0.105 * len(order)), 5.2)
     axes, x = figure.add_subplot(), np.arange(len(order))
-    chart = charts.LineChart(axes)
+    chart = line_charts.LineChart(axes)
     for style, (name, column) in enumerate(published.items()):
         y = [column.get(material, np.nan) for material in order]
-        axes.plot(x, y, color=charts.PUBLISHED, lw=1.6 if style == 0 else 0.9, ls=charts.LINE_STYLES[style], zorder=1)
+        axes.plot(
+            x,
+            y,
+            color=line_charts.PUBLISHED,
+            lw=1.6 if style == 0 else 0.9,
+            ls=line_charts.LINE_STYLES[style],
+            zorder=1,
+        )
         chart.end(f"{LABELS[name]}, published", y, "0.35")
     for place, curve in enumerate(curves):
         y = [curve.errors.get(material, np.nan) for material in order]
-        chart.line(place, charts.short(curve.method), x, y, ms=3.5, lw=0.9, zorder=3)
+        chart.line(place, line_charts.shorten(curve.method), x, y, ms=3.5, lw=0.9, zorder=3)
     axes.set_xticks(x, order, rotation=90, fontsize=6 if len(order) > 40 else 8)
     axes.set(ylabel="normals, mean angular error (degrees)", xlim=(-0.5, len(order) - 0.5))
     chart.finish(gap=0.05)

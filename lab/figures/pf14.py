@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lab.figures.sweep import METRICS, LeftOut, Panel, average, choose_runners, finds, paper_row, sweep
+from lab.shared import line_charts
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.published import POSTER
 from pipelines.evaluate.report.sections import Table
@@ -142,9 +143,9 @@ def _chart(methods: list[Method], kinds: tuple[str, ...], means: Means, shape: s
                 x = np.arange(len(kinds)) + (place * len(LIGHT_SETS) + number - (bars - 1) / 2) * width
                 heights = [means[method.name, lights, group, metric].value for group in kinds]
                 axes.bar(
-                    x, np.nan_to_num(heights), width * 0.92, color=charts.colour(place), alpha=0.55 if number else 1.0,
-                    hatch="////" if number else None, edgecolor="white", lw=0,
-                    label=f"{charts.short(method.name)}, {lights.split(':')[0]}",
+                    x, np.nan_to_num(heights), width * 0.92, color=line_charts.colour(place),
+                    alpha=0.55 if number else 1.0, hatch="////" if number else None, edgecolor="white", lw=0,
+                    label=f"{line_charts.shorten(method.name)}, {lights.split(':')[0]}",
                 )  # fmt: skip
                 known = [published(method, metric, group, lights, shape) for group in kinds]
                 points = [(at, value) for at, value in zip(x, known, strict=True) if value is not None]
@@ -152,7 +153,7 @@ def _chart(methods: list[Method], kinds: tuple[str, ...], means: Means, shape: s
                     axes.plot(*zip(*points, strict=True), "D", color="0.25", mfc="0.85", ms=5, ls="", zorder=5)
         axes.set_xticks(range(len(kinds)), [kind.capitalize() for kind in kinds])
         axes.set(ylabel=unit, title=title)
-        charts.tidy(axes)
+        line_charts.tidy(axes)
         if row == 0:
             handles, labels = axes.get_legend_handles_labels()
     if shape == SHAPE:
