@@ -51,21 +51,17 @@ def add_light_stage_arguments(parser: argparse.ArgumentParser) -> None:
 def _declare(parser: argparse.ArgumentParser, *datasets: str) -> None:
     """Declare the flags of all benchmarks, and those of these data sets."""
     suite.add_arguments(parser)
-    parser.add_argument("--longest-side", type=int, default=0, metavar="PIXELS",
-                        help="average larger crops down to this, to save memory (default: 0, never)")  # fmt: skip
+    add = parser.add_argument
+    add("--longest-side", type=int, default=0, metavar="PIXELS",
+        help="average larger crops down to this, to save memory (default: 0, never)")  # fmt: skip
     if "gourd-apple" in datasets:
-        parser.add_argument("--measured-lights", action="store_true",
-                            help="gourd-apple: compare with the measured lights, not the refined ones")  # fmt: skip
+        add("--measured-lights", action="store_true",
+            help="gourd-apple: compare with the measured lights, not the refined ones")  # fmt: skip
     if "light-stage" in datasets:
-        parser.add_argument(
-            "--least-z",
-            type=float,
-            default=0.0,
-            metavar="Z",
-            help="light-stage: use images whose light direction has z above it (default: 0)",
-        )
-        parser.add_argument("--gamma", type=float, default=1.0,
-                            help="light-stage: exponent that makes PNG values linear (default: 1, linear)")  # fmt: skip
+        add("--least-z", type=float, default=0.0, metavar="Z",
+            help="light-stage: use images whose light direction has z above it (default: 0)")  # fmt: skip
+        add("--gamma", type=float, default=1.0,
+            help="light-stage: exponent that makes PNG values linear (default: 1, linear)")  # fmt: skip
 
 
 def main(args: argparse.Namespace) -> int:
