@@ -163,13 +163,14 @@ class Evaluation:
         images, found = None, []
         lights: FoundLights = {}
         for runner in runners:
-            key, kept = _key(item, runner), item.pictured and runner.method.name in keep
-            known = self._known(key, kept)
-            if known is None:
+            key = (runner.method.name, runner.identity(), item.name, item.digest)
+            kept, maps = item.pictured and runner.method.name in keep, self._maps(key)
+            known = self._cache.get(key)
+            if known is None or (kept and known["normals"] and not maps.is_file()):
                 images = item.load() if images is None else images
-                known = self._run(item, images, runner, self._maps(key) if kept else None, lights)
+                known = self._run(item, images, runner, maps if kept else None, lights)
                 self._cache.add(key, known)
-            found.append(_result(known, self._maps(key)))
+            found.append(_result(known, maps))
         return found
 
     def run(
@@ -201,11 +202,6 @@ class Evaluation:
     def _maps(self, key: tuple[str, ...]) -> Path:
         return self.folder / "maps" / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.npz"
 
-    def _known(self, key: tuple[str, ...], kept: bool) -> dict[str, Any] | None:
-        """Return the cached result, or None; also None where its normal map is to be kept and is missing."""
-        known = self._cache.get(key)
-        return None if known and kept and known["normals"] and not self._maps(key).is_file() else known
-
     def _run(
         self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: "FoundLights"
     ) -> dict[str, Any]:
@@ -229,10 +225,6 @@ class Evaluation:
             "gains": np.round(np.asarray(estimate.intensities, np.float64), 6).tolist(),
             "notes": {name: value for name in _NOTES if (value := getattr(estimate.notes, name)) is not None},
         }
-
-
-def _key(item: TestObject, runner: "Runner") -> tuple[str, ...]:
-    return runner.method.name, runner.identity(), item.name, item.digest
 
 
 @cache

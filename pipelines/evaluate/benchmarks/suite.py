@@ -22,12 +22,6 @@ from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
 
 
-def _open(item: TestObject) -> Any:
-    """Return an object's images, read whole, so that no method is blamed for a damaged file."""
-    images: Any = item.load()
-    return images.open()
-
-
 def run(
     items: Sequence[TestObject],
     chosen: Sequence[Method],
@@ -49,7 +43,8 @@ def run(
     runners = [Runner(method, finder(models), config) for method in chosen]
     evaluation = Evaluation(folder)
     found: Found = {runner.method.name: {} for runner in runners}
-    objects = ((item.name, replace(item, load=partial(_open, item))) for item in items)
+    # read whole, so that no method is blamed for a damaged file
+    objects = ((item.name, replace(item, load=partial(lambda load: load().open(), item.load))) for item in items)
     for name, runner, result in evaluation.run(objects, runners, len(items), "evaluate", shown):
         found[runner.method.name][name] = result
     return found, runners
