@@ -11,7 +11,7 @@ import numpy as np
 
 from pipelines.evaluate.report import page as report
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table, Tile
-from pipelines.shared import pictures, using
+from pipelines.shared import network_flags, pictures
 from render.shared.errors import InputError
 from render.shared.progress import bars, stage
 from sdps.core.intensities import grey, scale_to_mean
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="go on where a check of the photographs stops (the report says which)")  # fmt: skip
     parser.add_argument("--scale", type=float, default=1.0, metavar="F",
                         help="reduce pictures and mask as they are read; 0.5 halves the sides")  # fmt: skip
-    using.add_arguments(parser)
+    network_flags.add_arguments(parser)
     parser.add_argument("--self-test", action="store_true",
                         help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
 

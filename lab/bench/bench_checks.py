@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.evaluate.workbench import photographs, write_photographs
+from pipelines.evaluate.workbench import photograph, write_photographs
 from pipelines.shared.flags import add_out
 from pipelines.shared.text_tables import render_text
 from render.records.manifest import SceneSpec, read_manifest
@@ -73,7 +73,7 @@ def judge(folder: Path, scene: SceneSpec) -> list[dict[str, Any]]:
     rng = generator(0, scene.id, "checks")
     gains = rng.uniform(0.2, 2.0, len(shard.images)).astype(np.float32)
     chosen = np.sort(rng.permutation(len(gains))[:MOST])
-    images = photographs(shard, gains)[chosen]
+    images = photograph(shard, gains)[chosen]
     images /= np.percentile(images[:, shard.mask], 99.5)
     images = np.pad(images, ((0, 0), (_PAD, _PAD), (_PAD, _PAD), (0, 0)))
     mask, rows, alarms = np.pad(shard.mask, _PAD), [], {}

@@ -14,9 +14,10 @@ import numpy as np
 
 from lab.bench.bench_relight import relight
 from lab.bench.image_noise import NoiseConfig, measure
+from lab.shared.line_charts import tidy
 from lab.shared.memory import resident_bytes
 from pipelines.shared import presets
-from pipelines.shared.charts import new_figure, tidy
+from pipelines.shared.charts import new_figure
 from render.planning import budget
 from render.planning.data_config import DataConfig
 from render.planning.plan import material_pool, plan

@@ -22,7 +22,7 @@ from lab.bench.large_photographs import LargeConfig, photograph_large
 from lab.shared.machines import hold, kinds, processor
 from lab.shared.memory import measured, peak_gib
 from pipelines.evaluate.workbench import write_photographs
-from pipelines.shared import using
+from pipelines.shared import network_flags
 from pipelines.shared.flags import add_models, add_out, split_list
 from pipelines.shared.text_tables import render_text
 from render.shared.errors import InputError
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `python -m lab bench-infer`."""
     parser.add_argument("--methods", action="append", help="commas or repeat (default: sdps)")
     add_models(parser)
-    using.add_arguments(parser)
+    network_flags.add_arguments(parser)
     add_size(parser)
     parser.add_argument("--many", type=int, default=0, help="also infer a folder of this many pictures")
     parser.add_argument("--large", action="store_true", help="also infer seven JPEG files of 12 megapixels")

@@ -12,7 +12,7 @@ from PIL import Image
 from lab.figures import light_distributions, number_of_classes, number_of_images, per_material, pf14
 from lab.figures.sweep import LeftOut, Panel
 from pipelines.evaluate.report.sections import Section, SectionWriter, save_picture
-from pipelines.evaluate.results import tables_text
+from pipelines.evaluate.score_tables import tables_text
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import presets
 from pipelines.shared.flags import pick_names, split_list

@@ -3,12 +3,12 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.sweep import LeftOut, Panel, finds, shapes_of
+from lab.figures.sweep import Panel, choose_runners, finds, list_shapes
+from lab.shared import line_charts
 from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
-from pipelines.shared.pictures import spread_evenly
 from pipelines.shared.text_tables import number
 
 SCENES = 3  # per shape
@@ -18,18 +18,12 @@ Shown = dict[str, tuple[TestObject, list[tuple[str, Result]]]]
 
 
 def make(bench: Workbench) -> Panel:
-    """Evaluate and draw.
-
-    Raises:
-        LeftOut: no method that finds light directions.
-        InputError: scenes that cannot be rendered or read.
-    """
-    runners = [runner for runner in bench.runners if finds(runner.method, "direction_mae")]
-    if not runners:
-        raise LeftOut("lights needs a method that finds the lights; add sdps or pf14 to --methods")
+    """Evaluate and draw."""
+    runners = choose_runners(bench, lambda method: finds(method, "direction_mae"),
+                             "lights", "a method that finds the lights; add sdps or pf14")  # fmt: skip
     wanted, folder = bench.merltest()
     drawings, rows, values = [], [], {}
-    for shape in shapes_of(wanted):
+    for shape in list_shapes(wanted):
         chosen = spread_evenly([scene for scene in wanted if scene.shape == shape], min(SCENES, bench.config.pictures))
         panels: Shown = {}
         objects = (((scene, item), item) for scene, item in bench.objects(chosen, folder, bench.config))
@@ -37,7 +31,7 @@ def make(bench: Workbench) -> Panel:
             name = runner.method.name
             panels.setdefault(scene.material, (item, []))[1].append((name, result))
             angle, gain = (result.scores.get(metric) for metric in ("direction_mae", "intensity_error"))
-            rows.append((shape, scene.material, name, *("-" if v is None else number(v) for v in (angle, gain))))
+            rows.append((shape, scene.material, name, number(angle), number(gain)))
             values[f"{scene.id} | {name}"] = {"direction_mae": angle, "intensity_error": gain}
         caption = f"{shape.capitalize()}: lights as (x, y) on the unit disc, coloured by intensity over the highest."
         drawings.append((f"lights-{shape}", caption, _chart(panels)))
@@ -49,13 +43,7 @@ def make(bench: Workbench) -> Panel:
     note = "Directions: mean angular error in degrees. Intensities: mean relative error after one least-squares scale."
     header = ("shape", "material", "method", "directions", "intensities")
     table = Table(title="Errors of the lights shown", header=header, rows=tuple(rows), note=note)
-    return Panel(
-        title="Light distributions, true and estimated",
-        text=text,
-        charts=tuple(drawings),
-        tables=(table,),
-        values=values,
-    )
+    return Panel("Light distributions, true and estimated", text, tuple(drawings), (table,), values)
 
 
 def _chart(panels: Shown) -> Figure:
@@ -76,6 +64,6 @@ def _chart(panels: Shown) -> Figure:
                 charts.light_disc(axes, result.light_directions, gains, item.light_directions)
             angle = result.scores.get("direction_mae")
             about = "refused" if angle is None else f"{angle:.1f}° off"
-            axes.set_title(f"{charts.short(name)}\n{about}", fontsize=8)
+            axes.set_title(f"{line_charts.shorten(name)}\n{about}", fontsize=8)
     figure.colorbar(points, ax=grid, shrink=0.6, label="intensity / highest", aspect=30)
     return figure

@@ -5,19 +5,18 @@ centre of its class. Every true light is replaced by the four directions at that
 the worst of the four means, an upper bound of what discretisation costs.
 """
 
-import hashlib
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.sweep import LeftOut, Panel, paper_row, shapes_of, sweep
+from lab.figures.sweep import Panel, average, choose_runners, list_shapes, paper_row, sweep, vary
+from lab.shared import line_charts
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.results import Mean, mean
+from pipelines.evaluate.score_tables import Mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
@@ -69,15 +68,9 @@ def centre_floor(directions: np.ndarray, count: int) -> float:
 
 
 def make(bench: Workbench) -> Panel:
-    """Evaluate and draw.
-
-    Raises:
-        LeftOut: no method that is given the lights.
-        InputError: scenes that cannot be rendered or read.
-    """
-    runners = [runner for runner in bench.runners if runner.method.lights == TRUE_LIGHTS]
-    if not runners:
-        raise LeftOut("bins needs a method that is given the lights; add psfcn or least-squares to --methods")
+    """Evaluate and draw."""
+    runners = choose_runners(bench, lambda method: method.lights == TRUE_LIGHTS,
+                             "bins", "a method that is given the lights; add psfcn or least-squares")  # fmt: skip
     wanted, folder = bench.merltest()
 
     def variants(scene: SceneSpec, item: TestObject) -> Iterator[tuple[tuple[Any, ...], TestObject]]:
@@ -87,9 +80,9 @@ def make(bench: Workbench) -> Panel:
 
     corners: dict[tuple[str, str, int], list[Mean]] = {}  # by method, shape, bins
     for (*key, _), results in sweep(bench, runners, (wanted, folder), variants, 4 * len(BINS) + 1, "bins").items():
-        corners.setdefault(tuple(key), []).append(mean((one.scores for one in results), "normal_mae"))
+        corners.setdefault(tuple(key), []).append(average(results)["normal_mae"])
     errors = {key: _worst(means) for key, means in corners.items()}
-    shapes = shapes_of(wanted)
+    shapes = list_shapes(wanted)
     directions = light_sets.load(bench.config.lights)
     text = (
         f"Normals of methods that are given the lights, on {len(wanted)} MERL-Test scenes of {len(directions)} lights "
@@ -97,31 +90,26 @@ def make(bench: Workbench) -> Panel:
         "azimuth and in elevation, delta = 180/(2 K_d) degrees; shown is the worst of the four means over materials. "
         "Angles stay within the range of class centres, +-(90 - delta) degrees. Intensities are the true ones."
     )
-    chart = _chart(runners, shapes, errors)
     values = {
         f"{method} | {shape}": {"exact" if not k else str(k): errors[method, shape, k].plain() for k in (*BINS, _EXACT)}
         for method, shape in dict.fromkeys((m, s) for m, s, _ in errors)
     }
-    return Panel(
-        title="Error against the number of light classes",
-        text=text,
-        charts=(("bins", "Upper bound of the normals' error by the number of bins K_d.", chart),),
-        tables=(_table(runners, shapes, errors, directions),),
-        values={"normal_mae": values, "class_centre_floor": {str(k): centre_floor(directions, k) for k in BINS}},
-    )
+    chart = ("bins", "Upper bound of the normals' error by the number of bins K_d.", _chart(runners, shapes, errors))
+    return Panel("Error against the number of light classes", text, (chart,),
+                 (_table(runners, shapes, errors, directions),),
+                 {"normal_mae": values, "class_centre_floor": {str(k): centre_floor(directions, k) for k in BINS}},
+                )  # fmt: skip
 
 
 def _deviations(item: TestObject, count: int) -> list[TestObject]:
     """Return the object with its true lights, or with each of the four sets of deviated ones."""
     if count == _EXACT:
         return [item]
-    found = []
-    for corner in CORNERS:
-        name = f"{item.name}, K_d {count} {corner[0]:+d}{corner[1]:+d}"
-        lights = deviate(item.true_directions, count, corner)
-        digest = hashlib.sha256(item.digest.encode() + lights.tobytes()).hexdigest()[:24]
-        found.append(replace(item, name=name, digest=digest, light_directions=lights))
-    return found
+    lights = {corner: deviate(item.true_directions, count, corner) for corner in CORNERS}
+    return [
+        vary(item, f"K_d {count} {x:+d}{y:+d}", moved.tobytes(), light_directions=moved)
+        for (x, y), moved in lights.items()
+    ]
 
 
 def _worst(corners: list[Mean]) -> Mean:
@@ -160,12 +148,12 @@ def _table(
 def _chart(runners: list[Runner], shapes: tuple[str, ...], errors: dict[tuple[str, str, int], Mean]) -> Figure:
     figure = charts.new_figure(8.0, 4.4)
     axes, x = figure.add_subplot(), [*BINS, _INFINITY_AT]
-    chart = charts.LineChart(axes)
+    chart = line_charts.LineChart(axes)
     for place, runner in enumerate(runners):
         for style, shape in enumerate(shapes):
             y = [errors[runner.method.name, shape, count].value for count in (*BINS, _EXACT)]
-            axes.plot(x[:-1], y[:-1], color=charts.colour(place), ls=charts.LINE_STYLES[style % 4])
-            chart.line(place, f"{charts.short(runner.method.name)}, {shape}", x, y, ls=":", lw=0.8)
+            axes.plot(x[:-1], y[:-1], color=line_charts.colour(place), ls=line_charts.LINE_STYLES[style % 4])
+            chart.line(place, f"{line_charts.shorten(runner.method.name)}, {shape}", x, y, ls=":", lw=0.8)
             chart.point(f"PS-FCN, {shape}: published", x[-1], _published(runner, shape))
     axes.axvline(36, color="0.8", lw=0.8)
     chart.ticks(x, [*map(str, BINS), "∞"])

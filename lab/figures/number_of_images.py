@@ -4,19 +4,18 @@ Each draw puts the lights in a random order; a set of n images is the first n of
 and all objects and methods see the same ones.
 """
 
-import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.sweep import METRICS, Panel, finds, paper_row, shapes_of, sweep
+from lab.figures.sweep import METRICS, Panel, average, finds, list_shapes, paper_row, sweep, vary
+from lab.shared import line_charts
 from pipelines.evaluate import published
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.results import Mean, mean
+from pipelines.evaluate.score_tables import Mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
@@ -25,11 +24,11 @@ from render.shared.seeds import generator
 from sdps.methods.method import Method
 
 COUNTS = (2, 4, 8, 16, 32, 64)
-Points = dict[tuple[str, str, int], dict[str, list[Mean]]]
-"""(method, shape, images): for every metric one mean over materials per draw."""
+Points = dict[tuple[str, str, int], list[dict[str, Mean]]]
+"""(method, shape, images): for every draw the mean of each metric over materials."""
 
 
-def subsets(total: int, draws: int, seed: int) -> list[tuple[int, int, np.ndarray]]:
+def draw_subsets(total: int, draws: int, seed: int) -> list[tuple[int, int, np.ndarray]]:
     """Return (images, draw, their places) with every count below `total` once per draw, and all images once."""
     chosen = []
     for draw in range(draws):
@@ -38,39 +37,32 @@ def subsets(total: int, draws: int, seed: int) -> list[tuple[int, int, np.ndarra
     return [*chosen, (total, 0, np.arange(total))]
 
 
-def part_of(item: TestObject, count: int, draw: int, places: np.ndarray) -> TestObject:
+def select_images(item: TestObject, count: int, draw: int, places: np.ndarray) -> TestObject:
     """Return an object, whose images are an array, seen in some of them only."""
     if count == len(item.true_directions):
         return item
-    digest = hashlib.sha256(item.digest.encode() + places.astype(np.int64).tobytes()).hexdigest()[:24]
-    return replace(
-        item, name=f"{item.name}, {count} images, draw {draw}", digest=digest,
+    return vary(
+        item, f"{count} images, draw {draw}", places.astype(np.int64).tobytes(),
         load=lambda: np.asarray(item.load())[places], light_directions=item.true_directions[places],
         intensities=None if item.intensities is None else item.intensities[places],
     )  # fmt: skip
 
 
 def make(bench: Workbench) -> Panel:
-    """Evaluate and draw.
-
-    Raises:
-        InputError: scenes that cannot be rendered or read.
-    """
+    """Evaluate and draw."""
     wanted, folder = bench.merltest()
-    chosen = subsets(len(wanted[0].lights), bench.draws, bench.config.seed)
+    chosen = draw_subsets(len(wanted[0].lights), bench.draws, bench.config.seed)
 
     def variants(scene: SceneSpec, item: TestObject) -> Iterator[tuple[tuple[Any, ...], TestObject]]:
         for count, draw, places in chosen:
-            yield (scene.shape, count, draw), part_of(item, count, draw, places)
+            yield (scene.shape, count, draw), select_images(item, count, draw, places)
 
     points: Points = {}
     found = sweep(bench, bench.runners, (wanted, folder), variants, len(chosen), "images")
     for (method, shape, count, _), results in found.items():
-        kept = points.setdefault((method, shape, count), {metric: [] for metric in METRICS})
-        for metric in METRICS:
-            kept[metric].append(mean((one.scores for one in results), metric))
+        points.setdefault((method, shape, count), []).append(average(results))
     methods = [runner.method for runner in bench.runners]
-    shapes = shapes_of(wanted)
+    shapes = list_shapes(wanted)
     counts = tuple(dict.fromkeys(count for count, _, _ in sorted(chosen, key=lambda part: part[0])))
     text = (
         f"{len(wanted)} MERL-Test scenes ({bench.config.lights}); {bench.draws} random subsets of each number of "
@@ -78,28 +70,23 @@ def make(bench: Workbench) -> Panel:
         "Bands: from the lowest to the highest draw. Grey diamonds: the paper's figures for all images. A method given "
         "the true lights is scored on normals only."
     )
-    drawings = tuple(
+    drawn = tuple(
         (f"images-{shape}", f"{shape.capitalize()}: error against the number of images.",
          _chart(methods, shape, counts, points))
         for shape in shapes
     )  # fmt: skip
-    tables = tuple(_table(methods, shape, counts, points, metric) for shape in shapes for metric in METRICS)
-    return Panel(
-        title="Error against the number of images",
-        text=text,
-        charts=drawings,
-        tables=tuple(table for table in tables if table.rows),
-        values={
-            f"{method} | {shape} | {count}": {name: [item.plain() for item in kept[name]] for name in METRICS}
-            for (method, shape, count), kept in points.items()
-        },
-    )
+    tables = [_table(methods, shape, counts, points, metric) for shape in shapes for metric in METRICS]
+    values = {
+        f"{method} | {shape} | {count}": {name: [draw[name].plain() for draw in draws] for name in METRICS}
+        for (method, shape, count), draws in points.items()
+    }
+    return Panel("Error against the number of images", text, drawn, tuple(each for each in tables if each.rows), values)
 
 
-def _average(draws: Sequence[Mean]) -> tuple[float, float, float, int]:
+def _summarise(draws: Sequence[dict[str, Mean]], metric: str) -> tuple[float, float, float, int]:
     """Return mean, lowest and highest over the draws, and how many objects failed in all of them."""
-    values = [item.value for item in draws if np.isfinite(item.value)]
-    failed = sum(item.failed for item in draws)
+    values = [draw[metric].value for draw in draws if np.isfinite(draw[metric].value)]
+    failed = sum(draw[metric].failed for draw in draws)
     if not values:
         return np.nan, np.nan, np.nan, failed
     return float(np.mean(values)), min(values), max(values), failed
@@ -120,12 +107,11 @@ def _table(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
     for method in (method for method in methods if finds(method, metric)):
         cells = []
         for count in counts:
-            middle, low, high, failed = _average(points[method.name, shape, count][metric])
-            text = number(middle) if np.isfinite(middle) else "-"
-            text += f" [{number(low)}, {number(high)}]" if high > low else ""
+            middle, low, high, failed = _summarise(points[method.name, shape, count], metric)
+            text = number(middle) + (f" [{number(low)}, {number(high)}]" if high > low else "")
             cells.append(text + (f" {failed} failed" if failed and np.isfinite(middle) else ""))
         known = _published(method, shape, metric)
-        rows.append((method.name, *cells, number(known) if known is not None else "-"))
+        rows.append((method.name, *cells, number(known)))
     title, unit = METRICS[metric]
     header = ("method", *map(str, counts), f"published, {counts[-1]}" if counts[-1] == 100 else "published, 100")
     note = f"{unit.capitalize()}, mean over materials and draws; in brackets the lowest and the highest draw."
@@ -137,14 +123,14 @@ def _chart(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
     figure = charts.new_figure(8.0, 2.9 * len(shown))
     for row, (metric, (title, unit)) in enumerate(shown.items()):
         axes = figure.add_subplot(len(shown), 1, row + 1)
-        chart = charts.LineChart(axes)
+        chart = line_charts.LineChart(axes)
         for place, method in enumerate(methods):
             if not finds(method, metric):
                 continue
-            drawn = [_average(points[method.name, shape, count][metric]) for count in counts]
+            drawn = [_summarise(points[method.name, shape, count], metric) for count in counts]
             middle, low, high = (np.array(part) for part in list(zip(*drawn, strict=True))[:3])
-            axes.fill_between(counts, low, high, color=charts.colour(place), alpha=0.18, lw=0)
-            chart.line(place, charts.short(method.name), counts, middle)
+            axes.fill_between(counts, low, high, color=line_charts.colour(place), alpha=0.18, lw=0)
+            chart.line(place, line_charts.shorten(method.name), counts, middle)
             if counts[-1] == 100:
                 paper = published.NORMALS.get(paper_row(method), ("",))[0]
                 chart.point(f"{paper}, published", 100, _published(method, shape, metric))

@@ -9,10 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
-from lab.figures.sweep import LeftOut, Panel, paper_row, sweep
+from lab.figures.sweep import LeftOut, Panel, choose_runners, paper_row, sweep
+from lab.shared import line_charts
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.workbench import Workbench, lit_object
+from pipelines.evaluate.workbench import Workbench, build_test_object
 from pipelines.shared import charts
 from pipelines.shared.text_tables import number
 from render.records.manifest import SceneSpec
@@ -68,24 +69,17 @@ class Curve:
 
 
 def make(bench: Workbench) -> Panel:
-    """Evaluate and draw; errors are averaged over `test.repeats` draws of the intensities.
-
-    Raises:
-        LeftOut: no bunny among the shapes, or no method that gives normals.
-        InputError: scenes that cannot be rendered or read.
-    """
+    """Evaluate and draw; errors are averaged over `test.repeats` draws of the intensities."""
     if SHAPE not in bench.config.shapes:
         raise LeftOut(f"materials needs {SHAPE} in test.shapes; the published curves are for it")
-    runners = [runner for runner in bench.runners if runner.method.normals]
-    if not runners:
-        raise LeftOut("materials needs a method that gives normals; add one to --methods")
+    runners = choose_runners(bench, lambda m: bool(m.normals), "materials", "a method that gives normals; add one")
     published = read_published()
     wanted, folder = bench.merltest()
     wanted = [scene for scene in wanted if scene.shape == SHAPE]
 
     def variants(scene: SceneSpec, _: TestObject) -> Iterator[tuple[tuple[str], TestObject]]:
         for repeat in range(bench.config.repeats):
-            yield (scene.material,), lit_object(scene, folder, bench.config, repeat)
+            yield (scene.material,), build_test_object(scene, folder, bench.config, repeat)
 
     found = sweep(bench, runners, (wanted, folder), variants, bench.config.repeats, "materials")
     errors = {key: [one.scores.get("normal_mae", np.nan) for one in results] for key, results in found.items()}
@@ -102,21 +96,19 @@ def make(bench: Workbench) -> Panel:
         f"{bench.config.repeats} draw(s) of random intensities. Materials are in the order of the published SDPS-Net "
         "curve. Grey: the paper's curves, of its own rendering, digitised from the vector figure of its poster."
     )
+    values = {
+        curve.method: {"rank_correlation": rho if np.isfinite(rho) else None, "beside": curve.column,
+                       "normal_mae": curve.errors}
+        for curve in curves
+        for rho in curve.rank_correlation(published)[:1]
+    }  # fmt: skip
+    chart = ("materials", "Mean angular error of normals per material.", _chart(curves, order, published))
     return Panel(
-        title="Error per material",
-        text=text,
-        charts=(("materials", "Mean angular error of normals per material.", _chart(curves, order, published)),),
-        tables=(_summary(curves, published), _hardest(curves, published)),
-        values={
-            curve.method: {"rank_correlation": rho if np.isfinite(rho) else None, "beside": curve.column,
-                           "normal_mae": curve.errors}
-            for curve in curves
-            for rho in curve.rank_correlation(published)[:1]
-        },
-    )  # fmt: skip
+        "Error per material", text, (chart,), (_summarise(curves, published), _list_hardest(curves, published)), values
+    )
 
 
-def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
+def _summarise(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
     rows = []
     for curve in curves:
         rho, p, count = curve.rank_correlation(published)
@@ -124,20 +116,20 @@ def _summary(curves: list[Curve], published: dict[str, dict[str, float]]) -> Tab
         rows.append((
             curve.method, number(float(np.mean(list(curve.errors.values())))) if curve.errors else "-",
             LABELS[curve.column], number(float(np.mean(theirs))) if theirs else "-",
-            f"{rho:.2f}" if np.isfinite(rho) else "-", f"{p:.1g}" if np.isfinite(p) else "-", str(count),
+            number(rho, 2), f"{p:.1g}" if np.isfinite(p) else "-", str(count),
         ))  # fmt: skip
     note = "Mean angular error in degrees over mask pixels. Spearman's rank correlation over the materials."
     header = ("method", "mean", "published curve", "its mean, same materials", "rank correlation", "p", "materials")
     return Table(title=f"Error per material: {SHAPE}", header=header, rows=tuple(rows), note=note)
 
 
-def _hardest(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
+def _list_hardest(curves: list[Curve], published: dict[str, dict[str, float]]) -> Table:
     """List the materials the first method finds hardest."""
     first = curves[0].errors
     names = sorted(first, key=lambda name: first[name], reverse=True)[:HARDEST]
     rows = tuple(
-        (name, *(number(c.errors[name]) if name in c.errors else "-" for c in curves),
-         *(number(column[name]) if name in column else "-" for column in published.values()))
+        (name, *(number(c.errors.get(name)) for c in curves),
+         *(number(column.get(name)) for column in published.values()))
         for name in names
     )  # fmt: skip
     header = ("material", *(c.method for c in curves), *(f"{LABELS[name]}, published" for name in published))
@@ -147,14 +139,21 @@ def _hardest(curves: list[Curve], published: dict[str, dict[str, float]]) -> Tab
 def _chart(curves: list[Curve], order: list[str], published: dict[str, dict[str, float]]) -> Figure:
     figure = charts.new_figure(max(7.0, 2.6 + 0.105 * len(order)), 5.2)
     axes, x = figure.add_subplot(), np.arange(len(order))
-    chart = charts.LineChart(axes)
+    chart = line_charts.LineChart(axes)
     for style, (name, column) in enumerate(published.items()):
         y = [column.get(material, np.nan) for material in order]
-        axes.plot(x, y, color=charts.PUBLISHED, lw=1.6 if style == 0 else 0.9, ls=charts.LINE_STYLES[style], zorder=1)
+        axes.plot(
+            x,
+            y,
+            color=line_charts.PUBLISHED,
+            lw=1.6 if style == 0 else 0.9,
+            ls=line_charts.LINE_STYLES[style],
+            zorder=1,
+        )
         chart.end(f"{LABELS[name]}, published", y, "0.35")
     for place, curve in enumerate(curves):
         y = [curve.errors.get(material, np.nan) for material in order]
-        chart.line(place, charts.short(curve.method), x, y, ms=3.5, lw=0.9, zorder=3)
+        chart.line(place, line_charts.shorten(curve.method), x, y, ms=3.5, lw=0.9, zorder=3)
     axes.set_xticks(x, order, rotation=90, fontsize=6 if len(order) > 40 else 8)
     axes.set(ylabel="normals, mean angular error (degrees)", xlim=(-0.5, len(order) - 0.5))
     chart.finish(gap=0.05)

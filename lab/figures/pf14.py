@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.figures.sweep import METRICS, LeftOut, Panel, finds, paper_row, sweep
+from lab.figures.sweep import METRICS, LeftOut, Panel, average, choose_runners, finds, paper_row, sweep
+from lab.shared import line_charts
 from pipelines.evaluate.evaluation import TestObject
 from pipelines.evaluate.published import POSTER
 from pipelines.evaluate.report.sections import Table
-from pipelines.evaluate.results import Mean, mean
+from pipelines.evaluate.score_tables import Mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts, scenes
-from pipelines.shared.pictures import spread_evenly
 from render.materials import library
 from render.planning import light_sets
 from render.planning.plan import material_pool
@@ -30,7 +30,7 @@ Means = dict[tuple[str, str, str, str], Mean]
 """(method, light set, group, metric)."""
 
 
-def albedos(count: int = LAMBERTIAN) -> list[str]:
+def list_albedos(count: int = LAMBERTIAN) -> list[str]:
     """Return Lambertian materials: a third greys from 0.1 to 0.9, the others colours of evenly spaced hues.
 
     The paper does not say which it took. A grey albedo only scales the images but for interreflection, hence colours.
@@ -44,7 +44,7 @@ def albedos(count: int = LAMBERTIAN) -> list[str]:
     return names
 
 
-def groups(chosen: tuple[str, ...]) -> dict[str, list[str]]:
+def group_materials(chosen: tuple[str, ...]) -> dict[str, list[str]]:
     """Return the materials of each group that `test.materials` leaves.
 
     All 15 + 12 + 9 + 12 where it is `all`. Otherwise the named ones; Lambertian ones that are not named are as large a
@@ -60,22 +60,16 @@ def groups(chosen: tuple[str, ...]) -> dict[str, list[str]]:
         raise LeftOut(f"pf14 needs materials of {', '.join(GROUPS[1:])}; add some to test.materials")
     named = [name for name in pool if name.startswith("lambertian:")]
     share = kept / sum(len(kinds[group]) for group in GROUPS[1:])
-    some = spread_evenly(albedos(), max(1, round(share * LAMBERTIAN)))
+    some = spread_evenly(list_albedos(), max(1, round(share * LAMBERTIAN)))
     return {"lambertian": named or some} | {group: names for group, names in found.items() if names}
 
 
 def make(bench: Workbench) -> Panel:
-    """Render the two light sets, evaluate and draw.
-
-    Raises:
-        LeftOut: no method that finds lights and normals itself, or no material of the groups.
-        InputError: scenes that cannot be rendered or read.
-    """
-    runners = [runner for runner in bench.runners if all(finds(runner.method, metric) for metric in METRICS)]
-    if not runners:
-        raise LeftOut("pf14 needs methods that find lights and normals; add sdps or pf14 to --methods")
+    """Render the two light sets, evaluate and draw."""
+    runners = choose_runners(bench, lambda method: all(finds(method, metric) for metric in METRICS),
+                             "pf14", "methods that find lights and normals; add sdps or pf14")  # fmt: skip
     shape = SHAPE if SHAPE in bench.config.shapes else bench.config.shapes[-1]
-    kinds = groups(bench.config.materials)
+    kinds = group_materials(bench.config.materials)
     means: Means = {}
     for lights in LIGHT_SETS:
         means |= _evaluate(bench, runners, shape, kinds, lights)
@@ -89,19 +83,12 @@ def make(bench: Workbench) -> Panel:
     )
     tables = tuple(_table(methods, tuple(kinds), means, metric, shape) for metric in METRICS)
     caption = "Errors by kind of reflectance; plain bars: near-uniform lights, hatched: biased lights."
-    return Panel(
-        title="Classical PF14 against SDPS-Net",
-        text=text,
-        charts=(
-            ("pf14", caption, _chart(methods, tuple(kinds), means, shape)),
-            ("pf14-lights", "The two light sets as (x, y) on the unit disc.", _light_sets()),
-        ),
-        tables=tables,
-        values={
-            "materials": kinds,
-            "means": {" | ".join(key): {"mean": m.plain(), "failed": m.failed} for key, m in means.items()},
-        },
+    drawn = (
+        ("pf14", caption, _chart(methods, tuple(kinds), means, shape)),
+        ("pf14-lights", "The two light sets as (x, y) on the unit disc.", _draw_light_sets()),
     )
+    values = {" | ".join(key): {"mean": m.plain(), "failed": m.failed} for key, m in means.items()}
+    return Panel("Classical PF14 against SDPS-Net", text, drawn, tables, {"materials": kinds, "means": values})
 
 
 def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[str, list[str]], lights: str) -> Means:
@@ -116,9 +103,9 @@ def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[s
 
     found = sweep(bench, runners, (wanted, folder), variants, 1, lights)
     return {
-        (method, lights, group, metric): mean((one.scores for one in results), metric)
+        (method, lights, group, metric): value
         for (method, group), results in found.items()
-        for metric in METRICS
+        for metric, value in average(results).items()
     }
 
 
@@ -155,9 +142,9 @@ def _chart(methods: list[Method], kinds: tuple[str, ...], means: Means, shape: s
                 x = np.arange(len(kinds)) + (place * len(LIGHT_SETS) + number - (bars - 1) / 2) * width
                 heights = [means[method.name, lights, group, metric].value for group in kinds]
                 axes.bar(
-                    x, np.nan_to_num(heights), width * 0.92, color=charts.colour(place), alpha=0.55 if number else 1.0,
-                    hatch="////" if number else None, edgecolor="white", lw=0,
-                    label=f"{charts.short(method.name)}, {lights.split(':')[0]}",
+                    x, np.nan_to_num(heights), width * 0.92, color=line_charts.colour(place),
+                    alpha=0.55 if number else 1.0, hatch="////" if number else None, edgecolor="white", lw=0,
+                    label=f"{line_charts.shorten(method.name)}, {lights.split(':')[0]}",
                 )  # fmt: skip
                 known = [published(method, metric, group, lights, shape) for group in kinds]
                 points = [(at, value) for at, value in zip(x, known, strict=True) if value is not None]
@@ -165,7 +152,7 @@ def _chart(methods: list[Method], kinds: tuple[str, ...], means: Means, shape: s
                     axes.plot(*zip(*points, strict=True), "D", color="0.25", mfc="0.85", ms=5, ls="", zorder=5)
         axes.set_xticks(range(len(kinds)), [kind.capitalize() for kind in kinds])
         axes.set(ylabel=unit, title=title)
-        charts.tidy(axes)
+        line_charts.tidy(axes)
         if row == 0:
             handles, labels = axes.get_legend_handles_labels()
     if shape == SHAPE:
@@ -175,7 +162,7 @@ def _chart(methods: list[Method], kinds: tuple[str, ...], means: Means, shape: s
     return figure
 
 
-def _light_sets() -> Figure:
+def _draw_light_sets() -> Figure:
     figure = charts.new_figure(5.4, 2.9)
     for axes, lights in zip(figure.subplots(1, len(LIGHT_SETS)), LIGHT_SETS, strict=True):
         directions = light_sets.load(lights)

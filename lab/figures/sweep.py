@@ -1,7 +1,8 @@
 """What the figures share: the sweep of methods over scenes, the form of a figure, and which methods it can show."""
 
+import hashlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from matplotlib.figure import Figure
 
 from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.report.sections import Table
+from pipelines.evaluate.score_tables import Mean, mean
 from pipelines.evaluate.workbench import Workbench
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
@@ -25,7 +27,7 @@ METRICS = {  # of the figures: title and unit
 
 
 class LeftOut(InputError):
-    """A figure cannot be made of these methods, shapes or materials; the others can."""
+    """A figure cannot be made of these methods, shapes or materials; other figures can."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,7 @@ class Panel:
 
 
 Variants = Callable[[SceneSpec, TestObject], Iterable[tuple[tuple[Any, ...], TestObject]]]
-"""Of a scene: the objects to score in its place, each with what is varied."""
+"""From a scene to the objects that are scored in its place, each with what is varied."""
 Sweep = dict[tuple[Any, ...], list[Result]]
 """By (method, *what is varied): a result per scene."""
 
@@ -79,7 +81,19 @@ def sweep(
     return found
 
 
-def shapes_of(scenes: Iterable[SceneSpec]) -> tuple[str, ...]:
+def average(results: Iterable[Result]) -> dict[str, Mean]:
+    """Return the mean of each metric over scenes."""
+    scores = [one.scores for one in results]
+    return {metric: mean(scores, metric) for metric in METRICS}
+
+
+def vary(item: TestObject, about: str, data: bytes, **changes: Any) -> TestObject:
+    """Return an object with other attributes, under a name and a digest of its own, which depend on `data` as well."""
+    digest = hashlib.sha256(item.digest.encode() + data).hexdigest()[:24]
+    return replace(item, name=f"{item.name}, {about}", digest=digest, **changes)
+
+
+def list_shapes(scenes: Iterable[SceneSpec]) -> tuple[str, ...]:
     """Return the shapes of scenes, each once."""
     return tuple(dict.fromkeys(scene.shape for scene in scenes))
 
@@ -91,8 +105,20 @@ def paper_row(method: Method) -> str:
     return rows.paper_row(method)
 
 
+def choose_runners(bench: Workbench, fits: Callable[[Method], bool], figure: str, what: str) -> list[Runner]:
+    """Return the methods that fit a figure.
+
+    Raises:
+        LeftOut: there are none.
+    """
+    runners = [runner for runner in bench.runners if fits(runner.method)]
+    if not runners:
+        raise LeftOut(f"{figure} needs {what} to --methods")
+    return runners
+
+
 def finds(method: Method, metric: str) -> bool:
-    """Tell whether a method can be scored by a metric, that is, estimates the quantity itself."""
+    """Return whether a method can be scored by a metric, that is, estimates the quantity itself."""
     if metric == "normal_mae":
         return bool(method.normals)
     if metric == "intensity_error" and method.intensities:

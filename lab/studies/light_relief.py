@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipelines.evaluate.workbench import intensities, photographs
+from pipelines.evaluate.workbench import draw_intensities, photograph
 from pipelines.shared.presets import TestConfig
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import read_shard
@@ -77,7 +77,7 @@ def _searched(scene: SceneSpec, folder: Path, lights: np.ndarray, gains: Sequenc
     shard = read_shard(folder / scene.file, scene)
     places = np.argwhere(shard.mask)
     places = places[generator(0, scene.id, "relief").permutation(len(places))[:_PIXELS]]
-    seen = photographs(shard, intensities(scene, TestConfig(), 0))[:, places[:, 0], places[:, 1]]  # (L, N, 3)
+    seen = photograph(shard, draw_intensities(scene, TestConfig(), 0))[:, places[:, 0], places[:, 1]]  # (L, N, 3)
     values = torch.from_numpy(seen / np.array(gains, np.float32)[:, None, None]).permute(1, 0, 2).contiguous()
     residuals = []
     for factor in _SEARCHED:

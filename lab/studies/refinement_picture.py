@@ -41,7 +41,7 @@ def main() -> int:
             pictures.normal_map(found.normals, scene.mask), _errors(scene, found.normals),
             pictures.error_map(np.where(scene.mask, expected(scene, begun, found).normals, np.nan), _YELLOW),
         ]  # fmt: skip
-        rows.append(np.concatenate([pictures.fit_height(part, _SIDE) for part in maps], axis=1))
+        rows.append(np.concatenate([pictures.scale_to_height(part, _SIDE) for part in maps], axis=1))
     Image.fromarray(np.concatenate(rows)).save(args.picture, quality=88)
     return 0
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from pipelines.evaluate.workbench import intensities
+from pipelines.evaluate.workbench import draw_intensities
 from pipelines.shared.presets import TestConfig
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import read_shard
@@ -49,7 +49,7 @@ class Scene:
     def __init__(self, folder: Path, spec: SceneSpec, narrow: bool, images: int, merltest: bool) -> None:
         shard, rng = read_shard(folder / spec.file, spec), generator(5, spec.id, "dev")
         every = np.arange(len(shard.light_directions))
-        gains = intensities(spec, TestConfig(), 0) if merltest else rng.uniform(0.2, 2.0, len(every))
+        gains = draw_intensities(spec, TestConfig(), 0) if merltest else rng.uniform(0.2, 2.0, len(every))
         kept = np.flatnonzero(shard.light_directions[:, 2] > _NARROW) if narrow else every
         if 0 < images < len(kept):
             kept = np.sort(rng.permutation(kept)[:images])

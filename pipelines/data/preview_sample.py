@@ -93,7 +93,7 @@ def _some(values: np.ndarray) -> np.ndarray:
 def strip(shard: Shard) -> np.ndarray:  # (128, 512, 3) uint8
     """Show the normals and three images (or the material weights and two) under one exposure, at most 128 high."""
     picture = pictures.preview_strip(shard, lights=3)
-    return pictures.fit_height(picture, SIDE)
+    return pictures.scale_to_height(picture, SIDE)
 
 
 def stage(scene: SceneSpec, shard: Shard) -> Stage:
@@ -103,7 +103,7 @@ def stage(scene: SceneSpec, shard: Shard) -> Stage:
     shown = [pictures.normal_map(shard.normals, shard.mask)]
     shown += [pictures.tone_map(shard.images[number], exposure) for number in chosen]
     side = min(STAGE_SIDE, shard.mask.shape[0])
-    cells = [pictures.fit_height(picture, side) for picture in shown]
+    cells = [pictures.scale_to_height(picture, side) for picture in shown]
     height, width = cells[0].shape[:2]
     sheet = np.full((-(-len(cells) // STAGE_COLUMNS) * height, STAGE_COLUMNS * width, 3), 255, np.uint8)
     for number, cell in enumerate(cells):

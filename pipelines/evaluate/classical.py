@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
-from pipelines.evaluate.results import mean, publish
+from pipelines.evaluate.score_tables import mean, publish
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import presets, scenes
 from pipelines.shared.flags import pick_names, split_list
@@ -80,11 +80,9 @@ def build_tables(rows: list[dict[str, Any]], names: list[str]) -> list[Table]:
         for lights, shape in dict.fromkeys((row["lights"], row["shape"]) for row in rows):
             part = [row for row in rows if (row["lights"], row["shape"]) == (lights, shape)]
             kinds = list(dict.fromkeys(row["category"] for row in part))
-            scores = {
-                (name, kind): [row["scores"] for row in part if (row["method"], row["category"]) == (name, kind)]
-                for name in shown
-                for kind in kinds
-            }
+            scores: dict[tuple[str, str], list[dict[str, float]]] = {}
+            for row in part:
+                scores.setdefault((row["method"], row["category"]), []).append(row["scores"])
             body = tuple((name, *(mean(scores[name, kind], metric).cell() for kind in kinds)) for name in shown)
             tables.append(Table(title=f"{title}: {shape}, {lights}", header=("method", *kinds), rows=body))
     return tables

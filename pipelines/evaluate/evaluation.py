@@ -1,7 +1,7 @@
-"""Methods on objects: one interface and one metric code for every benchmark, each result kept as it is found.
+"""Run methods on objects, with one interface and one set of metrics for every benchmark, and keep each result.
 
 A result is filed under the method (with its weights, settings and arithmetic), the object (with its images) and the
-code, so that a stopped evaluation goes on where it was, and what has changed is evaluated again.
+code, so that an evaluation that was stopped continues where it was, and what has changed is evaluated again.
 """
 
 import hashlib
@@ -34,7 +34,7 @@ _LIBRARIES = ("torch", "numpy", "scipy", "opencv-python-headless")
 
 @dataclass(frozen=True, eq=False)
 class TestObject:
-    """An object with what is known of it.
+    """An object and what is known about it.
 
     Attributes:
         name: Unique within the evaluation, e.g. `bunny-chrome`.
@@ -44,7 +44,7 @@ class TestObject:
         normals: (H, W, 3) true normals, or None.
         light_directions: (L, 3) true directions, or None.
         intensities: (L,) or (L, 3) true intensities, or None.
-        pictured: Whether normal maps may be kept of it.
+        pictured: Whether its normal maps may be kept.
     """
 
     __test__ = False  # nothing for pytest to collect
@@ -67,7 +67,7 @@ class TestObject:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a method made of an object.
+    """The result of a method on an object.
 
     Attributes:
         scores: Metrics by name; empty where the method refused.
@@ -75,8 +75,8 @@ class Result:
         reason: Why it refused, in one line, or empty.
         light_directions: (L, 3) estimated or given directions; (0, 3) where there are none.
         intensities: (L,) the same for intensities.
-        maps: File with the normal map, or None where it was not to be kept.
-        notes: What else a classical method says: the transformation it found, and from what.
+        maps: File with the normal map, or None where it was not kept.
+        notes: What else a classical method reports: the transformation it found, and what it found it from.
     """
 
     scores: dict[str, float]
@@ -150,9 +150,10 @@ class Evaluation:
         self._cache = ScoreCache(folder / "scores.jsonl", code_identity())
 
     def results(self, item: TestObject, runners: "Sequence[Runner]", keep: Collection[str] = ()) -> list[Result]:
-        """Return what methods make of an object, from the cache or by running them.
+        """Return the results of methods on an object, from the cache or by running them.
 
-        Its images are read once, and only if they are needed; lights that several methods see alike are estimated once.
+        Its images are read once, and only if needed; lights that several methods would estimate alike are estimated
+        once.
 
         Args:
             item: The object.
@@ -162,13 +163,14 @@ class Evaluation:
         images, found = None, []
         lights: FoundLights = {}
         for runner in runners:
-            key, kept = _key(item, runner), item.pictured and runner.method.name in keep
-            known = self._known(key, kept)
-            if known is None:
+            key = (runner.method.name, runner.identity(), item.name, item.digest)
+            kept, maps = item.pictured and runner.method.name in keep, self._maps(key)
+            known = self._cache.get(key)
+            if known is None or (kept and known["normals"] and not maps.is_file()):
                 images = item.load() if images is None else images
-                known = self._run(item, images, runner, self._maps(key) if kept else None, lights)
+                known = self._run(item, images, runner, maps if kept else None, lights)
                 self._cache.add(key, known)
-            found.append(_result(known, self._maps(key)))
+            found.append(_result(known, maps))
         return found
 
     def run(
@@ -200,15 +202,10 @@ class Evaluation:
     def _maps(self, key: tuple[str, ...]) -> Path:
         return self.folder / "maps" / f"{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.npz"
 
-    def _known(self, key: tuple[str, ...], kept: bool) -> dict[str, Any] | None:
-        """Return what is known of a method and an object, None where a normal map is to be kept that is not there."""
-        known = self._cache.get(key)
-        return None if known and kept and known["normals"] and not self._maps(key).is_file() else known
-
     def _run(
         self, item: TestObject, images: "ImageSource", runner: "Runner", maps: Path | None, lights: "FoundLights"
     ) -> dict[str, Any]:
-        """Run a method and return what is kept of it, JSON ready."""
+        """Run a method and return the part of its result that is kept, JSON ready."""
         try:
             estimate = runner.estimate(images, item.mask, item.light_directions, item.intensities, lights)
         except InputError as error:  # such as least squares under lights that were all estimated alike
@@ -230,13 +227,9 @@ class Evaluation:
         }
 
 
-def _key(item: TestObject, runner: "Runner") -> tuple[str, ...]:
-    return runner.method.name, runner.identity(), item.name, item.digest
-
-
 @cache
 def code_identity() -> str:
-    """Return what tells results of this code and its libraries from others: any file of the project may matter."""
+    """Return a text that changes with any file of the project and its libraries; then no older result is reused."""
     root = Path(__file__).parents[2]
     code = source_digest(*(root / package for package in ("render", "sdps", "pipelines")))
     return " ".join([_FORMAT, code, *(f"{name}-{importlib.metadata.version(name)}" for name in _LIBRARIES)])

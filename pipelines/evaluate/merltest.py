@@ -19,9 +19,9 @@ from pipelines.evaluate import published
 from pipelines.evaluate.object_pictures import ERROR_LIMIT, tiles
 from pipelines.evaluate.report import page as report
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
-from pipelines.evaluate.results import mean, tables_text, weights_of
-from pipelines.evaluate.workbench import Workbench, lit_object
-from pipelines.shared import presets, using
+from pipelines.evaluate.score_tables import cell, mean, tables_text, weights_of
+from pipelines.evaluate.workbench import Workbench, build_test_object
+from pipelines.shared import network_flags, presets
 from pipelines.shared.cluster import cluster_config
 from pipelines.shared.pictures import spread_evenly
 from pipelines.shared.presets import Preset, TestConfig
@@ -74,13 +74,13 @@ def main(args: argparse.Namespace) -> int:
     config = inference_config(preset.test)
     runners = tuple(Runner(method, finder(out), config) for method in (*lighting, *normals))
     bench = Workbench(preset, out, runners, cluster=cluster_config.from_arguments(args))
-    pictured = shown(normals)
+    pictured = pick_pictured(normals)
     wanted, folder = bench.merltest()
     results = evaluate(bench, wanted, folder, pictured)
-    tables, networks = build_tables(results, lighting, normals), using.describe(runners, config)
+    tables, networks = build_tables(results, lighting, normals), network_flags.describe(runners, config)
     presets.save_resolved(preset, out / "eval")
     write_json(out / "eval" / "results.json", {
-        "definition": definition(preset.test),
+        "definition": describe(preset.test),
         "networks": networks.strip(),
         "weights": weights_of(runners),
         "config": to_plain(preset.test),
@@ -93,7 +93,7 @@ def main(args: argparse.Namespace) -> int:
     chosen = {runner.method.name: runner for runner in runners}
     write(bench, folder, tables, results, [chosen[name] for name in pictured if name in chosen], networks)
     page = report.write(out, preset)
-    sys.stdout.write(f"{tables_text(tables, left=(0, 1))}\n{definition(preset.test)}{networks}\n{page}\n")
+    sys.stdout.write(f"{tables_text(tables, left=(0, 1))}\n{describe(preset.test)}{networks}\n{page}\n")
     return 0
 
 
@@ -124,7 +124,7 @@ def _own_lighting(preset: Preset) -> list[str]:
     return [name for name, model in models.items() if model in MODELS and MODELS[model].role == "lighting"]
 
 
-def shown(normals: Sequence[Method]) -> list[str]:
+def pick_pictured(normals: Sequence[Method]) -> list[str]:
     """Return the names of the methods whose normal maps the page shows.
 
     The paper's pair if it was trained here, the last of the shipped ways that find the lights (the rows have the best
@@ -141,7 +141,7 @@ def evaluate(bench: Workbench, wanted: Sequence[SceneSpec], folder: Path, pictur
     """Score every scene, averaged over the draws of random intensities; normal maps of the first draw are kept."""
     repeats = range(bench.config.repeats)
     objects = (
-        ((place, repeat), lit_object(scene, folder, bench.config, repeat))
+        ((place, repeat), build_test_object(scene, folder, bench.config, repeat))
         for place, scene in enumerate(wanted)
         for repeat in repeats
     )
@@ -175,7 +175,7 @@ def build_tables(results: list[SceneScores], lighting: list[Method], normals: li
     return [*tables, Table(title="Table B, normal estimation (MAE)", header=("row", "model", *shapes), rows=body)]
 
 
-def definition(config: TestConfig) -> str:
+def describe(config: TestConfig) -> str:
     """Return what the tables' numbers are and what the methods saw."""
     margin = config.margin_of((config.size, config.size))
     seen = "whole frame" if margin is None else f"object's box with {margin} pixels of margin"
@@ -208,7 +208,7 @@ def _rows(
     for row in paper if all_rows else ():
         if row not in {method.paper for method in methods}:
             figures = [figure for shape in shapes for figure in published.figures(paper, row, shape, len(metrics))]
-            cells = [MISSING + ("" if figure is None else f" ({number(figure)})") for figure in figures]
+            cells = [cell(MISSING, figure) for figure in figures]
             rows.append((row, paper[row][0], *cells))
     return tuple(sorted(rows, key=lambda row: (row[0] == "-", row[0])))
 
@@ -239,15 +239,15 @@ def write(
     repeats = f"{config.repeats} draws of intensities" if config.repeats > 1 else "one draw of intensities"
     text = (
         f"{len(results)} scenes of {config.size}x{config.size} pixels, {len(results[0].scene.lights)} lights, "
-        f"{repeats}. {definition(config)}{networks} "
+        f"{repeats}. {describe(config)}{networks} "
         f"Error maps run from 0 (black) to {ERROR_LIMIT:g} degrees (yellow)."
     )
     names = [runner.method.name for runner in runners]
     section = Section(name="merltest", title="MERL-Test scenes", text=text, order=10, tables=tuple(tables),
                       command=f"sdps evaluate merltest --preset {bench.preset.name} --out {bench.out}")  # fmt: skip
     writer = SectionWriter(section)
-    for result in choose(results, names[0], config.pictures):
-        item = lit_object(result.scene, folder, config)
+    for result in pick_spread(results, names[0], config.pictures):
+        item = build_test_object(result.scene, folder, config)
         kept = bench.evaluation.results(item, runners, names)
         found = {name: {item.name: one} for name, one in zip(names, kept, strict=True)}
         writer.strip(f"{result.scene.shape}, {result.scene.material}", tiles(item, found, names))
@@ -257,7 +257,7 @@ def write(
     SectionWriter(single).write(bench.out)
 
 
-def choose(results: Sequence[SceneScores], name: str, count: int) -> list[SceneScores]:
+def pick_spread(results: Sequence[SceneScores], name: str, count: int) -> list[SceneScores]:
     """Pick scenes of each shape spread from the best to the worst normal error, so the page shows both ends."""
     chosen = []
     for shape in dict.fromkeys(result.scene.shape for result in results):
@@ -278,12 +278,12 @@ def _per_scene(results: Sequence[SceneScores], names: Sequence[str]) -> Table:
         for metric, about, digits in _METRICS
         if any(metric in result.scores[name] for result in results)
     ]
-
-    def cell(scores: dict[str, float], metric: str, digits: int) -> str:
-        return f"{scores[metric]:.{digits}f}" if metric in scores else "-"
-
     rows = [
-        (r.scene.shape, r.scene.material, *(cell(r.scores[name], metric, digits) for name, metric, _, digits in wanted))
+        (
+            r.scene.shape,
+            r.scene.material,
+            *(number(r.scores[name].get(metric), digits) for name, metric, _, digits in wanted),
+        )
         for r in sorted(results, key=lambda r: _error(r, names[0]), reverse=True)
     ]
     header = ("shape", "material", *(f"{name}: {about}" for name, _, about, _ in wanted))

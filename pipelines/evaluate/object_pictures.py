@@ -1,4 +1,4 @@
-"""Pictures of an evaluated object: its input, its true normals, and what methods made of them."""
+"""Pictures of an evaluated object: its input, its true normals, and what methods estimated."""
 
 from collections.abc import Sequence
 
@@ -55,4 +55,4 @@ def _brightest(item: TestObject) -> np.ndarray:  # (H, W, 3)
 
 
 def _fit(picture: np.ndarray) -> np.ndarray:
-    return pictures.fit_height(picture, _SHOWN_HEIGHT) if picture.shape[0] > _SHOWN_HEIGHT else picture
+    return pictures.scale_to_height(picture, _SHOWN_HEIGHT) if picture.shape[0] > _SHOWN_HEIGHT else picture

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.evaluate.workbench import intensities, write_photographs
+from pipelines.evaluate.workbench import draw_intensities, write_photographs
 from pipelines.rendering.render_data import render_planned
 from pipelines.shared.presets import Preset, TestConfig
 from pipelines.shared.scenes import test_scenes
@@ -37,7 +37,7 @@ def photograph_bunny(folder: Path, material: str = "red-phenolic") -> Path:
     rendered = folder / TRUTH
     render_planned([scene], rendered, Preset(name="self-test", description="", test=test))
     shard = read_shard(rendered / scene.file, scene)
-    gains = intensities(scene, test, 0)
+    gains = draw_intensities(scene, test, 0)
     images = shard.images.astype(np.float32) * gains[:, None, None, None]
     write_photographs(folder, images / np.percentile(images[:, shard.mask], _UNCLIPPED), shard.mask)
     truth = {"shard": scene.file, "intensities": gains.tolist(), "directions": scene.light_directions().tolist()}

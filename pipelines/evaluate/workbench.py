@@ -1,4 +1,4 @@
-"""Methods on rendered test scenes, seen as photographs under lights of unknown strength."""
+"""Run methods on rendered test scenes, which they see as photographs under lights of unknown intensity."""
 
 import hashlib
 from collections.abc import Iterable, Iterator
@@ -27,13 +27,13 @@ def _read(path: Path, scene: SceneSpec, _size: int, _time: int) -> tuple[Shard, 
     return read_shard(path, scene), file_hash(path)
 
 
-def intensities(scene: SceneSpec, config: TestConfig, repeat: int) -> np.ndarray:  # (L,) float32
+def draw_intensities(scene: SceneSpec, config: TestConfig, repeat: int) -> np.ndarray:  # (L,) float32
     """Draw the random light intensities of a scene; each repeat has others."""
     rng = generator(config.seed, scene.id, "intensities", repeat)
     return rng.uniform(*config.intensity_range, len(scene.lights)).astype(np.float32)
 
 
-def photographs(shard: Shard, gains: np.ndarray) -> np.ndarray:
+def photograph(shard: Shard, gains: np.ndarray) -> np.ndarray:
     """Return (L, H, W, 3) float32: the object's radiance under lights of these intensities, black around it."""
     return shard.images.astype(np.float32) * gains[:, None, None, None] * shard.mask[..., None]
 
@@ -54,7 +54,7 @@ def write_photographs(folder: Path, images: Iterable[np.ndarray], mask: np.ndarr
     return folder
 
 
-def lit_object(scene: SceneSpec, folder: Path, config: TestConfig, repeat: int = 0) -> TestObject:
+def build_test_object(scene: SceneSpec, folder: Path, config: TestConfig, repeat: int = 0) -> TestObject:
     """Return a rendered scene as an object to evaluate.
 
     Args:
@@ -67,13 +67,13 @@ def lit_object(scene: SceneSpec, folder: Path, config: TestConfig, repeat: int =
         InputError: the shard is missing or damaged.
     """
     path = folder / scene.file
-    file = path.stat() if path.is_file() else None  # reading it tells what is wrong
+    file = path.stat() if path.is_file() else None  # a missing file is reported when it is read
     shard, digest = _read(path, scene, *((file.st_size, file.st_mtime_ns) if file else (0, 0)))
-    gains = intensities(scene, config, repeat)
+    gains = draw_intensities(scene, config, repeat)
     parts = (digest, gains.tobytes().hex())
     return TestObject(
         name=scene.id if repeat == 0 else f"{scene.id}, draw {repeat}",
-        digest=hashlib.sha256(repr(parts).encode()).hexdigest()[:24], load=lambda: photographs(shard, gains),
+        digest=hashlib.sha256(repr(parts).encode()).hexdigest()[:24], load=lambda: photograph(shard, gains),
         mask=shard.mask, normals=shard.normals, light_directions=scene.light_directions(), intensities=gains,
         pictured=repeat == 0,
     )  # fmt: skip
@@ -126,5 +126,5 @@ class Workbench:
     ) -> Iterator[tuple[SceneSpec, TestObject]]:
         """Yield each scene under random intensities (the first draw), its images made once however often asked for."""
         for scene in wanted:
-            item = lit_object(scene, folder, config)
+            item = build_test_object(scene, folder, config)
             yield scene, replace(item, load=cache(item.load))

@@ -73,7 +73,7 @@ def weight_map(weights: np.ndarray, mask: np.ndarray) -> np.ndarray:  # (H, W, 3
     return picture
 
 
-def fit_height(picture: np.ndarray, side: int) -> np.ndarray:  # (h, w, 3) uint8
+def scale_to_height(picture: np.ndarray, side: int) -> np.ndarray:  # (h, w, 3) uint8
     """Bring a picture to a height of `side`: averaged down, or up by whole pixels where it is smaller."""
     height, width = picture.shape[:2]
     if height == side:

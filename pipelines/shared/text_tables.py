@@ -1,5 +1,6 @@
-"""Tables as aligned text."""
+"""Tables as aligned text, and the figures in them."""
 
+import math
 from collections.abc import Collection, Sequence
 
 
@@ -16,6 +17,8 @@ def render_text(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
     return "\n".join([title, *lines]) + "\n"
 
 
-def number(value: float) -> str:
-    """Write a figure with two decimals from 1 up, three below."""
-    return f"{value:.2f}" if value >= 1 else f"{value:.3f}"
+def number(value: float | None, digits: int | None = None) -> str:
+    """Write a figure, by default with two decimals from 1 up and three below; a dash for None and NaN."""
+    if value is None or math.isnan(value):
+        return "-"
+    return f"{value:.{digits or (2 if value >= 1 else 3)}f}"

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from render.shapes.files.mesh_file import load_mesh
-from render.shapes.geometry.mesh import TriangleMesh, unit
+from render.shapes.geometry.mesh import TriangleMesh, unit, vertex_normals
+from render.shapes.geometry.windings import outward
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, cache_folder
 
@@ -40,7 +40,10 @@ def bunny() -> TriangleMesh:
     Raises:
         InputError: it is neither in the cache nor can it be fetched.
     """
-    mesh = load_mesh(bunny_file(), smooth=True)
+    found = trimesh.load_mesh(bunny_file(), process=False)
+    found.merge_vertices()
+    points, faces = np.asarray(found.vertices), outward(np.asarray(found.vertices), np.asarray(found.faces, np.int64))
+    mesh = TriangleMesh(vertices=points, faces=faces, normals=vertex_normals(points, faces))
     # The file is z-up with the tail towards +x and its right side towards +y.
     x, y, z = mesh.vertices.T
     nx, ny, nz = mesh.normals.T

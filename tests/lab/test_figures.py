@@ -21,9 +21,8 @@ from lab.figures import (
 )
 from pipelines.evaluate import evaluation, published
 from pipelines.evaluate.report.sections import read_sections
-from pipelines.evaluate.results import mean
 from pipelines.evaluate.workbench import Workbench
-from pipelines.shared import charts, presets, scenes
+from pipelines.shared import presets, scenes
 from render.planning import light_sets
 from render.records.shards import Shard, to_half, write_shard
 from render.shared.errors import InputError
@@ -61,7 +60,7 @@ def run(tmp_path, monkeypatch):
     preset = presets.load("smoke", SMALL)
     write_scenes(preset.test, tmp_path / "merltest")
     for name in pf14.LIGHT_SETS:
-        kinds = pf14.groups(preset.test.materials)
+        kinds = pf14.group_materials(preset.test.materials)
         chosen = tuple(item for names in kinds.values() for item in names)
         config = replace(preset.test, shapes=("bunny",), materials=chosen, lights=name)
         write_scenes(config, tmp_path / "figures" / scenes.slug(name))
@@ -123,33 +122,33 @@ def test_four_deviations_at_36_bins_are_two_and_a_half_degrees_in_each_angle():
 
 
 def test_subsets_are_nested_and_all_images_come_once():
-    chosen = number_of_images.subsets(100, draws=3, seed=0)
+    chosen = number_of_images.draw_subsets(100, draws=3, seed=0)
     assert [count for count, _, _ in chosen] == [*number_of_images.COUNTS] * 3 + [100]
     first = [set(places) for _, draw, places in chosen[:-1] if draw == 0]
     assert all(small < large for small, large in pairwise(first))
     assert set(chosen[0][2]) != set(chosen[len(number_of_images.COUNTS)][2])
-    assert [count for count, _, _ in number_of_images.subsets(12, 1, 0)] == [2, 4, 8, 12]
+    assert [count for count, _, _ in number_of_images.draw_subsets(12, 1, 0)] == [2, 4, 8, 12]
 
 
 def test_a_part_of_an_object_has_its_own_digest_and_truth():
     stack = np.arange(5 * 2 * 2 * 3, dtype=np.float32).reshape(5, 2, 2, 3)
     directions = hemisphere_lights(5, np.random.default_rng(1))
     item = evaluation.TestObject("cube", "abc", lambda: stack, np.ones((2, 2), bool), None, directions, np.arange(5.0))
-    part = number_of_images.part_of(item, 2, 0, np.array([1, 4]))
+    part = number_of_images.select_images(item, 2, 0, np.array([1, 4]))
     np.testing.assert_array_equal(part.load(), stack[[1, 4]])
     np.testing.assert_array_equal(part.intensities, [1.0, 4.0])
-    assert part.digest != item.digest and number_of_images.part_of(item, 5, 0, np.arange(5)) is item
+    assert part.digest != item.digest and number_of_images.select_images(item, 5, 0, np.arange(5)) is item
 
 
 def test_the_groups_of_the_pf14_figure_have_the_published_sizes():
-    sizes = {group: len(names) for group, names in pf14.groups(("all",)).items()}
+    sizes = {group: len(names) for group, names in pf14.group_materials(("all",)).items()}
     assert sizes == {"lambertian": 15, "fabric": 12, "plastic": 9, "phenolic": 12}
-    assert len(set(pf14.albedos())) == 15
-    few = pf14.groups(("red-phenolic", "blue-fabric", "pink-plastic", "chrome"))
+    assert len(set(pf14.list_albedos())) == 15
+    few = pf14.group_materials(("red-phenolic", "blue-fabric", "pink-plastic", "chrome"))
     assert [len(names) for names in few.values()] == [1, 1, 1, 1]
-    assert pf14.groups(("red-phenolic", "lambertian:0.5"))["lambertian"] == ["lambertian:0.5"]
+    assert pf14.group_materials(("red-phenolic", "lambertian:0.5"))["lambertian"] == ["lambertian:0.5"]
     with pytest.raises(sweep.LeftOut, match=r"test\.materials"):
-        pf14.groups(("chrome",))
+        pf14.group_materials(("chrome",))
 
 
 def test_published_curves_average_to_the_published_rows():
@@ -168,7 +167,7 @@ def test_rank_correlation_is_that_of_the_shared_materials():
     assert np.isnan(per_material.Curve("x", {"chrome": 1.0, "brass": 2.0}, "PS_FCN").rank_correlation(curves)[0])
 
 
-def test_methods_are_read_and_told_apart(tmp_path):
+def test_methods_are_read_and_distinguished(tmp_path):
     found = {m.name: m for m in eval_figures.wanted_methods(["least-squares", "pf14", "pf14"], tmp_path)}
     assert set(found) == {"least-squares, true lights", "pf14"}
     least, maxima = found["least-squares, true lights"], found["pf14"]
@@ -182,7 +181,7 @@ def test_methods_are_read_and_told_apart(tmp_path):
     assert sweep.paper_row(blind) == "B9" and not sweep.finds(blind, "direction_mae")
     assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "bunny") == 6.9
     assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "sphere") is None
-    with pytest.raises(InputError, match="want METHOD, LIGHTS"):
+    with pytest.raises(InputError, match="want METHOD or LIGHTS"):
         eval_figures.wanted_methods(["a+b+c+d"], tmp_path)
     with pytest.raises(InputError, match="unknown"):
         eval_figures.wanted_methods(["pf-14"], tmp_path)
@@ -195,22 +194,6 @@ def test_default_methods_are_those_with_weights(tmp_path, monkeypatch, caplog):
     for name in ("lcnet", "nenet"):
         write_text(tmp_path / "models" / name / f"{name}.safetensors", "not read here")
     assert next(m.name for m in eval_figures.wanted_methods([], tmp_path)) == "lcnet + nenet"
-
-
-def test_a_mean_says_what_failed():
-    scores = [{"normal_mae": 4.0}, {}, {"normal_mae": 6.0}]
-    found = mean(scores, "normal_mae")
-    assert found.cell(3.5) == "5.00 (3.50) [1 of 3 failed]" and found.plain() == 5.0
-    nothing = mean(scores[1:2], "normal_mae")
-    assert nothing.cell() == "-" and nothing.plain() is None
-
-
-def test_names_beside_lines_do_not_overlap():
-    axes = charts.new_figure(4, 3).add_subplot()
-    axes.set(xlim=(0, 1), ylim=(0, 10))
-    charts.label_ends(axes, [(str(n), 5.0 + 0.01 * n, "k") for n in range(6)] + [("gone", float("nan"), "k")], gap=0.1)
-    places = sorted(text.xyann[1] for text in axes.texts)
-    assert len(places) == 6 and np.diff(places).min() > 0.099
 
 
 # ---- whole runs

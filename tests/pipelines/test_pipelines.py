@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from pipelines.cli import main
-from pipelines.shared import pictures, presets, scenes
+from pipelines.shared import presets, scenes
 from pipelines.shared.flags import split_list
 from render.planning import light_sets
 from render.records.manifest import read_manifest
@@ -360,17 +360,3 @@ def evaluate_combinations(capsys, flags, out):
     )
     line = fails(capsys, "evaluate", "merltest", *flags, "--normals", "sdps-reg")
     assert "no such weights; train them with `sdps train --models" in line
-
-
-# ---- Pictures --------------------------------------------------------------------------------------
-
-
-def test_pictures_of_known_values():
-    normals = np.zeros((2, 2, 3), np.float32)
-    normals[0, 0] = 0, 0, 1
-    mask = np.array([[True, False], [False, False]])
-    picture = pictures.normal_map(normals, mask)
-    assert picture[0, 0].tolist() == [128, 128, 255] and picture[1, 1].tolist() == [255, 255, 255]
-    assert pictures.tone_map(np.array([[[0.0, 1.0, 0.2140]]])).tolist() == [[[0, 255, 127]]]
-    errors = pictures.error_map(np.array([[0.0, np.nan]]))
-    assert errors[0, 0].sum() < 10 and errors[0, 1].tolist() == [255, 255, 255]

@@ -111,7 +111,7 @@ def _read_scene(folder: Path, name: str | None) -> dict[str, Any]:
 @lru_cache(maxsize=1024)
 def _draw_strip(path: Path, scene: SceneSpec, _time: int) -> dict[str, Any]:
     shard = read_shard(path, scene)
-    strip = pictures.fit_height(pictures.preview_strip(shard, lights=3), _SIDE)
+    strip = pictures.scale_to_height(pictures.preview_strip(shard, lights=3), _SIDE)
     inside = shard.images[:, shard.mask]
     mean = float(inside.mean(dtype="float64")) if inside.size else math.nan
     return replace_nonfinite({"picture": pictures.data_uri(strip, quality=82), "radiance": round(mean, 5)})

@@ -62,7 +62,7 @@ class DiligentConfig:
         if self.margin < 0:
             raise InputError(f"margin must be 0 pixels or more, got {self.margin}")
 
-    def definition(self) -> str:
+    def describe(self) -> str:
         """Say in words how images are read."""
         depth = "16 bits" if self.bits == 16 else "8 bits (the high byte of 16-bit files)"
         bear = "bear with all 96 images" if self.bear == 96 else "bear without its first 20 images (76)"
@@ -85,22 +85,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Evaluate, print the tables, and write <out>/diligent/results.json and the report's section."""
     config, chosen = from_flags(DiligentConfig, args), suite.named_methods(args)
-    items = suite.pick(diligent_objects(args.data, config), args.objects)
+    items = suite.pick_objects(diligent_objects(args.data, config), args.objects)
     chosen = chosen or select.every_method(select.runs_folder(args.models), inference_config(args))
     return suite.evaluate(
-        DILIGENT, args, items, chosen, text=definition(items, config), protocol=to_plain(config),
+        DILIGENT, args, items, chosen, text=describe(items, config), protocol=to_plain(config),
         command=f"sdps evaluate diligent {args.data} --bits {args.bits} --bear {args.bear}",
     )  # fmt: skip
 
 
-def definition(items: Sequence[TestObject], config: DiligentConfig) -> str:
+def describe(items: Sequence[TestObject], config: DiligentConfig) -> str:
     """Say what the numbers are of."""
     counts = sorted({len(item.true_directions) for item in items})
     images = " or ".join(str(count) for count in counts)
     own = sum(item.name in OBJECTS for item in items)
     others = f" and {len(items) - own} others" if own < len(items) else ""
     return (
-        f"{own} of DiLiGenT's ten objects{others}, {images} images each; {config.definition()}. Normals: mean angular "
+        f"{own} of DiLiGenT's ten objects{others}, {images} images each; {config.describe()}. Normals: mean angular "
         "error in degrees over mask pixels. Directions: mean angular error in degrees over images. Intensities: truth "
         "divided per channel by the first image's, one least-squares scale, mean relative error. A dash: not in the "
         "folder, not printed, or given to the method."

@@ -65,8 +65,8 @@ def light_stage_objects(root: Path, *, least_z: float = 0.0, gamma: float = 1.0,
 
     Args:
         root: The folder.
-        least_z: Images are used whose unit light direction has z above it.
-        gamma: Exponent by which values of PNG files become linear.
+        least_z: Only images whose unit light direction has z above it are used.
+        gamma: Exponent that makes the values of PNG files linear.
         longest: Greatest side in pixels, 0 for no limit.
 
     Raises:
@@ -86,25 +86,25 @@ def light_stage_objects(root: Path, *, least_z: float = 0.0, gamma: float = 1.0,
         images = find_images(folder, (".exr", ".png"), len(directions), gamma)
         chosen = np.arange(len(directions))
         if len(images.files) == len(directions):  # an array holds the images in front only, and the lights' files too
-            chosen = front(directions, least_z)
-            images = _some(images, chosen)
+            chosen = pick_front(directions, least_z)
+            images = _select(images, chosen)
         matte = next((path for path in sorted(folder.glob("*matte.png"))), folder / "matte.png")
         objects.append(build_object(folder.name, images, read_mask(matte), directions[chosen], intensities[chosen],
                                     longest=longest, files=[matte], settings=(gamma,)))  # fmt: skip
     return objects
 
 
-def _some(images: Images, numbers: np.ndarray) -> Images:
+def _select(images: Images, numbers: np.ndarray) -> Images:
     """Return the images of these numbers, of a file each."""
     files, names = ([whole[number] for number in numbers] for whole in (images.files, images.names))
     return Images(lambda number: images.read(int(numbers[number])), files, names)
 
 
-def front(directions: np.ndarray, least_z: float) -> np.ndarray:
+def pick_front(directions: np.ndarray, least_z: float) -> np.ndarray:
     """Return the numbers of the lights in front of the object: z above `least_z`.
 
     Raises:
-        InputError: none.
+        InputError: there are none.
     """
     chosen = np.flatnonzero(directions[:, 2] > least_z)
     if not len(chosen):
@@ -115,7 +115,7 @@ def front(directions: np.ndarray, least_z: float) -> np.ndarray:
 
 
 def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
-    """Read a mask or matte of any values: what most of the image's border shows is the background.
+    """Read a mask or matte of any values: the value of most of the image's border is the background.
 
     Gourd&Apple's object is 1; the Light Stage's is dark in the original files and bright in converted ones.
 
@@ -127,7 +127,7 @@ def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
     border = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]])
     mask = ~bright if border.mean() > 0.5 else bright
     if not mask.any():
-        raise InputError(f"{path}: tells no object from the background; give the object's mask")
+        raise InputError(f"{path}: shows no object in front of a background; give the object's mask")
     return mask
 
 
@@ -192,10 +192,10 @@ def find_images(folder: Path, suffixes: Sequence[str], count: int, gamma: float 
         folder: The folder.
         suffixes: Of the pictures; the first that there are any of is taken.
         count: Number of lights.
-        gamma: Exponent by which integers become linear; floats are.
+        gamma: Exponent that makes integers linear; floats are linear already.
 
     Raises:
-        InputError: none, or another number than of lights.
+        InputError: there are none, or their number is not that of the lights.
     """
     packed, listed = folder / f"{folder.name}_uncalib.npy", folder / "names.txt"
     if packed.is_file():

@@ -20,61 +20,48 @@ from sdps.methods import select
 from sdps.methods.method import CONSTANT
 from sdps.models.registry import TRUE_LIGHTS
 
-
-def _benchmark(name: str, title: str, known: tuple[str, ...]) -> suite.Benchmark:
-    return suite.Benchmark(
-        name, title, 50, known,
-        (
-            (f"{title}, light directions, degrees", "directions", "direction_mae", 2),
-            (f"{title}, light intensities, relative error", "intensities", "intensity_error", 3),
-        ),
-    )  # fmt: skip
-
-
 BENCHMARKS = {
-    "gourd-apple": _benchmark("gourd-apple", "Gourd&Apple", GOURD_APPLE),
-    "light-stage": _benchmark("light-stage", "Light Stage Data Gallery", LIGHT_STAGE),
-}
+    name: suite.Benchmark(name, title, 50, known, (
+        (f"{title}, light directions, degrees", "directions", "direction_mae", 2),
+        (f"{title}, light intensities, relative error", "intensities", "intensity_error", 3),
+    ))
+    for name, title, known in (("gourd-apple", "Gourd&Apple", GOURD_APPLE),
+                               ("light-stage", "Light Stage Data Gallery", LIGHT_STAGE))
+}  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps eval-lights`, the earlier name of both commands."""
     parser.add_argument("--dataset", required=True, choices=tuple(BENCHMARKS), help="which layout the folder has")
-    _add_common_arguments(parser)
-    _add_gourd_apple_flags(parser)
-    _add_light_stage_flags(parser)
+    _declare(parser, *BENCHMARKS)
 
 
 def add_gourd_apple_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps evaluate gourd-apple`."""
-    _add_common_arguments(parser)
-    _add_gourd_apple_flags(parser)
+    _declare(parser, "gourd-apple")
     parser.set_defaults(dataset="gourd-apple", least_z=0.0, gamma=1.0)
 
 
 def add_light_stage_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps evaluate light-stage`."""
-    _add_common_arguments(parser)
-    _add_light_stage_flags(parser)
+    _declare(parser, "light-stage")
     parser.set_defaults(dataset="light-stage", measured_lights=False)
 
 
-def _add_gourd_apple_flags(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--measured-lights", action="store_true",
-                        help="gourd-apple: compare with the measured lights, not the refined ones")  # fmt: skip
-
-
-def _add_light_stage_flags(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--least-z", type=float, default=0.0, metavar="Z",
-                        help="light-stage: use images whose light direction has z above it (default: 0)")  # fmt: skip
-    parser.add_argument("--gamma", type=float, default=1.0,
-                        help="light-stage: exponent that makes PNG values linear (default: 1, linear)")  # fmt: skip
-
-
-def _add_common_arguments(parser: argparse.ArgumentParser) -> None:
+def _declare(parser: argparse.ArgumentParser, *datasets: str) -> None:
+    """Declare the flags of all benchmarks, and those of these data sets."""
     suite.add_arguments(parser)
-    parser.add_argument("--longest-side", type=int, default=0, metavar="PIXELS",
-                        help="average larger crops down to this, to save memory (default: 0, never)")  # fmt: skip
+    add = parser.add_argument
+    add("--longest-side", type=int, default=0, metavar="PIXELS",
+        help="average larger crops down to this, to save memory (default: 0, never)")  # fmt: skip
+    if "gourd-apple" in datasets:
+        add("--measured-lights", action="store_true",
+            help="gourd-apple: compare with the measured lights, not the refined ones")  # fmt: skip
+    if "light-stage" in datasets:
+        add("--least-z", type=float, default=0.0, metavar="Z",
+            help="light-stage: use images whose light direction has z above it (default: 0)")  # fmt: skip
+        add("--gamma", type=float, default=1.0,
+            help="light-stage: exponent that makes PNG values linear (default: 1, linear)")  # fmt: skip
 
 
 def main(args: argparse.Namespace) -> int:
@@ -85,13 +72,13 @@ def main(args: argparse.Namespace) -> int:
     if given:
         raise InputError(f"--methods: {given.name} is given the lights, so there is nothing to score")
     items, about = read(args)
-    items = suite.pick(items, args.objects)
+    items = suite.pick_objects(items, args.objects)
     if not chosen:  # every method that finds lights, and the paper's pair for its normals
         models = select.runs_folder(args.models)
         pairs = [method for method in select.every_method(models) if method.paper == "B1"]
         chosen = [*select.lighting_rows(models), *pairs, *select.classical_rows(calibrated=False)]
     return suite.evaluate(
-        bench, args, items, chosen, text=definition(bench, items, about, args.longest_side),
+        bench, args, items, chosen, text=describe(bench, items, about, args.longest_side),
         protocol={name: getattr(args, name) for name in ("measured_lights", "least_z", "gamma", "longest_side")},
         command=f"sdps evaluate {args.dataset} {args.data}",
     )  # fmt: skip
@@ -116,7 +103,7 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError(f"--longest-side {args.longest_side}: must be 0 or at least 16 pixels")
 
 
-def definition(bench: suite.Benchmark, items: Sequence[TestObject], about: str, longest: int) -> str:
+def describe(bench: suite.Benchmark, items: Sequence[TestObject], about: str, longest: int) -> str:
     """Say what the numbers are of."""
     images = ", ".join(f"{item.name} {len(item.true_directions)}" for item in items)
     size = f", crops averaged down to {longest} pixels" if longest else ""

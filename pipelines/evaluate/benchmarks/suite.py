@@ -11,8 +11,8 @@ from pipelines.evaluate.evaluation import Evaluation, Found, TestObject
 from pipelines.evaluate.object_pictures import tiles
 from pipelines.evaluate.published import published_rows
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
-from pipelines.evaluate.results import object_table, publish, weights_of
-from pipelines.shared import using
+from pipelines.evaluate.score_tables import object_table, publish, weights_of
+from pipelines.shared import network_flags
 from pipelines.shared.flags import add_out, pick_names, split_list
 from render.shared.config import to_plain
 from sdps.inference.inference_config import InferenceConfig, inference_config
@@ -20,12 +20,6 @@ from sdps.methods import select
 from sdps.methods.method import Method
 from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
-
-
-def _open(item: TestObject) -> Any:
-    """Return an object's images, read whole, so that no method is blamed for a damaged file."""
-    images: Any = item.load()
-    return images.open()
 
 
 def run(
@@ -49,7 +43,8 @@ def run(
     runners = [Runner(method, finder(models), config) for method in chosen]
     evaluation = Evaluation(folder)
     found: Found = {runner.method.name: {} for runner in runners}
-    objects = ((item.name, replace(item, load=partial(_open, item))) for item in items)
+    # read whole, so that no method is blamed for a damaged file
+    objects = ((item.name, replace(item, load=partial(lambda load: load().open(), item.load))) for item in items)
     for name, runner, result in evaluation.run(objects, runners, len(items), "evaluate", shown):
         found[runner.method.name][name] = result
     return found, runners
@@ -105,7 +100,7 @@ def evaluate(
     config, shown, file = inference_config(args), pick_pictured(chosen), args.out / bench.name / "results.json"
     found, runners = run(items, chosen, select.runs_folder(args.models), file.parent / "cache", config, shown)
     section = Section(
-        name=bench.name, title=bench.title, text=text + using.describe(runners, config), order=bench.order,
+        name=bench.name, title=bench.title, text=text + network_flags.describe(runners, config), order=bench.order,
         tables=build_tables(bench, items, found, chosen), command=f"{command} --out {args.out}",
     )  # fmt: skip
     writer = SectionWriter(section)
@@ -122,7 +117,7 @@ def evaluate(
             for name, row in found.items()
         },
     }
-    publish(writer, args.out, file, values, left=(0, 1), said=refusals(found))
+    publish(writer, args.out, file, values, left=(0, 1), footer=list_refusals(found))
     return 0
 
 
@@ -130,7 +125,7 @@ def build_tables(
     bench: Benchmark, items: Sequence[TestObject], found: Found, chosen: Sequence[Method]
 ) -> tuple[Table, ...]:
     """Return a benchmark's tables, ours and published rows; those of lights list each lighting model once."""
-    lights = lighting_only(found, chosen)
+    lights = drop_repeated_lights(found, chosen)
     return tuple(
         object_table(
             caption, found if metric == "normal_mae" else lights, metric, present=[item.name for item in items],
@@ -148,16 +143,16 @@ def _about(item: TestObject) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def refusals(found: Found) -> str:
-    """Say which methods refused which objects, a line each."""
+def list_refusals(found: Found) -> str:
+    """List which methods refused which objects and why, a line each."""
     lines = [
         f"{name} refused {key}: {one.reason}" for name, row in found.items() for key, one in row.items() if one.reason
     ]
     return "".join(f"\n{line}" for line in lines) + ("\n" if lines else "")
 
 
-def lighting_only(found: Found, chosen: Sequence[Method]) -> Found:
-    """Leave out methods whose lights are those of another that tells lights alone."""
+def drop_repeated_lights(found: Found, chosen: Sequence[Method]) -> Found:
+    """Leave out methods whose lights another method, one without normals, has a row for already."""
     alone = {_lights_of(method) for method in chosen if method.lights and not method.normals}
     kept = [method.name for method in chosen if not (method.normals and _lights_of(method) in alone)]
     return {name: found[name] for name in kept}
@@ -175,11 +170,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--models", type=Path, metavar="DIR",
                         help="--out of `sdps train`, whose models are evaluated (default: shipped ones)")  # fmt: skip
     parser.add_argument("--objects", action="append", help="commas or repeat (default: all in the folder)")
-    using.add_arguments(parser)
+    network_flags.add_arguments(parser)
     add_out(parser, Path("out/real"))
 
 
-def pick(items: Sequence[TestObject], names: list[str] | None) -> list[TestObject]:
+def pick_objects(items: Sequence[TestObject], names: list[str] | None) -> list[TestObject]:
     """Return the objects of `--objects`, or all.
 
     Raises:

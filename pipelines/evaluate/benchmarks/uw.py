@@ -17,9 +17,9 @@ from pipelines.evaluate.benchmarks.uw_photos import list_objects, read_lights, r
 from pipelines.evaluate.evaluation import Found, Result, TestObject
 from pipelines.evaluate.object_pictures import ERROR_LIMIT, tiles
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
-from pipelines.evaluate.results import publish
+from pipelines.evaluate.score_tables import cell, mean_of_all, publish
 from pipelines.shared.flags import add_models, add_out, pick_names, split_list
-from pipelines.shared.pictures import contact_sheet, fit_height
+from pipelines.shared.pictures import contact_sheet, scale_to_height
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
 from sdps.classical import registry
@@ -62,24 +62,26 @@ def main(args: argparse.Namespace) -> int:
         raise InputError(f"--reference {args.reference}: finds the lights itself; choose a calibrated method")
     source = resolve_source(args.folder, args.lights)
     lights = read_lights(args.folder, source)
-    items = [with_reference(read_photos(args.folder, name, lights), args.reference) for name in names]
+    items = [add_reference(read_photos(args.folder, name, lights), args.reference) for name in names]
     shown = [method.name for method in methods]
     found, _ = suite.run(items, methods, args.models, out / "cache", InferenceConfig(), shown)
     section = Section(name="photos", title="Photographs of the University of Washington", text=DEFINITION, order=60,
-                      tables=(table(items, found, args.reference),),
+                      tables=(build_table(items, found, args.reference),),
                       command=f"sdps evaluate uw {args.folder} --out {out}")  # fmt: skip
     writer = SectionWriter(section)
     for item in items:
         pictures = tiles(item, found, shown, "reference, lights known")
         writer.strip(item.name, pictures)
         flat = [
-            (text, fit_height(picture, _HEIGHT)) for text, picture, _ in pictures if isinstance(picture, np.ndarray)
+            (text, scale_to_height(picture, _HEIGHT))
+            for text, picture, _ in pictures
+            if isinstance(picture, np.ndarray)
         ]
         with atomic_path(out / f"{item.name}.png") as temporary:
             contact_sheet(flat).save(temporary)
     objects = {
         item.name: {"pixels": int(item.mask.sum()), "images": len(lights),
-                    "methods": {name: figures(item.name, name, found[name][item.name]) for name in shown}}
+                    "methods": {name: describe_result(item.name, name, found[name][item.name]) for name in shown}}
         for item in items
     }  # fmt: skip
     values = {"reference": args.reference, "lights": source, "light_directions": lights.tolist(), "objects": objects}
@@ -87,7 +89,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def with_reference(item: TestObject, method: str) -> TestObject:
+def add_reference(item: TestObject, method: str) -> TestObject:
     """Return an object with the normals that a calibrated method gives it under the measured lights for true ones.
 
     Raises:
@@ -98,25 +100,19 @@ def with_reference(item: TestObject, method: str) -> TestObject:
     return replace(item, digest=f"{item.digest}-{method}", normals=estimate.normals)
 
 
-def table(items: Sequence[TestObject], found: Found, reference: str) -> Table:
+def build_table(items: Sequence[TestObject], found: Found, reference: str) -> Table:
     """Lay out the errors, a method a row and an object a column, the published figures in brackets."""
-    rows = []
+    names, rows = [item.name for item in items], []
     for name, results in found.items():
-        errors = [results[item.name].scores.get("normal_mae", np.nan) for item in items]
-        known = [PUBLISHED.get(name, {}).get(item.name, np.nan) for item in items]
-        pairs = zip([*errors, float(np.mean(errors))], [*known, float(np.mean(known))], strict=True)
-        rows.append((name, *(_cell(error, figure) for error, figure in pairs)))
-    header = ("method", *(item.name for item in items), "mean")
+        errors = {key: one.scores["normal_mae"] for key, one in results.items() if "normal_mae" in one.scores}
+        known = PUBLISHED.get(name, {})
+        cells = [cell(errors.get(key), known.get(key), 2) for key in names]
+        rows.append((name, *cells, cell(mean_of_all(errors, names), mean_of_all(known, names), 2)))
+    header = ("method", *names, "mean")
     return Table(title=f"Normals against {reference} (degrees)", header=header, rows=tuple(rows))
 
 
-def _cell(error: float, published: float) -> str:
-    """Write one figure, with the published one in brackets; a dash where the method failed."""
-    text = "-" if np.isnan(error) else f"{error:.2f}"
-    return text if np.isnan(published) else f"{text} ({published:.2f})"
-
-
-def figures(item: str, method: str, result: Result) -> dict[str, Any]:
+def describe_result(item: str, method: str, result: Result) -> dict[str, Any]:
     """Return what is written down of a method on an object, JSON ready."""
     if result.reason:
         return {"failed": result.reason}

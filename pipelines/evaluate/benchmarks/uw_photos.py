@@ -76,7 +76,7 @@ def read_lights(folder: Path, source: str = "auto") -> np.ndarray:  # (L, 3)
     if resolve_source(folder, source) == "chrome":
         images, mask = _read_set(folder, "chrome")
         whole = Stack(images, mask, crop_box(mask, None))
-        return chrome_lights(whole[0 : len(whole)], mask, where=str(folder / "chrome"))
+        return find_chrome_lights(whole[0 : len(whole)], mask, where=str(folder / "chrome"))
     path = folder / "lights.txt"
     try:
         values = np.array(read_text(path).split(), np.float64)
@@ -106,7 +106,7 @@ def resolve_source(folder: Path, source: str) -> str:
     return "file"
 
 
-def chrome_lights(images: np.ndarray, mask: np.ndarray, where: str = "chrome") -> np.ndarray:  # (L, 3)
+def find_chrome_lights(images: np.ndarray, mask: np.ndarray, where: str = "chrome") -> np.ndarray:  # (L, 3)
     """Return the directions of distant lights from their mirror images on a sphere, seen orthographically.
 
     Args:

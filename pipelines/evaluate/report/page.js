@@ -104,7 +104,7 @@
     return Math.acos(Math.min(1, Math.max(-1, a[0] * b[0] + a[1] * b[1] + a[2] * b[2]))) / RADIANS;
   }
 
-  function tell(strip, truth, event) {
+  function show(strip, truth, event) {
     const { place } = placeIn(event.currentTarget, event), inside = place.every((v) => v >= 0 && v < 1);
     const wanted = inside ? mapOf.get(truth).at(place) : null;
     for (const figure of strip.querySelectorAll("figure[data-kind]")) mark(figure, inside ? place : null);
@@ -148,7 +148,7 @@
     strip.readout.textContent = "Point at a picture: the error there, to half a degree.";
     strip.after(strip.readout);
     for (const figure of strip.querySelectorAll("figure[data-kind]")) {
-      figure.addEventListener("pointermove", (event) => tell(strip, truth, event));
+      figure.addEventListener("pointermove", (event) => show(strip, truth, event));
       figure.addEventListener("pointerleave", () => strip.querySelectorAll("figure[data-kind]").forEach((one) => mark(one, null)));
     }
   }

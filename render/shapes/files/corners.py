@@ -1,22 +1,22 @@
-"""What the readers of mesh files return: triangles, and what the file says of their corners."""
+"""What the readers of mesh files return: triangles, and what the file says about their corners."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from render.shapes.files.polygons import triangles
+from render.shapes.files.polygons import triangulate
 from render.shared.errors import InputError
 
 
 @dataclass(frozen=True)
 class Corners:
-    """Triangles with what the file says of their corners.
+    """Triangles with what the file says about their corners.
 
     Attributes:
         vertices: (V, 3) float64.
         faces: (F, 3) int64.
-        uv: (F, 3, 2) float64, v up; None where a face has none.
-        normals: (F, 3, 3) float64, NaN at corners without; None for a file without.
+        uv: (F, 3, 2) float64, v up; None if any face has none.
+        normals: (F, 3, 3) float64, NaN at corners that have none; None if the file has none.
     """
 
     vertices: np.ndarray
@@ -50,7 +50,7 @@ def of_polygons(
         raise InputError(
             f"a face names vertex {index[bad][0]}, but the file holds 0 to {len(vertices) - 1}; repair the file"
         )
-    places = triangles(vertices[index], counts)
+    places = triangulate(vertices[index], counts)
     return Corners(
         vertices, index[places], None if uv is None else uv[places], None if normals is None else normals[places]
     )

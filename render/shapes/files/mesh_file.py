@@ -15,21 +15,20 @@ import trimesh
 
 from render.shapes.files import gltf_file, obj_file, off_file, ply_file, stl_file
 from render.shapes.files.corners import Corners
-from render.shapes.files.strips import from_strips
 from render.shapes.geometry import creases
-from render.shapes.geometry.mesh import TriangleMesh, vertex_normals, with_area, without_unused
+from render.shapes.geometry.mesh import TriangleMesh, with_area, without_unused
 from render.shapes.geometry.windings import outward
 from render.shared.decoding import decoding, largest_unpacked
 from render.shared.errors import InputError
 
 _GRID_BITS = 20  # positions on the same point of a grid of 2^20 steps over the mesh are one vertex
 _FARTHEST = 10  # extents from the origin, beyond which float32 would coarsen the shape
-_SIZES = (1e-12, 1e12)  # extents that float32 arithmetic bears
+_SIZES = (1e-12, 1e12)  # extents between which float32 arithmetic is exact enough
 _READERS = {"obj": obj_file.read, "off": off_file.read, "ply": ply_file.read}  # the last only where it has to
 _DOUBLE_SIDED = 0.9  # share of triangles with a copy that is wound the other way
 
 
-def load_mesh(path: str | Path, *, smooth: bool = False) -> TriangleMesh:
+def load_mesh(path: str | Path) -> TriangleMesh:
     """Read any mesh or scene file that trimesh reads, as placed in the file.
 
     The parts of a scene are concatenated; see `from_trimesh`. Normals of the file are used where they fit its
@@ -37,7 +36,6 @@ def load_mesh(path: str | Path, *, smooth: bool = False) -> TriangleMesh:
 
     Args:
         path: OBJ, PLY, STL, glTF, GLB, OFF, ..., also compressed by gzip.
-        smooth: Shade it smoothly all over, without creases and without the file's normals.
 
     Raises:
         InputError: missing file, unreadable format, damaged content, no triangles, or non-finite positions.
@@ -47,7 +45,7 @@ def load_mesh(path: str | Path, *, smooth: bool = False) -> TriangleMesh:
         raise InputError(f"{path}: no such mesh file")
     try:
         with decoding(path, "a mesh", "export it again"), _quiet():
-            return _mesh(_read(path, smooth), smooth)
+            return _mesh(_read(path))
     except InputError as error:
         message = str(error)
         if message.startswith(str(path)):
@@ -59,12 +57,12 @@ def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh") -> TriangleMesh:
     """Return the triangles of a mesh as placed, with creases where they meet at more than `creases.CREASE` degrees.
 
     Equal positions are welded, so that texture seams and the facets of STL do not show. Triangles without area and
-    those that stand twice are left out, those wound against their neighbours are turned, and a closed surface is
-    turned outside out. A mesh of which float32 could not hold the shape, very far from the origin for its size or of
-    an extreme size, is moved to the origin or scaled.
+    duplicates are left out, those wound against their neighbours are turned, and a closed surface is turned outside
+    out. A mesh whose shape float32 could not hold, very far from the origin for its size or of an extreme size, is
+    moved to the origin or scaled.
 
     Args:
-        mesh: Stays as it is; of its attributes only vertices, faces and texture coordinates are used.
+        mesh: Is not changed; only its vertices, faces and texture coordinates are used.
         name: What messages call it.
 
     Raises:
@@ -72,14 +70,14 @@ def from_trimesh(mesh: trimesh.Trimesh, name: str = "mesh") -> TriangleMesh:
     """
     faces = np.asarray(mesh.faces, np.int64)
     try:
-        return _mesh(Corners(np.asarray(mesh.vertices, np.float64), faces, _corner_uv(mesh)), False)
+        return _mesh(Corners(np.asarray(mesh.vertices, np.float64), faces, _corner_uv(mesh)))
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what trimesh and numpy say of a file from the console: it is refused in one line, or can be used."""
+    """Silence trimesh and numpy: a file is either used, or refused in one line of ours."""
     log = logging.getLogger("trimesh")
     was = log.level
     log.setLevel(logging.CRITICAL)
@@ -92,7 +90,7 @@ def _quiet() -> Iterator[None]:
 
 
 class _Neighbours(trimesh.resolvers.FilePathResolver):
-    """Finds files next to a mesh also by names that are escaped as in addresses: `my%20mesh.bin`."""
+    """Also finds files next to a mesh whose names are escaped as in addresses: `my%20mesh.bin`."""
 
     def get(self, name: str) -> bytes:
         """Return a file's content."""
@@ -102,8 +100,8 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):
             return super().get(unquote(name))
 
 
-def _read(path: Path, smooth: bool) -> Corners:
-    """Read a mesh file; one that is compressed by gzip, as in `bunny.ply.gz`, is unpacked in memory."""
+def _read(path: Path) -> Corners:
+    """Read a mesh file; one compressed by gzip, such as `bunny.ply.gz`, is unpacked in memory."""
     packed = path.suffix.lower() == ".gz"
     kind = Path(path.stem if packed else path.name).suffix[1:].lower()
     if kind not in trimesh.available_formats():
@@ -120,7 +118,7 @@ def _read(path: Path, smooth: bool) -> Corners:
         gltf_file.check(data, None if packed else path.parent)
     elif kind == "stl":
         data = stl_file.check(data)
-    found = None if smooth or kind not in _READERS else _READERS[kind](data)
+    found = _READERS[kind](data) if kind in _READERS else None
     if found is not None:
         return found
     resolver = None if packed else _Neighbours(str(path))
@@ -134,13 +132,12 @@ def _place(scene: Any) -> Iterator[trimesh.Trimesh]:
         transform, name = scene.graph[node]
         part = scene.geometry[name]
         # trimesh keeps the normals of the file in its cache
-        part = part.copy(include_cache=True) if isinstance(part, trimesh.Trimesh) else from_strips(part)
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
-            yield part.apply_transform(transform)
+            yield part.copy(include_cache=True).apply_transform(transform)
 
 
 def _corners(part: trimesh.Trimesh) -> Corners:
-    """Return the triangles of a part of a file, after a look at them."""
+    """Return the triangles of a part of a file, or refuse them."""
     vertices, faces = np.asarray(part.vertices), np.asarray(part.faces, np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise InputError("vertices and faces must have three columns; repair the file")
@@ -177,7 +174,7 @@ def _join(parts: list[Corners]) -> Corners:
     )
 
 
-def _mesh(found: Corners, smooth: bool) -> TriangleMesh:
+def _mesh(found: Corners) -> TriangleMesh:
     """Weld, clean, wind and shade triangles."""
     if not len(found.faces):
         raise InputError("contains no triangles; export it as a surface mesh")
@@ -185,25 +182,21 @@ def _mesh(found: Corners, smooth: bool) -> TriangleMesh:
     if not np.isfinite(vertices).all():
         count = int((~np.isfinite(vertices)).any(1).sum())
         raise InputError(f"{count} of {len(vertices)} vertices are not finite; repair the file")
-    vertices = vertices if smooth else _within_float32(vertices)
-    merged, faces = _merge(vertices, faces) if smooth else _weld(vertices, faces)
+    merged, faces = _weld(_fit_float32(vertices), faces)
     kept = with_area(merged, faces)
-    if not smooth:
-        kept &= _first_of_copies(faces, kept)
+    kept &= _mark_first_copies(faces, kept)
     if not kept.any():
         raise InputError(f"all of its {len(faces)} triangles are degenerate: they have no area")
     merged, faces = without_unused(merged, faces[kept])
     wound = outward(merged, faces)
     moved = (wound[:, :, None] == faces[:, None, :]).argmax(2)[..., None]  # winding the other way moves corners
     uv = None if found.uv is None else np.take_along_axis(found.uv[kept], moved, axis=1)
-    if smooth:
-        return TriangleMesh(vertices=merged, faces=wound, normals=vertex_normals(merged, wound), uv=uv)
     given = None if found.normals is None else np.take_along_axis(found.normals[kept], moved, axis=1)
     points, split, normals = creases.shade(merged, wound, given)
     return TriangleMesh(vertices=points, faces=split, normals=normals, uv=uv)
 
 
-def _within_float32(vertices: np.ndarray) -> np.ndarray:
+def _fit_float32(vertices: np.ndarray) -> np.ndarray:
     """Move and scale positions (V, 3) float64 so that float32 holds their shape, if it does not as they are."""
     biggest = np.abs(vertices).max()
     if not biggest > 0:
@@ -220,13 +213,6 @@ def _within_float32(vertices: np.ndarray) -> np.ndarray:
     return vertices
 
 
-def _merge(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge positions that agree to 1e-8, as trimesh does."""
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    mesh.merge_vertices()
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
-
-
 def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge positions that agree to a millionth of the extent; the first of them in the file stays."""
     low = vertices.min(axis=0)
@@ -240,7 +226,7 @@ def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return vertices[first[order]], place[which][faces]
 
 
-def _first_of_copies(faces: np.ndarray, among: np.ndarray) -> np.ndarray:  # (F,) bool
+def _mark_first_copies(faces: np.ndarray, among: np.ndarray) -> np.ndarray:  # (F,) bool
     """Mark the triangles that are the first with their corners and winding; in a double-sided mesh, their corners."""
     turned = np.take_along_axis(faces, (faces.argmin(1)[:, None] + np.arange(3)) % 3, axis=1)
     side = turned[:, 1] > turned[:, 2]

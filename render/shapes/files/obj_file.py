@@ -5,7 +5,6 @@ concave polygons beyond their outline. What concerns the surface is read here; m
 """
 
 import re
-import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,8 +12,6 @@ import numpy as np
 from render.shapes.files.corners import Corners, of_polygons
 from render.shared.errors import InputError
 
-_BLOCK = 1 << 16  # faces turned into numbers together
-_MISSING = ("/0/0", "/0", "")  # to be added to a corner with no, one or two slashes
 _CONTINUED = re.compile(r"^([ \t]*(?:v|vn|vt|f|fo)[ \t][^\n]*?)\\[ \t]*\n", re.M)
 
 
@@ -87,75 +84,32 @@ def _absolute(face: str, found: _Statements) -> str:
 def _numbers(keyword: str, rows: list[str], least: int) -> np.ndarray:
     """Return the first three numbers of each row (N, 3), of `vt` two (N, 2); what a row lacks is 0."""
     columns = 2 if keyword == "vt" else 3
-    if not rows:
-        return np.empty((0, columns))
-    if len({len(row.split()) for row in rows}) == 1:
-        values = _parse(rows, np.float64)
-        if values is not None:
-            table = values.reshape(len(rows), -1)[:, :columns]
-            if table.shape[1] >= least:
-                return np.pad(table, ((0, 0), (0, columns - table.shape[1])))
-    table = np.zeros((len(rows), columns))
-    for number, row in enumerate(rows):
+    table = []
+    for row in rows:
         try:
-            numbers = [float(value) for value in row.partition("#")[0].split()[:columns]]
-            if len(numbers) < least:
-                raise ValueError
+            numbers = [float(word) for word in row.partition("#")[0].split()[:columns]]
         except ValueError:
-            raise InputError(f"'{keyword} {row[:60]}': expected {columns} numbers; export it again") from None
-        table[number, : len(numbers)] = numbers
-    return table
+            numbers = []
+        if len(numbers) < least:
+            raise InputError(f"'{keyword} {row[:60]}': expected {columns} numbers; export it again")
+        table.append(numbers + [0.0] * (columns - len(numbers)))
+    return np.array(table, np.float64).reshape(-1, columns)
 
 
 def _corners(rows: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of all corners (N, 3): vertex, texture coordinate, normal, 0 for none; and (P,) corners."""
-    tables, counts = [], []
-    for start in range(0, len(rows), _BLOCK):
-        block = rows[start : start + _BLOCK]
-        table, count = _of_one_form(block) or _of_any_form([row.split() for row in block])
-        tables.append(table)
-        counts.append(count)
-    return np.concatenate(tables), np.concatenate(counts)
-
-
-def _of_one_form(rows: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Read faces whose corners all have no slash or all have two, and stand one blank apart; None for others."""
-    counts = np.array([row.count(" ") + 1 for row in rows])
-    joined, total = " ".join(rows), int(counts.sum())
-    if joined.count("/") not in (0, 2 * total):
-        return None
-    columns = 3 if "/" in joined else 1
-    values = _parse([joined.replace("//", "/0/").replace("/", " ")], np.int64)
-    if values is None or len(values) != columns * total:
-        return None
-    table = values.reshape(-1, columns)
-    return np.pad(table, ((0, 0), (0, 3 - columns))), counts
-
-
-def _of_any_form(faces: list[list[str]]) -> tuple[np.ndarray, np.ndarray]:
-    """Read faces corner by corner."""
-    texts = [corner + _MISSING[min(corner.count("/"), 2)] for face in faces for corner in face]
-    joined = " ".join(texts).replace("//", "/0/") + " "
-    values = _parse([joined.replace("/ ", "/0 ").replace("/", " ")], np.int64)
-    if values is None or len(values) != 3 * len(texts):
-        raise InputError(_describe_malformed(faces))
-    return values.reshape(-1, 3), np.array([len(face) for face in faces])
-
-
-def _describe_malformed(faces: list[list[str]]) -> str:
-    form = re.compile(r"\d+(/\d*(/\d*)?)?")
-    face = next((face for face in faces if not all(form.fullmatch(corner) for corner in face)), [])
-    return f"'f {' '.join(face)[:60]}': expected whole numbers, as in f 1 2 3 or f 1/1/1 2/2/1 3/3/1; export it again"
-
-
-def _parse(rows: list[str], dtype: type) -> np.ndarray | None:
-    """Return all numbers of rows as one array, None when something else is among them."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # numpy warns of what it cannot read, and returns what stands before
-        try:
-            return np.fromstring(" ".join(rows), sep=" ", dtype=dtype)
-        except (ValueError, DeprecationWarning, OverflowError):
-            return None
+    text = " ".join(word for row in rows for word in row.split())
+    text = re.sub(r"/(?=[/ ]|$)", "/0", text)  # every corner becomes v/vt/vn
+    text = re.sub(r"(?<!\S)([0-9]+)(?!\S)", r"\1/0", text)
+    text = re.sub(r"(?<!\S)([0-9]+/[0-9]+)(?!\S)", r"\1/0", text)
+    if re.search(r"(?<!\S)(?![0-9]+/[0-9]+/[0-9]+(?!\S))\S", text):
+        form = re.compile(r"[0-9]+(/[0-9]*(/[0-9]*)?)?")
+        bad = next(row for row in rows if not all(form.fullmatch(corner) for corner in row.split()))
+        raise InputError(
+            f"'f {bad.strip()[:60]}': expected whole numbers, as in f 1 2 3 or f 1/1/1 2/2/1 3/3/1; export it again"
+        )
+    table = np.fromstring(text.replace("/", " "), np.int64, sep=" ").reshape(-1, 3)
+    return table, np.array([len(row.split()) for row in rows])
 
 
 def _look_up(values: np.ndarray, index: np.ndarray) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""Reading OFF, of whose faces trimesh reads only those with one number of corners throughout."""
+"""Reading OFF, whose concave faces trimesh fills beyond their outline."""
 
 import re
 

@@ -7,7 +7,7 @@ from render.shared.errors import InputError
 _MOST = 20_000  # corners of a concave face: the time to cut it grows with their square, to a minute
 
 
-def triangles(points: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def triangulate(points: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Cut polygons into triangles without new vertices.
 
     A convex polygon becomes a fan around its first corner. Where a fan would leave the polygon, ears are cut off.
@@ -40,23 +40,25 @@ def triangles(points: np.ndarray, counts: np.ndarray) -> np.ndarray:
         start, count = first[concave], counts[concave]
         if count > _MOST:
             raise InputError(f"has a face of {count:,} corners that is not convex; export it as triangles")
-        fans[polygon == concave] = start + _ears(np.asarray(points[start : start + count], np.float64), whole[concave])
+        fans[polygon == concave] = start + _cut_ears(
+            np.asarray(points[start : start + count], np.float64), whole[concave]
+        )
     return fans
 
 
-def _ears(points: np.ndarray, normal: np.ndarray) -> np.ndarray:  # (n - 2, 3)
+def _cut_ears(points: np.ndarray, normal: np.ndarray) -> np.ndarray:  # (n - 2, 3)
     """Cut ears off a polygon (n, 3) as seen along its normal, always the one with the widest smallest angle."""
     drop = int(np.abs(normal).argmax())
     keep = [(drop + 1) % 3, (drop + 2) % 3]
     flat = points[:, keep] * (1 if normal[drop] >= 0 else [-1, 1])
     left, found = list(range(len(points))), []
     while len(left) > 3:
-        found.append(_best_ear(flat, left))
+        found.append(_find_ear(flat, left))
         left.remove(found[-1][1])
     return np.array([*found, tuple(left)])
 
 
-def _best_ear(flat: np.ndarray, left: list[int]) -> tuple[int, int, int]:
+def _find_ear(flat: np.ndarray, left: list[int]) -> tuple[int, int, int]:
     """Return the ear of what is left of a flat polygon; without any, as where it crosses itself, its widest corner."""
     ring = flat[left]
     before, after = np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0)

@@ -1,4 +1,4 @@
-"""Binary STL files of which the length does not fit their header."""
+"""Binary STL files whose length does not match their header, which trimesh would take for text."""
 
 import struct
 
@@ -8,7 +8,7 @@ _HEADER, _TRIANGLE = 84, 50  # bytes
 
 
 def check(data: bytes) -> bytes:
-    """Return an STL file, a binary one without what stands behind its triangles.
+    """Return an STL file, a binary one without the bytes after its triangles.
 
     Raises:
         InputError: a binary file that ends before its last triangle.

@@ -159,9 +159,9 @@ def test_strips_show_weights_in_the_place_of_an_image():
 
 def test_pictures_are_fitted_without_blur():
     picture = np.random.default_rng(0).integers(0, 256, (16, 64, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(pictures.fit_height(picture, 32), picture.repeat(2, 0).repeat(2, 1))
-    assert pictures.fit_height(picture, 8).shape == (8, 32, 3)
-    assert pictures.fit_height(picture, 16) is picture
+    np.testing.assert_array_equal(pictures.scale_to_height(picture, 32), picture.repeat(2, 0).repeat(2, 1))
+    assert pictures.scale_to_height(picture, 8).shape == (8, 32, 3)
+    assert pictures.scale_to_height(picture, 16) is picture
 
 
 def test_plots_take_the_ink_of_the_page():

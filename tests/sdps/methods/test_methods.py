@@ -215,8 +215,8 @@ def test_rendered_scenes_are_seen_whole_and_photographs_cut(
     assert seen == [None, 4, None, 15, 4, None]
     with pytest.raises(InputError, match="margin must be at least 0 pixels, auto, or null"):
         replace(preset.test, margin=-1)
-    assert "whole frame" in merltest.definition(preset.test)
-    assert "box with 15 pixels" in merltest.definition(replace(preset.test, margin=15))
+    assert "whole frame" in merltest.describe(preset.test)
+    assert "box with 15 pixels" in merltest.describe(replace(preset.test, margin=15))
 
 
 def test_a_refusal_is_kept_with_its_reason(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -258,17 +258,17 @@ def test_a_preset_says_which_shipped_ways_stand_beside_what_is_trained(kept: Pat
 
 def test_the_page_shows_the_pair_trained_here_and_the_best_shipped_way(runs: Path, kept: Path, tmp_path: Path) -> None:
     least_squares = "least-squares, true lights"
-    assert merltest.shown(rows.normal_methods(runs)) == ["lcnet + nenet", least_squares]
+    assert merltest.pick_pictured(rows.normal_methods(runs)) == ["lcnet + nenet", least_squares]
     for name in ("psfcn", "nenet"):
         write_weights(kept.with_name(f"{name}.safetensors"), name)
     # Rows further down the table build on better networks; least squares on LCNet's lights comes last.
-    assert merltest.shown(rows.normal_methods(tmp_path)) == ["lcnet + psfcn (shipped)", least_squares]
-    both = merltest.shown(rows.normal_methods(runs))
+    assert merltest.pick_pictured(rows.normal_methods(tmp_path)) == ["lcnet + psfcn (shipped)", least_squares]
+    both = merltest.pick_pictured(rows.normal_methods(runs))
     assert both == ["lcnet + nenet", "lcnet + psfcn (shipped)", least_squares]
     write_weights(kept.with_name("lcnet-soft.safetensors"), "lcnet-soft")
-    assert merltest.shown(rows.normal_methods(runs))[1] == "lcnet-soft + psfcn (shipped)"
+    assert merltest.pick_pictured(rows.normal_methods(runs))[1] == "lcnet-soft + psfcn (shipped)"
     given = [Method(name="psfcn, true lights", lights="true", normals="psfcn")]
-    assert merltest.shown(given) == ["psfcn, true lights", least_squares]
+    assert merltest.pick_pictured(given) == ["psfcn, true lights", least_squares]
 
 
 def test_python_uses_networks_as_every_command_does(runs: Path) -> None:

@@ -17,7 +17,7 @@ from pipelines.evaluate.benchmarks.diligent import OBJECTS, DiligentConfig, dili
 from pipelines.evaluate.evaluation import Result
 from pipelines.evaluate.published import published_rows
 from pipelines.evaluate.report.sections import read_sections
-from pipelines.evaluate.results import object_table
+from pipelines.evaluate.score_tables import object_table
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.images import read_image, write_png
@@ -147,7 +147,7 @@ def test_foreign_objects_alone_have_no_published_rows():
     assert table.header == ("method", "source", "cone", "this object") and len(table.rows) == 1
 
 
-def test_a_refusal_is_told():
+def test_a_refusal_is_shown():
     found = {"m": {"ball": Result({}, reason="too few"), "cat": Result({"normal_mae": 2.0})}}
     table = object_table("t", found, "normal_mae", present=["ball", "cat"], known=OBJECTS, digits=2, published=())
     assert table.rows[0][2:4] == ("refused", "2.00") and table.rows[0][-2:] == ("-", "-")
@@ -229,11 +229,11 @@ def test_lights_over_eight_views_have_a_row_of_their_own(models):
     learned = {method.name: method for method in select.select_methods(["learned"], models)}
     views = learned["lcnet-soft (shipped), 8 views"]
     assert (views.normals, views.light_views) == ("", 8)
-    assert list(suite.lighting_only(learned, list(learned.values())))[:2] == ["lcnet", "lcnet (shipped)"]
-    told = suite.lighting_only(learned, list(learned.values()))
-    assert views.name in told and not any("+" in name for name in told)  # whose lights are a network's alone
+    assert list(suite.drop_repeated_lights(learned, list(learned.values())))[:2] == ["lcnet", "lcnet (shipped)"]
+    kept = suite.drop_repeated_lights(learned, list(learned.values()))
+    assert views.name in kept and not any("+" in name for name in kept)  # whose lights are a network's alone
     few = select.select_methods(["shipped:lcnet-soft", "shipped:sdps-plus"], models)
-    assert len(suite.lighting_only({method.name: method for method in few}, few)) == 2  # one view, eight views
+    assert len(suite.drop_repeated_lights({method.name: method for method in few}, few)) == 2  # one view, eight views
 
 
 @pytest.mark.skipif(not DATA, reason="SDPS_SHARED_DATA names no folder with diligent_ball.zip")

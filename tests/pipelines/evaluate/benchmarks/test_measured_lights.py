@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.evaluate.benchmarks import stacks
-from pipelines.evaluate.benchmarks.lit_photographs import front, gourd_apple_objects, light_stage_objects
+from pipelines.evaluate.benchmarks.lit_photographs import gourd_apple_objects, light_stage_objects, pick_front
 from pipelines.evaluate.published import published_rows
 from render.shared.errors import InputError
 from render.shared.images import write_png
@@ -98,14 +98,14 @@ def test_packed_light_stage_takes_every_image(stage):
     assert len(item.load()) == 2 and np.allclose(item.light_directions[1], directions[1] / 0.99624, atol=1e-4)
 
 
-def test_another_number_of_front_lights_than_the_papers_is_told(caplog):
+def test_another_number_of_front_lights_than_the_papers_is_logged(caplog):
     directions = np.tile([0.0, 0.0, 1.0], (253, 1))
     directions[:120, 2] = -1.0
     with caplog.at_level(logging.WARNING):
-        assert len(front(directions, 0.0)) == 133
+        assert len(pick_front(directions, 0.0)) == 133
         assert not caplog.records
         directions[120, 2] = -1.0
-        front(directions, 0.0)
+        pick_front(directions, 0.0)
     assert "132 of the 253 lights" in caplog.text
 
 

@@ -87,7 +87,7 @@ def test_stars_seen_from_any_side_are_cut_into_triangles_of_their_area(points):
     radius = np.where(np.arange(2 * points) % 2, 0.3, 1.0)
     turn = np.linalg.qr(np.random.default_rng(points).normal(size=(3, 3)))[0]
     star = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], 1) @ turn
-    corners = star[polygons.triangles(star, np.array([2 * points]))]
+    corners = star[polygons.triangulate(star, np.array([2 * points]))]
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert len(crosses) == 2 * points - 2
     assert np.linalg.norm(crosses, axis=1).sum() == pytest.approx(np.linalg.norm(crosses.sum(0)), rel=1e-9)
@@ -391,5 +391,24 @@ def test_ply_with_colours_lists_and_other_elements(tmp_path):
     (tmp_path / "a.ply.gz").write_bytes(gzip.compress((tmp_path / "a.ply").read_bytes()))
     np.testing.assert_array_equal(load_mesh(tmp_path / "a.ply.gz").vertices, mesh.vertices)
     (tmp_path / "a.ply").write_bytes(header.encode() + body[:-40])
+    with pytest.raises(InputError, match="is cut short"):
+        load_mesh(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("order", ["", "<", ">"])
+def test_ply_strips_of_any_byte_order(tmp_path, order):
+    """A square and a triangle: strips of one list are separated by -1, and the last may end without."""
+    points, strips = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [5, 0, 0]], [0, 1, 2, 3, -1, 1, 4, 3]
+    form = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    header = f"ply\nformat {form} 1.0\nelement vertex 5\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    rows = [*points, [len(strips), *strips]]
+    body = "\n".join(" ".join(map(str, row)) for row in rows).encode()
+    if order:
+        body = np.array(points, f"{order}f4").tobytes() + np.array(rows[-1], f"{order}i4").tobytes()
+    (tmp_path / "a.ply").write_bytes(header.encode() + body)
+    mesh = load_mesh(tmp_path / "a.ply")
+    assert len(mesh.faces) == 3 and measures(mesh)[0] == pytest.approx(3)
+    (tmp_path / "a.ply").write_bytes(header.encode() + body[:-2])
     with pytest.raises(InputError, match="is cut short"):
         load_mesh(tmp_path / "a.ply")

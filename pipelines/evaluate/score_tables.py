@@ -1,4 +1,4 @@
-"""What evaluations do with scores: means over objects, tables, results.json and a section of the report."""
+"""The one writer of tables: cells, means over objects, our rows above published ones, results.json and the report."""
 
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -19,6 +19,12 @@ from sdps.methods.runner import Runner
 OURS, REFUSED = "ours", "refused"
 
 
+def cell(value: float | str | None, published: float | None = None, digits: int | None = None) -> str:
+    """Write a figure, a dash where there is none, or what stands in its place, with the published one in brackets."""
+    text = value if isinstance(value, str) else number(value, digits)
+    return text if published is None else f"{text} ({number(published, digits)})"
+
+
 @dataclass(frozen=True)
 class Mean:
     """A mean over objects.
@@ -34,14 +40,13 @@ class Mean:
     count: int
 
     def cell(self, published: float | None = None) -> str:
-        """Write it with the published figure in brackets, and what failed."""
-        text = number(self.value) if np.isfinite(self.value) else "-"
-        text += f" ({number(published)})" if published is not None else ""
-        return text + (f" [{self.failed} of {self.count} failed]" if self.failed and self.failed < self.count else "")
+        """Write it with the published figure in brackets, and how many objects failed."""
+        some = 0 < self.failed < self.count
+        return cell(self.value, published) + (f" [{self.failed} of {self.count} failed]" if some else "")
 
     def plain(self) -> float | None:
         """Return the value, None where there is none, for JSON."""
-        return float(self.value) if np.isfinite(self.value) else None
+        return None if np.isnan(self.value) else self.value
 
 
 def mean(scores: Iterable[Mapping[str, float]], metric: str) -> Mean:
@@ -94,23 +99,19 @@ def object_table(
     entries += [(one.method, one.source, one.figures, one.average, ()) for one in published] if official else []
     rows = []
     for name, source, figures, printed, refused in entries:
-        cells = [REFUSED if column in refused else _figure(figures.get(column), digits) for column in columns]
-        means = [_mean(figures, present)]
-        means += [_mean(figures, known) if printed is None else printed] if official else []
-        rows.append((name, source, *cells, *(_figure(mean, digits) for mean in means)))
+        cells = [REFUSED if column in refused else number(figures.get(column), digits) for column in columns]
+        means = [mean_of_all(figures, present)]
+        means += [mean_of_all(figures, known) if printed is None else printed] if official else []
+        rows.append((name, source, *cells, *(number(mean, digits) for mean in means)))
     last = [f"mean of {len(present)}" if len(present) > 1 else "this object"]
     last += [f"all {len(known)}"] if official else []
     header, theirs = ("method", "source", *columns, *last), tuple(range(ours, len(rows)))
     return Table(title=title, header=header, rows=tuple(rows), published=theirs, note=note)
 
 
-def _mean(figures: Mapping[str, float], names: Sequence[str]) -> float | None:
+def mean_of_all(figures: Mapping[str, float], names: Sequence[str]) -> float | None:
     """Return the mean over objects, None where one has no figure."""
     return float(np.mean([figures[name] for name in names])) if all(name in figures for name in names) else None
-
-
-def _figure(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def weights_of(runners: Iterable[Runner]) -> dict[str, str]:
@@ -119,7 +120,7 @@ def weights_of(runners: Iterable[Runner]) -> dict[str, str]:
 
 
 def publish(writer: SectionWriter, out: Path, file: Path, values: dict[str, Any], left: Collection[int] = (0,),
-            said: str = "") -> None:  # fmt: skip
+            footer: str = "") -> None:  # fmt: skip
     """Write a section of the report and results.json, and print the tables with what their numbers are.
 
     Args:
@@ -128,10 +129,10 @@ def publish(writer: SectionWriter, out: Path, file: Path, values: dict[str, Any]
         file: Gets the definition, the values and the tables as JSON.
         values: What else belongs to the results.
         left: Columns that are set flush left in the terminal.
-        said: What is printed after the tables.
+        footer: What is printed after the tables.
     """
     section = writer.section
     tables = {table.title: to_plain(table) for table in section.tables}
     write_json(file, {"definition": section.text, **values, "tables": tables})
     writer.write(out)
-    sys.stdout.write(f"{tables_text(section.tables, left)}{said}\n{section.text}\n{file}\n")
+    sys.stdout.write(f"{tables_text(section.tables, left)}{footer}\n{section.text}\n{file}\n")
