@@ -75,7 +75,7 @@ def make(bench: Workbench) -> Panel:
         LeftOut: no method that is given the lights.
         InputError: scenes that cannot be rendered or read.
     """
-    runners = [runner for runner in bench.runners if runner.method.lights == TRUE_LIGHTS]
+    runners = [runner for runner in bench.runners if runner.method.lighting == TRUE_LIGHTS]
     if not runners:
         raise LeftOut("bins needs a method that is given the lights; add psfcn or least-squares to --methods")
     wanted, folder = bench.merltest()

@@ -172,9 +172,9 @@ def test_methods_are_read_and_told_apart(tmp_path):
     found = {m.name: m for m in eval_figures.wanted_methods(["least-squares", "pf14", "pf14"], tmp_path)}
     assert set(found) == {"least-squares, true lights", "pf14"}
     least, maxima = found["least-squares, true lights"], found["pf14"]
-    assert least.lights == "true" and not sweep.finds(least, "direction_mae")
+    assert least.lighting == "true" and not sweep.finds(least, "direction_mae")
     assert sweep.finds(maxima, "intensity_error") and sweep.paper_row(maxima) == "PF14"
-    pair = Method(name="x", lights="shipped:lcnet", normals="shipped:nenet")
+    pair = Method(name="x", lighting="shipped:lcnet", normals="shipped:nenet")
     assert sweep.paper_row(pair) == "B1" and sweep.finds(pair, "direction_mae")
     assert sweep.paper_row(replace(pair, intensities="true")) == ""
     assert not sweep.finds(replace(pair, intensities="true"), "intensity_error")
@@ -182,7 +182,7 @@ def test_methods_are_read_and_told_apart(tmp_path):
     assert sweep.paper_row(blind) == "B9" and not sweep.finds(blind, "direction_mae")
     assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "bunny") == 6.9
     assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "sphere") is None
-    with pytest.raises(InputError, match="want METHOD, LIGHTS"):
+    with pytest.raises(InputError, match="want METHOD or LIGHTS"):
         eval_figures.wanted_methods(["a+b+c+d"], tmp_path)
     with pytest.raises(InputError, match="unknown"):
         eval_figures.wanted_methods(["pf-14"], tmp_path)

@@ -158,13 +158,13 @@ def refusals(found: Found) -> str:
 
 def lighting_only(found: Found, chosen: Sequence[Method]) -> Found:
     """Leave out methods whose lights are those of another that tells lights alone."""
-    alone = {_lights_of(method) for method in chosen if method.lights and not method.normals}
+    alone = {_lights_of(method) for method in chosen if method.lighting and not method.normals}
     kept = [method.name for method in chosen if not (method.normals and _lights_of(method) in alone)]
     return {name: found[name] for name in kept}
 
 
 def _lights_of(method: Method) -> tuple[str, str | None, int | None]:
-    return method.lights, method.read_out, method.light_views
+    return method.lighting, method.read_out, method.light_views
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -192,5 +192,5 @@ def pick(items: Sequence[TestObject], names: list[str] | None) -> list[TestObjec
 def pick_pictured(chosen: Sequence[Method]) -> list[str]:
     """Return the names of the methods to show, and of the first lighting model."""
     names = select.list_shown(list(chosen))
-    lights = [method.name for method in chosen if method.lights and not method.normals][:1]
+    lights = [method.name for method in chosen if method.lighting and not method.normals][:1]
     return names or lights
