@@ -276,7 +276,7 @@ def _adapt(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> 
     directions, intensities = known
     if not directions:
         method = parse(text, find)
-        if TRUE_LIGHTS in (method.lights, method.intensities):
+        if TRUE_LIGHTS in (method.lighting, method.intensities):
             raise InputError(
                 f"--method {text} needs the lights; give them with --lights, or put a lighting model before it, "
                 f"as in lcnet+{text}"
@@ -288,7 +288,7 @@ def _adapt(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> 
         _log.warning("%s finds the lights itself; those given are not used", text)
         return parse(text, find)
     method = parse(text if "+" in text else f"{TRUE_LIGHTS}+{text}", find)
-    if method.lights != TRUE_LIGHTS:
+    if method.lighting != TRUE_LIGHTS:
         _log.warning("%s finds the lights itself; those given are not used", text)
     return replace(method, name=method.name.replace("true lights", "given lights"))
 

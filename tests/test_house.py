@@ -113,6 +113,16 @@ def test_no_circles():
         pytest.fail(" -> ".join(error.args[1]))
 
 
+COVERED = {"lab.shared", "render.exchange.layouts", "render.shapes.sculpture", "sdps.classical.common"}
+"""Folders whose code is tested with that of the folder above, or with what uses it."""
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_tests_lie_where_the_code_lies(folder):
+    place = ROOT.joinpath("tests", *folder.split("."))
+    assert any(place.rglob("test_*.py")) != (folder in COVERED), folder
+
+
 def test_no_folder_is_crowded():
     for folder in {path.parent for path in MODULES.values()}:
         entries = {path.name for path in folder.iterdir() if not path.name.startswith("__")} - {"py.typed"}

@@ -9,6 +9,7 @@ from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
+from pipelines.shared.pictures import spread_evenly
 from pipelines.shared.text_tables import number
 
 SCENES = 3  # per shape

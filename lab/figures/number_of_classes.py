@@ -69,7 +69,7 @@ def centre_floor(directions: np.ndarray, count: int) -> float:
 
 def make(bench: Workbench) -> Panel:
     """Evaluate and draw."""
-    runners = choose_runners(bench, lambda method: method.lights == TRUE_LIGHTS,
+    runners = choose_runners(bench, lambda method: method.lighting == TRUE_LIGHTS,
                              "bins", "a method that is given the lights; add psfcn or least-squares")  # fmt: skip
     wanted, folder = bench.merltest()
 

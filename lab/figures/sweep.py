@@ -100,7 +100,7 @@ def list_shapes(scenes: Iterable[SceneSpec]) -> tuple[str, ...]:
 
 def paper_row(method: Method) -> str:
     """Return the row of the paper's table that a method is, `PF14` for that method, or an empty string."""
-    if (method.lights, method.normals, method.intensities) == ("", "pf14", ""):
+    if (method.lighting, method.normals, method.intensities) == ("", "pf14", ""):
         return "PF14"
     return rows.paper_row(method)
 
@@ -123,5 +123,5 @@ def finds(method: Method, metric: str) -> bool:
         return bool(method.normals)
     if metric == "intensity_error" and method.intensities:
         return False
-    learned = bool(method.lights) and method.lights != TRUE_LIGHTS
-    return learned or (not method.lights and not method.models())
+    learned = bool(method.lighting) and method.lighting != TRUE_LIGHTS
+    return learned or (not method.lighting and not method.models())

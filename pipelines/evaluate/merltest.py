@@ -106,7 +106,7 @@ def table_rows(args: argparse.Namespace, out: Path, preset: Preset) -> tuple[lis
     constant = Method(name="constant predictor", normals=CONSTANT)
     if any((args.lighting, args.normals, args.intensities)):
         method = rows.from_flags(out, args.lighting, args.normals, args.intensities)
-        reference = Method(name="least-squares, true lights", lights="true", normals="least-squares")
+        reference = Method(name="least-squares, true lights", lighting="true", normals="least-squares")
         return [], [method, *([reference] if method.name != reference.name else []), constant]
     normals = rows.normal_methods(out, preset.test.shipped, preset.test)
     lighting = rows.lighting_methods(out, _own_lighting(preset), preset.test, normals, preset.test.shipped)
@@ -130,7 +130,7 @@ def pick_pictured(normals: Sequence[Method]) -> list[str]:
     The paper's pair if it was trained here, the last of the shipped ways that find the lights (the rows have the best
     last), and least squares; where there is neither, the first method.
     """
-    finders = [method for method in normals if method.lights != TRUE_LIGHTS and method.normals in method.models()]
+    finders = [method for method in normals if method.lighting != TRUE_LIGHTS and method.normals in method.models()]
     shipped = [method for method in finders if all(name.startswith(SHIPPED) for name in method.models())]
     pairs = [method for method in finders if method.paper == "B1" and method not in shipped]
     chosen = [*pairs[:1], *shipped[-1:]] or normals[:1]

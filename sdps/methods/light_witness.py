@@ -41,7 +41,7 @@ def see_lights(
             find(pair.lighting)
         except InputError:
             continue
-        method = Method(name=pair.lighting, lights=pair.lighting, light_views=pair.light_views)
+        method = Method(name=pair.lighting, lighting=pair.lighting, light_views=pair.light_views)
         return Runner(method, find, config).estimate(images, mask, None, None)
     return None
 

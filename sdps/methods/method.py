@@ -24,7 +24,7 @@ class Method:
 
     Attributes:
         name: Label of its row.
-        lights: A lighting model (run or file), `true` for lights that are given, or empty for none.
+        lighting: A lighting model (run or file), `true` for lights that are given, or empty for none.
         normals: A normal model, a classical method, or empty for lighting alone.
         intensities: `true` where only the intensities are given, else empty.
         read_out: How light classes become lights; None for the configuration's.
@@ -36,7 +36,7 @@ class Method:
     """
 
     name: str
-    lights: str = NONE
+    lighting: str = NONE
     normals: str = NONE
     intensities: str = NONE
     read_out: ReadOut | None = None
@@ -47,29 +47,29 @@ class Method:
 
     def models(self) -> set[str]:
         """Return the runs whose weights it needs."""
-        return {self.lights, self.normals} - {NONE, TRUE_LIGHTS, *CLASSICAL}
+        return {self.lighting, self.normals} - {NONE, TRUE_LIGHTS, *CLASSICAL}
 
 
-def label(lights: str, normals: str, *, combination: str = NONE) -> str:
+def label(lighting: str, normals: str, *, combination: str = NONE) -> str:
     """Name what parts make together, by the combination's name and its parts where it has one."""
-    suffix = " (shipped)" if any(part.startswith(pretrained.SHIPPED) for part in (lights, normals)) else ""
-    lights, normals = (part.removeprefix(pretrained.SHIPPED) for part in (lights, normals))
-    if lights == TRUE_LIGHTS:
+    suffix = " (shipped)" if any(part.startswith(pretrained.SHIPPED) for part in (lighting, normals)) else ""
+    lighting, normals = (part.removeprefix(pretrained.SHIPPED) for part in (lighting, normals))
+    if lighting == TRUE_LIGHTS:
         text = f"{normals}, true lights"
     else:
-        text = " + ".join(part for part in (lights, normals) if part)
+        text = " + ".join(part for part in (lighting, normals) if part)
     return (f"{combination} ({text})" if combination else text) + suffix
 
 
-def join(lights: str, normals: str, *, paper: str = "", intensities: str = NONE, combination: str = NONE) -> Method:
+def join(lighting: str, normals: str, *, paper: str = "", intensities: str = NONE, combination: str = NONE) -> Method:
     """Return the method of parts that go together, with its label; asked for as a combination, with its views."""
     pair = COMBINATIONS[combination] if combination else None
     views: dict[str, Any] = {field: getattr(pair, field, None) for field in VIEWS}
     named = combination if any(views.values()) else NONE  # others are their parts, and called so
-    name = label(stem(lights), stem(normals), combination=named)
+    name = label(stem(lighting), stem(normals), combination=named)
     return Method(
         name=name + (", true intensities" if intensities else ""),
-        lights=lights,
+        lighting=lighting,
         normals=normals,
         intensities=intensities,
         paper=paper,

@@ -11,11 +11,11 @@ from sdps.methods.method import CLASSICAL, CONSTANT, NONE, REFINE, Method, join,
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
 
-def combine(lights: str | None, normals: str | None, intensities: str | None, find: Callable[[str], Path]) -> Method:
+def combine(lighting: str | None, normals: str | None, intensities: str | None, find: Callable[[str], Path]) -> Method:
     """Return the method that a user's choice describes.
 
     Args:
-        lights: A run or weights file, or `true`.
+        lighting: A run or weights file, or `true`.
         normals: A run, a weights file, a combination such as `sdps`, or a classical method.
         intensities: `true` where only these are given.
         find: Gives the weights file of a name, or raises InputError.
@@ -28,14 +28,14 @@ def combine(lights: str | None, normals: str | None, intensities: str | None, fi
     combination = name if name in COMBINATIONS else NONE
     if combination:
         pair = COMBINATIONS[combination]
-        lights = lights or prefix + pair.lighting
+        lighting = lighting or prefix + pair.lighting
         normals = prefix + pair.normals
     if normals is None:
-        raise InputError("--lights and --intensities need --normals as well; see `sdps list models`")
-    lights = lights or _default_lights(normals, find)
+        raise InputError("--lighting and --intensities need --normals as well; see `sdps list models`")
+    lighting = lighting or _default_lighting(normals, find)
     if normals in CLASSICAL:
-        _check_classical(normals, lights, intensities)
-    method = join(lights, normals, intensities=intensities or NONE, combination=combination)
+        _check_classical(normals, lighting, intensities)
+    method = join(lighting, normals, intensities=intensities or NONE, combination=combination)
     for needed in sorted(method.models()):
         find(needed)
     return method
@@ -74,7 +74,7 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
         raise InputError(f"method {name}: say which normals, as in true+psfcn")
     if MODELS[model_of(name, find)].role == "lighting":
         find(name)
-        return Method(name=label(stem(name), NONE), lights=name)
+        return Method(name=label(stem(name), NONE), lighting=name)
     return combine(None, name, None, find)
 
 
@@ -91,7 +91,7 @@ def with_refinement(method: Method) -> Method:
 
 def uses_networks(method: Method) -> bool:
     """Return whether a network finds the normals, under lights that a network finds or that are given."""
-    return method.lights != NONE and method.normals not in (NONE, *CLASSICAL)
+    return method.lighting != NONE and method.normals not in (NONE, *CLASSICAL)
 
 
 def model_of(name: str, find: Callable[[str], Path]) -> str:
@@ -106,19 +106,19 @@ def model_of(name: str, find: Callable[[str], Path]) -> str:
     return plain if plain in MODELS else load_weights(find(name)).name
 
 
-def _default_lights(normals: str, find: Callable[[str], Path]) -> str:
+def _default_lighting(normals: str, find: Callable[[str], Path]) -> str:
     """Return the lights a normal model was trained on; none for methods that are not given any."""
     if normals in CLASSICAL:
         return NONE
-    lights = MODELS[model_of(normals, find)].lights
-    shipped = normals.startswith(pretrained.SHIPPED) and lights not in (NONE, TRUE_LIGHTS)
-    return pretrained.SHIPPED + lights if shipped else lights
+    lighting = MODELS[model_of(normals, find)].lights
+    shipped = normals.startswith(pretrained.SHIPPED) and lighting not in (NONE, TRUE_LIGHTS)
+    return pretrained.SHIPPED + lighting if shipped else lighting
 
 
-def _check_classical(normals: str, lights: str, intensities: str | None) -> None:
+def _check_classical(normals: str, lighting: str, intensities: str | None) -> None:
     """Refuse what a classical method would not look at, and a calibrated one without lights."""
     calibrated = normals in classical.METHODS and classical.METHODS[normals].calibrated
-    if calibrated and not lights:
-        raise InputError(f"{normals} needs lights; give --lights, `true` or a lighting model")
-    if not calibrated and (lights or intensities):
-        raise InputError(f"{normals} finds the lights itself; leave out --lights and --intensities")
+    if calibrated and not lighting:
+        raise InputError(f"{normals} needs lights: `true` or a lighting model, as in true+{normals}")
+    if not calibrated and (lighting or intensities):
+        raise InputError(f"{normals} finds the lights itself; leave out the lighting model and the intensities")

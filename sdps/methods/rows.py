@@ -53,14 +53,16 @@ def lighting_methods(
     names = [name for name, item in MODELS.items() if item.role == "lighting"]
     names += [name for name in own if name not in names]
     trained = [name for name in names if pretrained.trained_file(out, name).is_file()]
-    methods = [Method(name=name, lights=name, paper=MODELS[name].paper if name in MODELS else "") for name in trained]
+    methods = [Method(name=name, lighting=name, paper=MODELS[name].paper if name in MODELS else "") for name in trained]
     if "lcnet" in trained:
         read_outs: tuple[ReadOut, ...] = ("centre", "expectation", "peak")
         others = (how for how in read_outs if how != config.read_out)
-        methods += [Method(name=f"lcnet, {how}", lights="lcnet", read_out=how) for how in others]
-    available, wanted = pretrained.list_shipped(), {way.lights for way in ways}
+        methods += [Method(name=f"lcnet, {how}", lighting="lcnet", read_out=how) for how in others]
+    available, wanted = pretrained.list_shipped(), {way.lighting for way in ways}
     kept = [
-        Method(name=label(pretrained.SHIPPED + name, NONE), lights=pretrained.SHIPPED + name, paper=MODELS[name].paper)
+        Method(
+            name=label(pretrained.SHIPPED + name, NONE), lighting=pretrained.SHIPPED + name, paper=MODELS[name].paper
+        )
         for name in names
         if name in available and (shipped == ALL or pretrained.SHIPPED + name in wanted)
     ]
@@ -70,11 +72,11 @@ def lighting_methods(
 
 def with_views(rows: Sequence[Method], ways: Sequence[Method]) -> list[Method]:
     """Return rows of lights, and after them those that one of `ways` averages over turned views, averaged so."""
-    counts = {way.lights: way.light_views for way in ways if way.light_views}
+    counts = {way.lighting: way.light_views for way in ways if way.light_views}
     averaged = [
         replace(row, name=f"{row.name}, {count} views", light_views=count, paper="")
         for row in rows
-        if (count := counts.get(row.lights))
+        if (count := counts.get(row.lighting))
     ]
     return [*rows, *averaged]
 
@@ -104,7 +106,7 @@ def normal_methods(out: Path, shipped: tuple[str, ...] = ALL, config: InferenceC
 
 def _every_row() -> list[Method]:
     """Return the tables' rows, and after them the combinations that average over views."""
-    rows = [join(lights, normals, paper=paper) for lights, normals, paper in NORMAL_ROWS]
+    rows = [join(lighting, normals, paper=paper) for lighting, normals, paper in NORMAL_ROWS]
     for name, pair in COMBINATIONS.items():
         if pair.light_views or pair.normal_views:
             rows.append(join(pair.lighting, pair.normals, combination=name))
@@ -113,14 +115,14 @@ def _every_row() -> list[Method]:
 
 def as_shipped(method: Method) -> Method:
     """Return the same way with the weights that travel with the package, where it needs any."""
-    parts = {part: getattr(method, part) for part in ("lights", "normals")}
+    parts = {part: getattr(method, part) for part in ("lighting", "normals")}
     placed = {part: pretrained.SHIPPED + name for part, name in parts.items() if name in method.models()}
     return replace(method, name=f"{method.name} (shipped)", **placed) if placed else method
 
 
-def from_flags(out: Path, lights: str | None, normals: str | None, intensities: str | None) -> Method:
+def from_flags(out: Path, lighting: str | None, normals: str | None, intensities: str | None) -> Method:
     """Return the method that flags describe, with its row in the paper's table; see `sdps.methods.parse.combine`."""
-    return _with_row(combine(lights, normals, intensities, finder(out)))
+    return _with_row(combine(lighting, normals, intensities, finder(out)))
 
 
 def _with_row(method: Method) -> Method:
@@ -131,5 +133,5 @@ def paper_row(method: Method) -> str:
     """Return the row of the paper's table of normals that a combination is, or an empty string."""
     if method.intensities or method.refined:
         return ""
-    parts = tuple(part.removeprefix(pretrained.SHIPPED) for part in (method.lights, method.normals))
+    parts = tuple(part.removeprefix(pretrained.SHIPPED) for part in (method.lighting, method.normals))
     return next((row[2] for row in NORMAL_ROWS if row[:2] == parts), "")

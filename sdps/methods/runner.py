@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sdps.models.checkpoint import TrainedModel
 
 _digest = cache(file_hash)
-_PLACES = ("lights", "normals")
+_PLACES = ("lighting", "normals")
 Found = dict[tuple[Hashable, ...], Estimate]
 """Estimated lights by what they depend on."""
 
@@ -97,9 +97,9 @@ class Runner:
         """
         method = self.method
         given: dict[str, Any] = {}
-        if method.lights == TRUE_LIGHTS:
+        if method.lighting == TRUE_LIGHTS:
             given["lights"] = lights
-        if TRUE_LIGHTS in (method.lights, method.intensities) and intensities is not None:
+        if TRUE_LIGHTS in (method.lighting, method.intensities) and intensities is not None:
             given["intensities"] = intensities
         estimate = self._estimate(images, mask, given, found)
         return self._refine(images, mask, estimate, given, saturation) if method.refined else estimate
@@ -113,7 +113,7 @@ class Runner:
             return self._classical(images, mask, given, found)
         if not method.normals:
             return self._lights(images, mask, given, found)
-        if found is not None and method.lights not in (NONE, TRUE_LIGHTS):
+        if found is not None and method.lighting not in (NONE, TRUE_LIGHTS):
             given["found"] = self._lights(images, mask, given, found)
         assert self.estimator is not None  # the method has a normal model
         return self.estimator.estimate(images, mask, **given)
@@ -122,7 +122,7 @@ class Runner:
         """Estimate the lights, or take what another method with the same lighting networks found."""
         found = {} if found is None else found
         options = self.config.options() | {"normal_views": None, "rotations": None}
-        key = (_digest(self.files[self.method.lights]), *options.items(), "intensities" in given)
+        key = (_digest(self.files[self.method.lighting]), *options.items(), "intensities" in given)
         if key not in found:
             assert self.estimator is not None  # the method has a lighting model
             found[key] = self.estimator.estimate_lights(images, mask, given.get("intensities"))
@@ -133,7 +133,7 @@ class Runner:
         name = self.method.normals
         arguments: tuple[Any, ...] = ()
         if classical.METHODS[name].calibrated:
-            if self.method.lights == TRUE_LIGHTS:
+            if self.method.lighting == TRUE_LIGHTS:
                 arguments = given["lights"], given.get("intensities")
             else:
                 lit = self._lights(images, mask, given, found)
@@ -176,9 +176,9 @@ class Runner:
         method, truth = self.method, {}
         if estimate.normals.size and normals is not None:
             truth["normals"] = normals
-        if method.lights != TRUE_LIGHTS and len(estimate.light_directions) and lights is not None:
+        if method.lighting != TRUE_LIGHTS and len(estimate.light_directions) and lights is not None:
             truth["light_directions"] = lights
-        found = len(estimate.intensities) and TRUE_LIGHTS not in (method.lights, method.intensities)
+        found = len(estimate.intensities) and TRUE_LIGHTS not in (method.lighting, method.intensities)
         if found and intensities is not None:
             truth["intensities"] = intensities
         return {item.name: item.value for item in score(estimate, mask, **truth)}

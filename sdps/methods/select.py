@@ -65,7 +65,9 @@ def list_shown(chosen: list[Method]) -> list[str]:
     if len(giving) <= _MOST_SHOWN:
         return [method.name for method in giving]
     pair = COMBINATIONS["sdps"].members()
-    main = [m.name for m in giving if tuple(n.removeprefix(pretrained.SHIPPED) for n in (m.lights, m.normals)) == pair]
+    main = [
+        m.name for m in giving if tuple(n.removeprefix(pretrained.SHIPPED) for n in (m.lighting, m.normals)) == pair
+    ]
     plus = [method.name for method in giving if method.normal_views]
     classic = [method.name for method in giving if method.name in SHOWN]
     return [*main[-1:], *plus[-1:], *classic] or [giving[0].name]

@@ -68,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
     """Evaluate, print the tables, and write <out>/<dataset>/results.json and the report's section."""
     _check(args)
     bench, chosen = BENCHMARKS[args.dataset], suite.named_methods(args)
-    given = next((method for method in chosen if method.lights == TRUE_LIGHTS), None)
+    given = next((method for method in chosen if method.lighting == TRUE_LIGHTS), None)
     if given:
         raise InputError(f"--methods: {given.name} is given the lights, so there is nothing to score")
     items, about = read(args)

@@ -153,13 +153,13 @@ def list_refusals(found: Found) -> str:
 
 def drop_repeated_lights(found: Found, chosen: Sequence[Method]) -> Found:
     """Leave out methods whose lights another method, one without normals, has a row for already."""
-    alone = {_lights_of(method) for method in chosen if method.lights and not method.normals}
+    alone = {_lights_of(method) for method in chosen if method.lighting and not method.normals}
     kept = [method.name for method in chosen if not (method.normals and _lights_of(method) in alone)]
     return {name: found[name] for name in kept}
 
 
 def _lights_of(method: Method) -> tuple[str, str | None, int | None]:
-    return method.lights, method.read_out, method.light_views
+    return method.lighting, method.read_out, method.light_views
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -187,5 +187,5 @@ def pick_objects(items: Sequence[TestObject], names: list[str] | None) -> list[T
 def pick_pictured(chosen: Sequence[Method]) -> list[str]:
     """Return the names of the methods to show, and of the first lighting model."""
     names = select.list_shown(list(chosen))
-    lights = [method.name for method in chosen if method.lights and not method.normals][:1]
+    lights = [method.name for method in chosen if method.lighting and not method.normals][:1]
     return names or lights

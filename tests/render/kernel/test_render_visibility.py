@@ -216,7 +216,7 @@ def test_sharing_in_groups_is_far_below_the_noise(monkeypatch):
         return dict(many_lights.render(built, View(), surfaces, lights, **options)[1])[0]
 
     shared, other = rendered(0), rendered(1)
-    monkeypatch.setattr(paths, "grouped_visibility", asked_one_by_one)
+    monkeypatch.setattr(paths, "group_visibility", asked_one_by_one)
     asked = rendered(0)
     assert 0 < abs(shared.mean(dtype=np.float64) / asked.mean(dtype=np.float64) - 1) < 2e-4
     np.testing.assert_allclose(shared.mean((1, 2, 3)), asked.mean((1, 2, 3)), rtol=1e-3)
@@ -225,7 +225,7 @@ def test_sharing_in_groups_is_far_below_the_noise(monkeypatch):
 
 
 def asked_one_by_one(built, positions, normals, facets, emitters, lights):
-    """Give what `grouped_visibility` gives, by a ray for every vertex and light."""
+    """Give what `group_visibility` gives, by a ray for every vertex and light."""
     at = (mi.Vector3f(*rows) for rows in (positions, normals, facets))
     return visibility(built, *at, emitters, lights, coherent=False)
 

@@ -90,7 +90,7 @@ def test_trained_weights_come_before_shipped_ones(runs: Path, kept: Path, tmp_pa
 )
 def test_expressions(runs: Path, text: str, lights: str, normals: str, name: str) -> None:
     method = parse(text, finder(runs))
-    assert (method.lights, method.normals, method.name) == (lights, normals, name)
+    assert (method.lighting, method.normals, method.name) == (lights, normals, name)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_expressions(runs: Path, text: str, lights: str, normals: str, name: str
         ("true", "say which normals"),
         ("lcnet+lcnet-second+nenet", r"want METHOD or LIGHTS\+NORMALS"),
         ("lcnet++psfcn", r"want METHOD"),
-        ("lcnet+pf14", "pf14 finds the lights itself; leave out --lights"),
+        ("lcnet+pf14", "pf14 finds the lights itself; leave out the lighting model"),
         ("lcnet-second", "unknown model or method 'lcnet-second'"),
     ],
 )
@@ -110,10 +110,10 @@ def test_expressions_that_do_not_fit(runs: Path, text: str, message: str) -> Non
 
 def test_flags_that_a_classical_method_would_not_look_at(runs: Path) -> None:
     find = finder(runs)
-    with pytest.raises(InputError, match="least-squares needs lights; give --lights"):
+    with pytest.raises(InputError, match="least-squares needs lights"):
         combine(None, "least-squares", None, find)
     for lights, intensities in (("lcnet", None), (None, "true")):
-        with pytest.raises(InputError, match="leave out --lights and --intensities"):
+        with pytest.raises(InputError, match="leave out the lighting model and the intensities"):
             combine(lights, "pf14", intensities, find)
     for name, counts in (
         ("sdps-frames", (8, 8)),

@@ -208,12 +208,12 @@ def test_bad_folders_are_one_line(tree, tmp_path, harm, message):
 
 
 def test_expressions(models):
-    assert parse("least-squares", finder(None)).lights == "true"
-    assert parse("pf14", finder(None)).lights == ""
+    assert parse("least-squares", finder(None)).lighting == "true"
+    assert parse("pf14", finder(None)).lighting == ""
     both = parse("lcnet + least-squares", finder(models))
-    assert (both.lights, both.normals) == ("lcnet", "least-squares")
+    assert (both.lighting, both.normals) == ("lcnet", "least-squares")
     alone = parse("lcnet", finder(models))
-    assert (alone.lights, alone.normals, alone.name) == ("lcnet", "", "lcnet")
+    assert (alone.lighting, alone.normals, alone.name) == ("lcnet", "", "lcnet")
     learned, classic = (select.select_methods([kind], models) for kind in ("learned", "classical"))
     assert all(method.models() or "true lights" in method.name for method in learned)
     assert not any(method.models() for method in classic)

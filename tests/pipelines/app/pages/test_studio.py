@@ -18,7 +18,7 @@ from pipelines.shared import presets
 from render.records.shards import read_shard
 from render.shared.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 
 
 @pytest.fixture

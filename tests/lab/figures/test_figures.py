@@ -171,9 +171,9 @@ def test_methods_are_read_and_distinguished(tmp_path):
     found = {m.name: m for m in eval_figures.wanted_methods(["least-squares", "pf14", "pf14"], tmp_path)}
     assert set(found) == {"least-squares, true lights", "pf14"}
     least, maxima = found["least-squares, true lights"], found["pf14"]
-    assert least.lights == "true" and not sweep.finds(least, "direction_mae")
+    assert least.lighting == "true" and not sweep.finds(least, "direction_mae")
     assert sweep.finds(maxima, "intensity_error") and sweep.paper_row(maxima) == "PF14"
-    pair = Method(name="x", lights="shipped:lcnet", normals="shipped:nenet")
+    pair = Method(name="x", lighting="shipped:lcnet", normals="shipped:nenet")
     assert sweep.paper_row(pair) == "B1" and sweep.finds(pair, "direction_mae")
     assert sweep.paper_row(replace(pair, intensities="true")) == ""
     assert not sweep.finds(replace(pair, intensities="true"), "intensity_error")
