@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from lab.bench import bench_data
-from lab.shared.memory import timed
+from lab.shared.memory import measure_seconds
 from pipelines.shared.flags import add_fields, from_flags
 from render.planning import light_sets
 from render.records.manifest import View
@@ -125,7 +125,7 @@ def run(config: BenchConfig) -> dict[str, Any]:
     found: dict[str, Any] = {}
     ways = _ways(config, found)
     with progress_bar(total=len(ways) * (config.repeats + 2) + config.path_repeats, unit="run", desc="bench") as bar:
-        times = _interleaved(ways, config.repeats, bar)
+        times = _interleave(ways, config.repeats, bar)
         times["path"] = [_path(config, found, bar) for _ in range(config.path_repeats)]
     seconds = {name: float(np.median(values)) for name, values in times.items()}
     return {
@@ -218,17 +218,17 @@ def _path(config: BenchConfig, found: dict[str, Any], bar: "tqdm[Any]") -> float
         size=config.size, spp=config.spp, bounces=config.bounces, seed=config.seed,
     )  # fmt: skip
     found["path_mean"] = float(next(images).mean())
-    elapsed = timed(lambda: [image.shape for image in images])
+    elapsed = measure_seconds(lambda: [image.shape for image in images])
     bar.update()
     return elapsed
 
 
-def _interleaved(ways: dict[str, Callable[[], None]], repeats: int, bar: "tqdm[Any]") -> dict[str, list[float]]:
+def _interleave(ways: dict[str, Callable[[], None]], repeats: int, bar: "tqdm[Any]") -> dict[str, list[float]]:
     """Run the ways in turn, so that a change of the machine's load meets all; two rounds warm up."""
     times: dict[str, list[float]] = {name: [] for name in ways}
     for number in range(repeats + 2):
         for name, way in ways.items():
-            elapsed = timed(way)
+            elapsed = measure_seconds(way)
             if number >= 2:
                 times[name].append(elapsed)
             bar.update()

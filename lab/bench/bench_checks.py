@@ -78,10 +78,10 @@ def judge(folder: Path, scene: SceneSpec) -> list[dict[str, Any]]:
     images = np.pad(images, ((0, 0), (_PAD, _PAD), (_PAD, _PAD), (0, 0)))
     mask, rows, alarms = np.pad(shard.mask, _PAD), [], {}
     for case, spoilt in CASES.items():
-        picked = _picked(spoilt.which, len(images))
+        picked = _pick(spoilt.which, len(images))
         done = spoilt.which, spoilt.channel
         if done not in alarms:  # two cases leave the pictures as they are
-            alarms[done] = _alarms(_altered(images, spoilt, picked), mask)
+            alarms[done] = _alarms(_alter(images, spoilt, picked), mask)
         named = _named(alarms[done], spoilt.words)
         right = (named or set()) & set(picked.tolist())
         rows.append({"scene": scene.id, "case": case, "said": named is not None, "pictures": len(picked),
@@ -89,14 +89,14 @@ def judge(folder: Path, scene: SceneSpec) -> list[dict[str, Any]]:
     return rows
 
 
-def _picked(which: str, count: int) -> np.ndarray:
+def _pick(which: str, count: int) -> np.ndarray:
     """Return which pictures are spoilt."""
     places = {"none": slice(0, 0), "half": slice(count // 2, None), "one": slice(count // 3, count // 3 + 1),
               "eighth": slice(5, None, 8)}  # fmt: skip
     return np.arange(count)[places[which]]
 
 
-def _altered(images: np.ndarray, spoilt: Spoilt, picked: np.ndarray) -> np.ndarray:
+def _alter(images: np.ndarray, spoilt: Spoilt, picked: np.ndarray) -> np.ndarray:
     """Return the pictures with what a case does to some of them."""
     altered = images.copy()
     if spoilt.channel is not None:

@@ -10,7 +10,7 @@ import sys
 from typing import Any
 
 from lab.bench.bench_scenes import BenchClassicalConfig, large_object
-from lab.shared.memory import measured, peak_gib
+from lab.shared.memory import measure, peak_gib
 from pipelines.shared.flags import add_fields, add_out, from_flags, pick_names
 from pipelines.shared.text_tables import render_text
 from render.shared.files import write_json, write_text
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Time the methods, print the table and write it."""
     config, names = from_flags(BenchClassicalConfig, args), pick_names("method", args.methods, registry.METHODS)
-    found = {name: measured(_work, name, config) for name in progress_bar(names, desc="bench", unit="method")}
+    found = {name: measure(_work, name, config) for name in progress_bar(names, desc="bench", unit="method")}
     text = table(found, config)
     write_json(args.out / "bench_classical.json", {"config": vars(config), "methods": found})
     write_text(args.out / "bench_classical.md", text)

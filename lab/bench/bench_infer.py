@@ -20,7 +20,7 @@ import numpy as np
 from lab.bench.bench_scenes import BenchClassicalConfig, add_size, large_object, size_from
 from lab.bench.large_photographs import LargeConfig, photograph_large
 from lab.shared.machines import hold, kinds, processor
-from lab.shared.memory import measured, peak_gib
+from lab.shared.memory import measure, peak_gib
 from pipelines.evaluate.workbench import write_photographs
 from pipelines.shared import network_flags
 from pipelines.shared.flags import add_models, add_out, split_list
@@ -56,12 +56,12 @@ def main(args: argparse.Namespace) -> int:
         return _large(args, LargeConfig(width=800, height=600))
     folders = {args.images: photograph(args.out / "photographs", config)}
     if args.many:
-        folders[args.many] = repeated(args.out / "many", folders[args.images], args.many)
+        folders[args.many] = repeat(args.out / "many", folders[args.images], args.many)
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for kind in kinds():
         with hold(kind):
             found[kind] = {
-                f"{name}, {count} pictures": measured(_work, folder, name, args.models, used)
+                f"{name}, {count} pictures": measure(_work, folder, name, args.models, used)
                 for name in split_list(args.methods) or ["sdps"]
                 for count, folder in folders.items()
             }
@@ -74,7 +74,7 @@ def main(args: argparse.Namespace) -> int:
 def _large(args: argparse.Namespace, config: LargeConfig) -> int:
     """Infer large photographs on this machine as it is; print what every stage took, and write bench_large.json."""
     folder = photograph_large(args.out / "large", config)
-    found = measured(_large_work, folder, args.models, inference_config(args))
+    found = measure(_large_work, folder, args.models, inference_config(args))
     write_json(args.out / "bench_large.json", {"config": vars(config), **found})
     if found["error"]:
         raise InputError(found["error"])
@@ -122,7 +122,7 @@ def photograph(folder: Path, config: BenchClassicalConfig) -> Path:
     return write_photographs(folder, (image * scale for image in progress_bar(images, desc="photograph")), mask)
 
 
-def repeated(folder: Path, source: Path, count: int) -> Path:
+def repeat(folder: Path, source: Path, count: int) -> Path:
     """Fill a folder with links to the pictures of another one, again and again."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)

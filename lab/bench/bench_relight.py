@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.shared.memory import timed
+from lab.shared.memory import measure_seconds
 from render.planning import light_sets
 from render.records.manifest import SceneSpec, View, write_manifest
 from render.shared.imaging import environments
@@ -33,13 +33,13 @@ def relight(_: int, __: Path | None) -> tuple[dict[str, Any], str]:
                       lights=lights, size=_SIZE, spp=_SPP, bounces=_BOUNCES)  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         write_manifest(folder, [scene])
-        rendering = timed(lambda: render_scenes([scene], folder))
+        rendering = measure_seconds(lambda: render_scenes([scene], folder))
         ways = _ways(scene, Path(folder))
         ways["path"][0]()  # compiles
         times: dict[str, list[float]] = {name: [] for name in ways}
         for _repeat in progress_bar(range(_REPEATS), unit="round", desc="bench"):
             for name, (way, images) in ways.items():
-                times[name].append(timed(way) / images)
+                times[name].append(measure_seconds(way) / images)
     seconds = {name: float(np.median(values)) for name, values in times.items()}
     ratios = {f"path / {name}": seconds["path"] / seconds[name] for name in ways if name != "path"}
     values = {"seconds_per_image": seconds, "stage_seconds": rendering, "ratios": ratios}

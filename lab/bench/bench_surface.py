@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lab.bench.bench_scenes import BenchClassicalConfig, add_size, large_object, size_from
-from lab.shared.memory import apart, peak_gib, timed
+from lab.shared.memory import apart, measure_seconds, peak_gib
 from pipelines.shared.flags import add_out, pick_names
 from pipelines.shared.text_tables import render_text
 from render.records.manifest import SceneSpec, read_manifest
@@ -86,7 +86,7 @@ def _depth_row(name: str, source: str, shard: Shard, normals: np.ndarray) -> dic
            "mae": normal_mae(normals, shard.normals, shard.mask)}  # fmt: skip
     for way, option in (("plain", False), ("discontinuities", True)):
         depth = integrate(normals, shard.mask, discontinuities=option)
-        off = np.abs(_centred(depth.z - truth, depth))[shard.mask]
+        off = np.abs(_centre(depth.z - truth, depth))[shard.mask]
         row[way] = {"mean": float(off.mean()), "largest": float(off.max()), "residual": depth.residual}
     return row
 
@@ -95,7 +95,7 @@ def _true_depth(shard: Shard) -> np.ndarray:  # (H, W) in pixels
     return shard.depth * (max(shard.mask.shape) / 2.0)
 
 
-def _centred(values: np.ndarray, depth: Depth) -> np.ndarray:
+def _centre(values: np.ndarray, depth: Depth) -> np.ndarray:
     """Take from each component what no normal tells: how far away it lies."""
     labels = depth.labels[depth.mask]
     means = np.bincount(labels, values[depth.mask]) / np.bincount(labels)
@@ -148,7 +148,7 @@ def _work(step: str, config: BenchClassicalConfig) -> dict[str, Any]:
             "residuals": lambda: residuals(images, mask, normals, lights, gains, albedo),
         }
         before = peak_gib()
-        seconds = timed(actions[kind])
+        seconds = measure_seconds(actions[kind])
     return {"seconds": seconds, "before_gib": before, "peak_gib": peak_gib(), "pixels": int(mask.sum())}
 
 

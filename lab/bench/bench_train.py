@@ -23,7 +23,7 @@ import torch
 
 from lab.bench.bench_scenes import write_scenes
 from lab.shared.machines import hold, kinds, processor
-from lab.shared.memory import apart, peak_bytes, timed
+from lab.shared.memory import apart, measure_seconds, peak_bytes
 from pipelines.shared.flags import add_fields, add_out, from_flags
 from render.shared.config import check_fields, to_plain
 from render.shared.errors import InputError
@@ -131,7 +131,7 @@ def machine() -> dict[str, Any]:
     for name in ("float32", "bfloat16"):
         left, right = (torch.ones(2048, 2048, dtype=getattr(torch, name)) for _ in range(2))
         left @ right
-        times = [timed(partial(torch.matmul, left, right)) for _ in range(5)]
+        times = [measure_seconds(partial(torch.matmul, left, right)) for _ in range(5)]
         rates[name] = float(np.median([2 * 2048**3 / 1e9 / seconds for seconds in times]))
     return {
         "processor": processor(), "precision": chosen.precision, "reason": chosen.reason,
@@ -154,13 +154,13 @@ def measure(config: BenchTrainConfig, model: str, folder: Path) -> dict[str, Any
         waiting = {
             f"{workers} loader processes": _waiting(config, model, folder, Path(scratch), workers) for workers in (0, 1)
         }
-    rates = {name: _spread(values) for name, values in wall.items()}
+    rates = {name: _measure_spread(values) for name, values in wall.items()}
     ratios = [ours / plain for ours, plain in zip(wall[OURS], wall[PLAIN], strict=True)]
     return {
         "batch": list(batch.images.shape),
         "ways": rates,
-        "per_processor_second": {name: _spread(values) for name, values in processor.items()},
-        "ratio": _spread(ratios),
+        "per_processor_second": {name: _measure_spread(values) for name, values in processor.items()},
+        "ratio": _measure_spread(ratios),
         "muon_share": float(np.mean(updates)) * rates[MUON]["median"] / images if MUON in ways else None,
         "waiting": waiting,
         "skipped": skipped,
@@ -183,7 +183,7 @@ def _ways(
         trainer = make_trainer(replace(training(config, model), **changes), model, folder, scratch / name)
         if name == MUON:
             update = trainer.optimiser.step
-            trainer.optimiser.step = lambda update=update: updates.append(timed(update))  # type: ignore
+            trainer.optimiser.step = lambda update=update: updates.append(measure_seconds(update))  # type: ignore
         ways[name] = partial(trainer.take_step, batch, 0.5)
 
     def one_thread() -> None:
@@ -322,7 +322,7 @@ def peak_memory(config: BenchTrainConfig, model: str, folder: Path, way: str) ->
     return None if peak is None else peak / 1e6
 
 
-def _spread(values: list[float]) -> dict[str, float]:
+def _measure_spread(values: list[float]) -> dict[str, float]:
     return {"median": float(np.median(values)), "least": min(values), "most": max(values)}
 
 

@@ -94,7 +94,7 @@ def measure(config: NoiseConfig) -> list[Row]:
 
 
 @lru_cache(maxsize=1)
-def _built(shape: str) -> Any:
+def _build(shape: str) -> Any:
     """Return the scene of a shape, kept for its next materials."""
     from render import shapes
     from render.kernel import scene
@@ -108,7 +108,7 @@ def _measure_group(config: NoiseConfig, shape: str, materials: list[str]) -> lis
     from render.materials.kernels.packed import pack
 
     directions = light_sets.draw("azimuth-elevation", config.lights, generator(config.seed, "noise", "lights"))
-    built = _built(shape)
+    built = _build(shape)
     packed = pack(materials, built.mesh)
 
     def images(spp: int, seed: int, probe: bool) -> tuple[Any, list[np.ndarray]]:

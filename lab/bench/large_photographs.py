@@ -61,7 +61,7 @@ def photograph_large(folder: Path, config: LargeConfig) -> Path:
         folder.mkdir(parents=True)
         for number in progress_bar(range(config.pictures), desc="photograph", unit="picture"):
             picture = np.concatenate(
-                [_shaded(rows, lights[number], gains[number], config, rng) for rows in _bands(config)]
+                [_shade(rows, lights[number], gains[number], config, rng) for rows in _bands(config)]
             )
             Image.fromarray(picture).save(folder / f"{number:03d}.jpg", quality=_QUALITY)
         if config.share < 1.0:
@@ -94,7 +94,7 @@ def _relief(rows: slice, config: LargeConfig) -> tuple[np.ndarray, np.ndarray, n
     return normals, colours[cells.astype(int)], mask
 
 
-def _shaded(
+def _shade(
     rows: slice, light: np.ndarray, gain: float, config: LargeConfig, rng: np.random.Generator
 ) -> np.ndarray:  # (h, W, 3) uint8
     normals, albedo, mask = _relief(rows, config)

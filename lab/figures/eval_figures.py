@@ -61,7 +61,7 @@ def main(args: argparse.Namespace) -> int:
     if args.draws < 1:
         raise InputError(f"--draws must be at least 1, got {args.draws}")
     config = inference_config(preset.test)
-    runners = tuple(Runner(item, finder(out), config) for item in wanted_methods(split_list(args.methods), out))
+    runners = tuple(Runner(item, finder(out), config) for item in choose_methods(split_list(args.methods), out))
     bench = Workbench(preset, out, runners, args.draws)
     left_out = 0
     for name in names:
@@ -80,7 +80,7 @@ def main(args: argparse.Namespace) -> int:
     return 1 if left_out else 0
 
 
-def wanted_methods(names: Sequence[str], out: Path) -> list[Method]:
+def choose_methods(names: Sequence[str], out: Path) -> list[Method]:
     """Return the methods that names stand for, or the default ones.
 
     Raises:

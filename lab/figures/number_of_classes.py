@@ -117,7 +117,7 @@ def _worst(corners: list[Mean]) -> Mean:
     return max(corners, key=lambda item: item.value if np.isfinite(item.value) else -1.0)
 
 
-def _published(runner: Runner, shape: str) -> float | None:
+def _find_published(runner: Runner, shape: str) -> float | None:
     """Return the paper's figure for true lights (row B0)."""
     return published.figures(published.NORMALS, "B0", shape)[0] if paper_row(runner.method) == "B0" else None
 
@@ -129,7 +129,7 @@ def _table(
     rows = []
     for count in (*BINS, _EXACT):
         cells = [
-            errors[r.method.name, s, count].cell(_published(r, s) if count == _EXACT else None) for r, s in columns
+            errors[r.method.name, s, count].cell(_find_published(r, s) if count == _EXACT else None) for r, s in columns
         ]
         angles = ["0", "0", "0"]
         if count:
@@ -154,7 +154,7 @@ def _chart(runners: list[Runner], shapes: tuple[str, ...], errors: dict[tuple[st
             y = [errors[runner.method.name, shape, count].value for count in (*BINS, _EXACT)]
             axes.plot(x[:-1], y[:-1], color=line_charts.colour(place), ls=line_charts.LINE_STYLES[style % 4])
             chart.line(place, f"{line_charts.shorten(runner.method.name)}, {shape}", x, y, ls=":", lw=0.8)
-            chart.point(f"PS-FCN, {shape}: published", x[-1], _published(runner, shape))
+            chart.point(f"PS-FCN, {shape}: published", x[-1], _find_published(runner, shape))
     axes.axvline(36, color="0.8", lw=0.8)
     chart.ticks(x, [*map(str, BINS), "∞"])
     axes.set(xlabel="bins of azimuth and of elevation, $K_d$ (∞: true lights)", xlim=(1.8, _INFINITY_AT * 1.08))

@@ -92,7 +92,7 @@ def _summarise(draws: Sequence[dict[str, Mean]], metric: str) -> tuple[float, fl
     return float(np.mean(values)), min(values), max(values), failed
 
 
-def _published(method: Method, shape: str, metric: str) -> float | None:
+def _find_published(method: Method, shape: str, metric: str) -> float | None:
     """Return the paper's figure for all images, where it has the method and shape."""
     row = paper_row(method)
     if metric == "normal_mae":
@@ -110,7 +110,7 @@ def _table(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
             middle, low, high, failed = _summarise(points[method.name, shape, count], metric)
             text = number(middle) + (f" [{number(low)}, {number(high)}]" if high > low else "")
             cells.append(text + (f" {failed} failed" if failed and np.isfinite(middle) else ""))
-        known = _published(method, shape, metric)
+        known = _find_published(method, shape, metric)
         rows.append((method.name, *cells, number(known)))
     title, unit = METRICS[metric]
     header = ("method", *map(str, counts), f"published, {counts[-1]}" if counts[-1] == 100 else "published, 100")
@@ -133,7 +133,7 @@ def _chart(methods: Sequence[Method], shape: str, counts: tuple[int, ...], point
             chart.line(place, line_charts.shorten(method.name), counts, middle)
             if counts[-1] == 100:
                 paper = published.NORMALS.get(paper_row(method), ("",))[0]
-                chart.point(f"{paper}, published", 100, _published(method, shape, metric))
+                chart.point(f"{paper}, published", 100, _find_published(method, shape, metric))
         chart.ticks(counts, list(map(str, counts)), base=2)
         axes.set(ylabel=unit, title=f"{title}, {shape}", xlabel="images")
         chart.finish(gap=0.09)

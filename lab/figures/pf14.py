@@ -110,7 +110,7 @@ def _evaluate(bench: Workbench, runners: list[Runner], shape: str, kinds: dict[s
     }
 
 
-def published(method: Method, metric: str, group: str, lights: str, shape: str) -> float | None:
+def find_published(method: Method, metric: str, group: str, lights: str, shape: str) -> float | None:
     """Return the paper's figure, or None."""
     row = POSTER[metric].get(paper_row(method))
     return row[GROUPS.index(group)][LIGHT_SETS.index(lights)] if row and shape == SHAPE else None
@@ -121,7 +121,10 @@ def _table(methods: list[Method], kinds: tuple[str, ...], means: Means, metric: 
         (
             method.name,
             lights.split(":")[0],
-            *(means[method.name, lights, g, metric].cell(published(method, metric, g, lights, shape)) for g in kinds),
+            *(
+                means[method.name, lights, g, metric].cell(find_published(method, metric, g, lights, shape))
+                for g in kinds
+            ),
         )
         for method in methods
         for lights in LIGHT_SETS
@@ -147,7 +150,7 @@ def _chart(methods: list[Method], kinds: tuple[str, ...], means: Means, shape: s
                     alpha=0.55 if number else 1.0, hatch="////" if number else None, edgecolor="white", lw=0,
                     label=f"{line_charts.shorten(method.name)}, {lights.split(':')[0]}",
                 )  # fmt: skip
-                known = [published(method, metric, group, lights, shape) for group in kinds]
+                known = [find_published(method, metric, group, lights, shape) for group in kinds]
                 points = [(at, value) for at, value in zip(x, known, strict=True) if value is not None]
                 if points:
                     axes.plot(*zip(*points, strict=True), "D", color="0.25", mfc="0.85", ms=5, ls="", zorder=5)

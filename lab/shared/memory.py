@@ -12,7 +12,7 @@ from render.backend.orphans import end_with_parent
 from render.shared.errors import InputError
 
 
-def timed(action: Callable[[], object]) -> float:
+def measure_seconds(action: Callable[[], object]) -> float:
     """Return the seconds that an action takes."""
     start = time.perf_counter()
     action()
@@ -53,7 +53,7 @@ def apart(work: Callable[..., Any], *arguments: Any) -> Any:
             raise InputError("the process died before it was done; there may be too little memory") from error
 
 
-def measured(work: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
+def measure(work: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
     """Return what `work` returns in a fresh process and an empty `error`, or its complaint as `error` alone."""
     try:
         return {**apart(work, *arguments), "error": ""}

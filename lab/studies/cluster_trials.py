@@ -61,7 +61,7 @@ def kills(times: int, seed: int, disturbed: Callable[[presets.Preset, Path, rand
             done = disturbed(preset, folder, rng)
             found = content(folder)
             wrong = [name for name in sorted(expected | found) if found.get(name) != expected.get(name)]
-            if not listed_once(folder, scenes):
+            if not list_once(folder, scenes):
                 wrong.append("ledger")
             bad += bool(wrong)
             said = f"DIFFERS ({', '.join(wrong)})" if wrong else "the bytes of the local run"
@@ -70,7 +70,7 @@ def kills(times: int, seed: int, disturbed: Callable[[presets.Preset, Path, rand
     return int(bad > 0)
 
 
-def killed_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
+def kill_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
     """Render on two workers, one of which is killed while scenes are at work; return how many scenes are done."""
     scenes = plan_scenes(preset, folder)
     with cluster(2, 1) as (address, client):
@@ -92,7 +92,7 @@ def killed_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
     return summary.done
 
 
-def restarted_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
+def restart_run(preset: presets.Preset, folder: Path, rng: random.Random) -> int:
     """Render while the scheduler is killed and, with its workers, started again; return how many scenes are done."""
     scenes = plan_scenes(preset, folder)
     with socket.socket() as probe:
@@ -153,7 +153,7 @@ def content(folder: Path) -> dict[str, str]:
     return {path.name: file_hash(path) for path in [folder / "manifest.jsonl", *(folder / "shards").iterdir()]}
 
 
-def listed_once(folder: Path, scenes: list[SceneSpec]) -> bool:
+def list_once(folder: Path, scenes: list[SceneSpec]) -> bool:
     """Tell whether every scene stands in the ledger once."""
     ids = [line["id"] for lines in read_runs(folder) for line in lines]
     return sorted(ids) == sorted(scene.id for scene in scenes)
@@ -265,7 +265,7 @@ if __name__ == "__main__":
     parser.add_argument("--bytes", type=int, default=2_000_000)
     flags = parser.parse_args()
     if flags.trial in ("kills", "schedulers"):
-        sys.exit(kills(flags.times, flags.seed, killed_run if flags.trial == "kills" else restarted_run))
+        sys.exit(kills(flags.times, flags.seed, kill_run if flags.trial == "kills" else restart_run))
     if flags.trial == "plan":
         sys.exit(plan(flags.chunks))
     sys.exit(load(flags.slots, flags.chunks, flags.seconds, flags.bytes, flags.workers))

@@ -39,7 +39,7 @@ def join(folders: Sequence[Path], out: Path, *, first: bool = False, train: Sequ
     origins: dict[str, Path] = {}
     scenes: list[SceneSpec] = []
     for folder, count in zip(folders, train or [None] * len(folders), strict=True):
-        for scene in _taken(folder, count):
+        for scene in _take(folder, count):
             if scene.id in origins:
                 if first:
                     continue
@@ -58,7 +58,7 @@ def join(folders: Sequence[Path], out: Path, *, first: bool = False, train: Sequ
     return len(scenes)
 
 
-def _taken(folder: Path, count: int | None) -> list[SceneSpec]:
+def _take(folder: Path, count: int | None) -> list[SceneSpec]:
     """Return a folder's finished scenes, of those for training `count`, evenly spread, or all."""
     scenes = [scene for scene in read_manifest(folder) if (folder / scene.file).is_file()]
     if count is None:

@@ -59,20 +59,20 @@ def _row(scene: SceneSpec, folder: Path, found: dict, search: bool) -> tuple[flo
     truth, lights = scene.light_directions(), np.array(found["lights"], np.float32)
     errors = [_error(lights, factor, truth) for factor in _FACTORS]
     best = int(np.argmin(errors))
-    searched = _error(lights, _searched(scene, folder, lights, found["gains"]), truth) if search else np.nan
+    searched = _error(lights, _search(scene, folder, lights, found["gains"]), truth) if search else np.nan
     return _error(lights, 1.0, truth), errors[best], float(_FACTORS[best]), searched
 
 
-def _scaled(lights: np.ndarray, factor: float) -> np.ndarray:
+def _scale(lights: np.ndarray, factor: float) -> np.ndarray:
     moved = lights * np.array([factor, factor, 1.0], np.float32)
     return moved / np.linalg.norm(moved, axis=1, keepdims=True)
 
 
 def _error(lights: np.ndarray, factor: float, truth: np.ndarray) -> float:
-    return float(angle_degrees(_scaled(lights, factor), truth).mean())
+    return float(angle_degrees(_scale(lights, factor), truth).mean())
 
 
-def _searched(scene: SceneSpec, folder: Path, lights: np.ndarray, gains: Sequence[float]) -> float:
+def _search(scene: SceneSpec, folder: Path, lights: np.ndarray, gains: Sequence[float]) -> float:
     """Return the factor under which robust first normals explain some pixels best."""
     shard = read_shard(folder / scene.file, scene)
     places = np.argwhere(shard.mask)
@@ -81,7 +81,7 @@ def _searched(scene: SceneSpec, folder: Path, lights: np.ndarray, gains: Sequenc
     values = torch.from_numpy(seen / np.array(gains, np.float32)[:, None, None]).permute(1, 0, 2).contiguous()
     residuals = []
     for factor in _SEARCHED:
-        directions = torch.from_numpy(_scaled(lights, factor))[None].expand(len(values), -1, -1)
+        directions = torch.from_numpy(_scale(lights, factor))[None].expand(len(values), -1, -1)
         residuals.append(float(first_normals(values, directions)[2].mean()))
     return float(_SEARCHED[int(np.argmin(residuals))])
 

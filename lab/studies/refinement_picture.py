@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lab.studies.refinement_study import Scene, expected, kept
+from lab.studies.refinement_study import Scene, expect_errors, read_kept
 from pipelines.shared import pictures
 from render.records.manifest import read_manifest
 from sdps.core.metrics import angle_degrees
@@ -33,13 +33,13 @@ def main() -> int:
     rows = []
     for name in args.scenes:
         scene = Scene(args.merltest, specs[name], False, 0, True)
-        begun, found = kept(args.out / "merltest-all" / f"{name.replace('/', '_')}.npz")
+        begun, found = read_kept(args.out / "merltest-all" / f"{name.replace('/', '_')}.npz")
         lit = scene.images[int(np.argmax(scene.lights @ np.array([-0.4, 0.5, 0.77])))]
         maps = [
             pictures.tone_map(lit, pictures.auto_exposure(lit[None], scene.mask)),
             pictures.normal_map(begun.normals, scene.mask), _errors(scene, begun.normals),
             pictures.normal_map(found.normals, scene.mask), _errors(scene, found.normals),
-            pictures.error_map(np.where(scene.mask, expected(scene, begun, found).normals, np.nan), _YELLOW),
+            pictures.error_map(np.where(scene.mask, expect_errors(scene, begun, found).normals, np.nan), _YELLOW),
         ]  # fmt: skip
         rows.append(np.concatenate([pictures.scale_to_height(part, _SIDE) for part in maps], axis=1))
     Image.fromarray(np.concatenate(rows)).save(args.picture, quality=88)

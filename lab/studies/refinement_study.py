@@ -50,13 +50,13 @@ class Scene:
         shard, rng = read_shard(folder / spec.file, spec), generator(5, spec.id, "dev")
         every = np.arange(len(shard.light_directions))
         gains = draw_intensities(spec, TestConfig(), 0) if merltest else rng.uniform(0.2, 2.0, len(every))
-        kept = np.flatnonzero(shard.light_directions[:, 2] > _NARROW) if narrow else every
-        if 0 < images < len(kept):
-            kept = np.sort(rng.permutation(kept)[:images])
+        chosen = np.flatnonzero(shard.light_directions[:, 2] > _NARROW) if narrow else every
+        if 0 < images < len(chosen):
+            chosen = np.sort(rng.permutation(chosen)[:images])
         self.name, self.mask, self.normals = spec.id, shard.mask, shard.normals
         self.material, self.shape = spec.material, spec.shape
-        self.lights, self.gains = shard.light_directions[kept], gains[kept].astype(np.float32)
-        radiance = shard.images[kept].astype(np.float32) * shard.mask[..., None]
+        self.lights, self.gains = shard.light_directions[chosen], gains[chosen].astype(np.float32)
+        radiance = shard.images[chosen].astype(np.float32) * shard.mask[..., None]
         self.images = radiance * self.gains[:, None, None, None]  # (L, H, W, 3)
 
 
@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=1, help="take every so many scenes")
     parser.add_argument("--fit", action="store_true", help="print the constants of sdps/refinement/trust.py")
     args = parser.parse_args(argv)
-    folder = args.merltest or rendered(args.out / "scenes")
+    folder = args.merltest or load_scenes(args.out / "scenes")
     specs = list(enumerate(read_manifest(folder)))[:: args.every]
     results = []
     for (number, spec), images in tqdm([(spec, images) for images in args.images for spec in specs], disable=None):
@@ -80,26 +80,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         tag += f"-{args.light_error:g}" if args.light_error else ""
         tag += f"-{args.start}" if args.start else ""
         scene = Scene(folder, spec, not args.merltest and number % 2 == 1, images, args.merltest is not None)
-        results.append((scene, *_refined(scene, args.out / tag, args.start, args.lights, args.light_error)))
+        results.append((scene, *_refine(scene, args.out / tag, args.start, args.lights, args.light_error)))
     for line in _fit(results) if args.fit else _table(results):
         sys.stdout.write(f"{line}\n")
     return 0
 
 
-def rendered(out: Path) -> Path:
+def load_scenes(out: Path) -> Path:
     command = [sys.executable, "-m", "pipelines.cli", "render-data", "--preset", str(_PRESET), "--out", str(out)]
     subprocess.run(command, check=True)
     return out / "data" if (out / "data").is_dir() else out
 
 
-def _refined(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> tuple[Estimate, Refined]:
+def _refine(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> tuple[Estimate, Refined]:
     """Return the start and what refinement makes of it, read back where it is there."""
     path = out / f"{scene.name.replace('/', '_')}.npz"
     if not path.exists():
         lit = given or wrong > 0.0
         method = parse(name or ("true+psfcn" if lit else "sdps-plus"), finder(None))
         runner = Runner(method, finder(None), InferenceConfig(light_views=None if lit else 8, normal_views=1))
-        told = _turned(scene, wrong) if lit else (None, None)
+        told = _turn(scene, wrong) if lit else (None, None)
         start = runner.estimate(scene.images, scene.mask, *told)
         gains = start.intensities if told[1] is None else told[1]
         found = refine(scene.images, scene.mask, start.normals, start.light_directions, gains, directions_given=given)
@@ -109,10 +109,10 @@ def _refined(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> t
             if start.expected_error is not None:
                 begun["expected_error"] = start.expected_error
             np.savez(file, **{f"start_{name}": value for name, value in begun.items()}, **vars(found))
-    return kept(path)
+    return read_kept(path)
 
 
-def kept(path: Path) -> tuple[Estimate, Refined]:
+def read_kept(path: Path) -> tuple[Estimate, Refined]:
     """Return a start and its refinement, read back."""
     with np.load(path) as archive:
         begun = Estimate(
@@ -122,7 +122,7 @@ def kept(path: Path) -> tuple[Estimate, Refined]:
         return begun, Refined(**{name: archive[name] for name in Refined.__dataclass_fields__})
 
 
-def _turned(scene: Scene, degrees: float) -> tuple[np.ndarray, np.ndarray]:
+def _turn(scene: Scene, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the true lights, each turned by an angle about an axis of its own, and gains off by 1 % a degree."""
     rng = generator(6, scene.name, "wrong")
     across = np.cross(scene.lights, rng.normal(size=scene.lights.shape))
@@ -141,7 +141,7 @@ def _errors(scene: Scene, found: Estimate) -> tuple[float, float, float]:
     )
 
 
-def expected(scene: Scene, begun: Estimate, found: Refined) -> Trust:
+def expect_errors(scene: Scene, begun: Estimate, found: Refined) -> Trust:
     """Return the errors to expect."""
     given = np.allclose(begun.light_directions, found.light_directions, atol=1e-6)  # of unit length but for rounding
     return trust(found, scene.mask, begun, given=given)
@@ -154,7 +154,7 @@ def _table(results: list[tuple[Scene, Estimate, Refined]]) -> Iterator[str]:
     for scene, begun, found in results:
         before = _errors(scene, begun)
         after = _errors(scene, Estimate(found.normals, found.light_directions, found.grey_intensities))
-        judged = expected(scene, begun, found)
+        judged = expect_errors(scene, begun, found)
         doubts += bool(judged.doubt)
         rows.append((scene.shape, before, after, before if judged.doubt else after))
         yield (
@@ -177,7 +177,7 @@ def _reliability(results: list[tuple[Scene, Estimate, Refined]], bins: int = 8) 
     """Yield the mean error by eighths of the expected one, every scene with the same weight."""
     normals, lights = [], []
     for scene, begun, found in results:
-        judged = expected(scene, begun, found)
+        judged = expect_errors(scene, begun, found)
         actual = angle_degrees(found.normals[scene.mask], scene.normals[scene.mask])
         some = np.linspace(0, len(actual) - 1, 500).astype(int)
         normals.append(np.stack([judged.normals[scene.mask], actual])[:, some])
@@ -203,7 +203,7 @@ def _fit(results: list[tuple[Scene, Estimate, Refined]]) -> Iterator[str]:
     for name, pairs in parts.items():
         yield f"{name} = ({', '.join(f'{value:.3f}' for value in _powers(pairs))})"
     for width in sorted({len(NORMAL), parts["NORMAL"][0][1].shape[1]}):
-        each, means = _left_out([(shape, x[:, :width], y) for shape, x, y in parts["NORMAL"]])
+        each, means = _leave_out([(shape, x[:, :width], y) for shape, x, y in parts["NORMAL"]])
         yield f"NORMAL, {width} features, shapes left out: logarithms off by {each:.2f}, of means {means:.2f} (rms)"
 
 
@@ -216,7 +216,7 @@ def _powers(pairs: Pairs) -> np.ndarray:
     return found
 
 
-def _left_out(pairs: Pairs) -> tuple[float, float]:
+def _leave_out(pairs: Pairs) -> tuple[float, float]:
     """Fit without each shape in turn; return how far the logarithms of its errors, and of their means, are off."""
     each, means = [], []
     for left in {shape for shape, _, _ in pairs}:

@@ -42,7 +42,7 @@ class PublishedRow:
 
 
 @cache
-def published_rows(benchmark: str, quantity: str) -> tuple[PublishedRow, ...]:
+def read_published_rows(benchmark: str, quantity: str) -> tuple[PublishedRow, ...]:
     """Return the rows of a benchmark (`diligent`, ...) for `directions`, `intensities` or `normals`."""
     table = read_yaml(str(_FOLDER / "real_benchmarks.yaml"))[benchmark]
     return tuple(

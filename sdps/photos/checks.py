@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdps.photos.masks import border_share
-from sdps.photos.measures import Measures, measure, spread
+from sdps.photos.measures import Measures, measure, measure_spread
 from sdps.photos.reading import Photographs
 
 LEVELS = ("error", "warning", "note")
@@ -61,7 +61,7 @@ def check(photos: Photographs) -> list[Finding]:
     return sorted(found, key=lambda finding: LEVELS.index(finding.level))
 
 
-def _named(photos: Photographs, chosen: np.ndarray) -> tuple[str, ...]:
+def _list_names(photos: Photographs, chosen: np.ndarray) -> tuple[str, ...]:
     """Return the names of the images at the true places of (L,) bool."""
     return tuple(np.asarray(photos.files, object)[chosen])
 
@@ -92,14 +92,14 @@ def _brightness(photos: Photographs, measures: Measures) -> Iterator[Finding]:
         if float(measures.levels.max()) < _DARK:
             yield Finding("warning", "All pictures are very dark, so noise will show. Expose longer.")
     if black.any():
-        names = _named(photos, black)
+        names = _list_names(photos, black)
         yield Finding("warning", f"The object is black in {_pictures(names)}. Was the lamp off? Leave them out.", names)
 
 
 def _saturation(photos: Photographs, measures: Measures) -> Iterator[Finding]:
-    clipped = _clipped(photos, measures)
+    clipped = _check_clipped(photos, measures)
     if clipped.any():
-        names = _named(photos, clipped)
+        names = _list_names(photos, clipped)
         yield Finding(
             "warning",
             f"Clipped before it was saved: up to {measures.topped[clipped].max():.0%} of the object has one highest "
@@ -115,7 +115,7 @@ def _saturation(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     much = (measures.saturated > _SATURATED) & ~ruined
     for level, which in (("error" if ruined.all() else "warning", ruined), ("warning", much)):
         if which.any():
-            names = _named(photos, which)
+            names = _list_names(photos, which)
             worst = measures.saturated[which].max()
             yield Finding(
                 level,
@@ -125,7 +125,7 @@ def _saturation(photos: Photographs, measures: Measures) -> Iterator[Finding]:
             )
 
 
-def _clipped(photos: Photographs, measures: Measures) -> np.ndarray:  # (L,) bool
+def _check_clipped(photos: Photographs, measures: Measures) -> np.ndarray:  # (L,) bool
     """Find pictures that share a highest value, on many pixels, below full scale.
 
     Values of 8 bits repeat by chance, and so do all pixels of a flat object that was computed.
@@ -143,7 +143,7 @@ def _movement(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     moved = lengths > 0
     if not moved.any():
         return
-    names = _named(photos, moved)
+    names = _list_names(photos, moved)
     if moved.mean() > 0.5 and shifts[moved].std(0).max() > 0.25 * lengths[moved].mean():
         yield Finding(
             "warning",
@@ -162,7 +162,7 @@ def _movement(photos: Photographs, measures: Measures) -> Iterator[Finding]:
 
 def _light_spread(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     values = np.zeros(3)
-    found = spread(measures.observations.mean(-1))[:3]
+    found = measure_spread(measures.observations.mean(-1))[:3]
     values[: len(found)] = found
     if values[1] < _SAME:
         brightness = measures.observations.mean((1, 2))
@@ -187,7 +187,7 @@ def _light_spread(photos: Photographs, measures: Measures) -> Iterator[Finding]:
         )
 
 
-def _given_lights(photos: Photographs, _: Measures) -> Iterator[Finding]:
+def _check_given_lights(photos: Photographs, _: Measures) -> Iterator[Finding]:
     if photos.light_directions is None:
         return
     lights = photos.light_directions.astype(np.float64)
@@ -231,7 +231,7 @@ def _colour(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     cast = measures.casts > 0
     if not cast.any():
         return
-    names = _named(photos, cast)
+    names = _list_names(photos, cast)
     if cast.mean() < _FEW_CASTS:
         text = f"The colour of {_pictures(names)} differs by up to {measures.casts.max():.0%}: another light, or gloss."
         yield Finding("note", text, names)
@@ -308,7 +308,7 @@ _RULES: tuple[Callable[[Photographs, Measures], Iterator[Finding]], ...] = (
     _saturation,
     _movement,
     _light_spread,
-    _given_lights,
+    _check_given_lights,
     _near_lamps,
     _duplicates,
     _colour,

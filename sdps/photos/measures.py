@@ -110,7 +110,7 @@ def _casts(photos: Photographs, observations: np.ndarray) -> np.ndarray:  # (L,)
     return colour_casts(some, saturation)
 
 
-def spread(observations: np.ndarray) -> np.ndarray:
+def measure_spread(observations: np.ndarray) -> np.ndarray:
     """Return the singular values, relative to the first, of the images scaled to unit length, (min(L, P),).
 
     For lights evenly within a cone the second is 0.07 to 0.10 per 10 degrees of its half-angle, on spheres and hills,

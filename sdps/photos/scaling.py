@@ -15,7 +15,7 @@ MOST_PIXELS = 50_000_000
 _AT_ONCE = 2**20
 
 
-def reduced_grey(pixels: np.ndarray, gamma: str | float, shape: tuple[int, int]) -> np.ndarray:
+def reduce_grey(pixels: np.ndarray, gamma: str | float, shape: tuple[int, int]) -> np.ndarray:
     """Return the linear brightness of pixels (H, W, 3), a few rows at a time, reduced to a shape (h, w)."""
     step = max(1, _AT_ONCE // pixels.shape[1])
     rows = (pixels[start : start + step] for start in range(0, len(pixels), step))

@@ -18,7 +18,7 @@ from sdps.photos.pictures.listing import Listing
 from sdps.photos.pictures.picture_kinds import LOSSY, Coding
 from sdps.photos.pictures.picture_names import MASK, is_bare
 from sdps.photos.response import full_scale
-from sdps.photos.scaling import read_reduced_mask, reduced_grey, refuse_huge, scale_note
+from sdps.photos.scaling import read_reduced_mask, reduce_grey, refuse_huge, scale_note
 
 _DARK = 0.5
 """A picture named as a dark frame is one if its mean is under this share of the others' median."""
@@ -63,7 +63,7 @@ def survey(
     Raises:
         InputError: pictures that cannot be used together.
     """
-    masks = _given_masks(folder, listing) if mask_file is None else _Masks(mask_file, ())
+    masks = _read_masks(folder, listing) if mask_file is None else _Masks(mask_file, ())
     look = _Look(folder, listing, gamma, faults, scale, masked=masks.file is not None)
     look.through(judging=True)
     if len(look.kept) < len(look.dropped):  # what most pictures look like is their nature
@@ -177,7 +177,7 @@ class _Look:
             touched = reduce_image((~np.isfinite(pixels).all(-1)).astype(np.float32), self.shape) > 0
             self.broken[(self.broken < 0) & touched] = len(self.kept) - 1
         if not self.masked:
-            self.variation.add(reduced_grey(pixels, self.gamma, self.shape))
+            self.variation.add(reduce_grey(pixels, self.gamma, self.shape))
 
     def _begin(self, name: str, picture: Picture) -> None:
         """Settle what the first photograph decides."""
@@ -196,7 +196,7 @@ class _Masks:
     notes: tuple[str, ...]
 
 
-def _given_masks(folder: Path, listing: Listing) -> _Masks:
+def _read_masks(folder: Path, listing: Listing) -> _Masks:
     """Choose the folder's mask.
 
     `mask.*` is always one; others, such as `cat_mask.png`, must have about two values, and several must

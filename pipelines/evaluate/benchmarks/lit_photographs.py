@@ -199,7 +199,7 @@ def find_images(folder: Path, suffixes: Sequence[str], count: int, gamma: float 
     """
     packed, listed = folder / f"{folder.name}_uncalib.npy", folder / "names.txt"
     if packed.is_file():
-        return packed_images(packed, count)
+        return read_packed(packed, count)
     if listed.is_file():
         files, what = [folder / name for name in read_names(listed)], f"{listed}: "
     else:
@@ -221,7 +221,7 @@ def find_images(folder: Path, suffixes: Sequence[str], count: int, gamma: float 
     return Images.of_files(files, read)
 
 
-def packed_images(path: Path, count: int) -> Images:
+def read_packed(path: Path, count: int) -> Images:
     """Return the images in an array (H, W, 3 L), as the loaders of SDPS-Net's family keep them.
 
     Raises:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pipelines.evaluate.evaluation import Evaluation, Found, TestObject
 from pipelines.evaluate.object_pictures import tiles
-from pipelines.evaluate.published import published_rows
+from pipelines.evaluate.published import read_published_rows
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table
 from pipelines.evaluate.score_tables import object_table, publish, weights_of
 from pipelines.shared import network_flags
@@ -129,7 +129,7 @@ def build_tables(
     return tuple(
         object_table(
             caption, found if metric == "normal_mae" else lights, metric, present=[item.name for item in items],
-            known=bench.known, published=published_rows(bench.name, quantity), digits=digits, note=bench.note,
+            known=bench.known, published=read_published_rows(bench.name, quantity), digits=digits, note=bench.note,
         )
         for caption, quantity, metric, digits in bench.tables
     )  # fmt: skip

@@ -44,7 +44,7 @@ class Votes:
     against: int = 0
     telling: int = 0
 
-    def carried(self, least: float, share: float, times: float) -> bool:
+    def is_carried(self, least: float, share: float, times: float) -> bool:
         """Whether enough tiles agree: so many, such a share of the telling ones, and so many times those against."""
         return self.agree >= max(least, share * self.telling, times * self.against)
 

@@ -176,7 +176,7 @@ class Tracker:
     def take(self, number: int, view: View, shift: Shift, sign: int = 1) -> None:
         """Add the view of image `number`, moved back by its shift, to the others; with `sign` -1, take it out again."""
         back = self._steps(shift, -1)
-        edges, lit, part = (_moved(field, *back) for field in (view.edges, view.lit, view.part))
+        edges, lit, part = (_move_field(field, *back) for field in (view.edges, view.lit, view.part))
         self._edges += sign * edges
         self._strength += sign * np.abs(edges)
         self._lit += sign * lit.astype(np.int32)
@@ -190,10 +190,10 @@ class Tracker:
         whole = self._whole or not 0 < outline.mean() < _FULL
         few = self._count < _FEW
         needed = (WHOLE_OF_FEW if few else WHOLE) if whole else SURE
-        if votes.carried(*needed):
+        if votes.is_carried(*needed):
             return self._shift(votes.rows, votes.columns, suspicious=True, sure=True, alike=True)
         if whole or self._count < _EDGES_FROM:
-            return self._shift(votes.rows, votes.columns, suspicious=votes.carried(*SUSPICIOUS))
+            return self._shift(votes.rows, votes.columns, suspicious=votes.is_carried(*SUSPICIOUS))
         return self._edges_shift(view, outline)
 
     def _edges_shift(self, view: View, outline: np.ndarray) -> Shift:
@@ -215,7 +215,7 @@ class Tracker:
         votes = self._explainer.judge(view.part, rows, columns)
         ahead, behind = _silhouette(outline, view.lit, rows, columns)
         alike = behind <= LIT_BEHIND and votes.agree >= votes.against
-        sure = alike and ahead >= LIT_AHEAD and votes.carried(*BESIDE_EDGES)
+        sure = alike and ahead >= LIT_AHEAD and votes.is_carried(*BESIDE_EDGES)
         return self._shift(rows, columns, suspicious=True, sure=sure, alike=alike)
 
     def _shift(self, rows: int, columns: int, **said: bool) -> Shift:
@@ -285,14 +285,14 @@ def _keep_sure(tracker: Tracker, numbers: list[int], image: Callable[[int], np.n
 
 def _silhouette(outline: np.ndarray, lit: np.ndarray, rows: int, columns: int) -> tuple[float, float]:
     """Return which share is lit of what the outline (h, w), shifted, newly covers, and of what it uncovers."""
-    shifted = _moved(outline, rows, columns)
+    shifted = _move_field(outline, rows, columns)
     covered = shifted & ~ndimage.binary_dilation(outline)
     uncovered = outline & ~ndimage.binary_dilation(shifted)
     ahead, behind = (float(lit[part].mean()) if part.any() else 0.0 for part in (covered, uncovered))
     return ahead, behind
 
 
-def _moved(field: np.ndarray, rows: int, columns: int) -> np.ndarray:
+def _move_field(field: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """Move a field (h, w) down and to the right, zero where nothing came from."""
     if not rows and not columns:
         return field

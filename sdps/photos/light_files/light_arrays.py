@@ -46,7 +46,7 @@ def read_npy(path: Path, count: int, want: Want) -> Table:
         entry = _numpy_entry(handle)
         if entry is None:
             raise InputError(f"{path}: holds no numbers; save the lights with np.save as an array of L x 3 numbers")
-        return _chosen(path, {"": entry}, count, want)
+        return _choose_array(path, {"": entry}, count, want)
 
 
 def read_npz(path: Path, count: int, want: Want) -> Table:
@@ -63,7 +63,7 @@ def read_npz(path: Path, count: int, want: Want) -> Table:
                     found = _numpy_entry(member)
                 if found is not None:
                     entries[name[:-4]] = _Entry(found.shape, partial(_member, archive, name))
-        return _chosen(path, entries, count, want)
+        return _choose_array(path, entries, count, want)
 
 
 def read_mat(path: Path, count: int, want: Want) -> Table:
@@ -76,9 +76,9 @@ def read_mat(path: Path, count: int, want: Want) -> Table:
         warnings.simplefilter("ignore")
         there = scipy_io.whosmat(path)
         numbers = [(name, shape) for name, shape, kind in there if kind in _MATLAB]
-        entries = {name: _Entry(_squeezed(shape), partial(_variable, path, name)) for name, shape in numbers}
+        entries = {name: _Entry(_squeeze(shape), partial(_variable, path, name)) for name, shape in numbers}
         others = [f"{name} ({kind})" for name, _, kind in there if kind not in _MATLAB]
-        return _chosen(path, entries, count, want, others)
+        return _choose_array(path, entries, count, want, others)
 
 
 def _numpy_entry(handle: IO[bytes]) -> _Entry | None:
@@ -98,7 +98,7 @@ def _numpy_entry(handle: IO[bytes]) -> _Entry | None:
             raise ValueError("it ends too early")
         return np.frombuffer(data, kind).reshape(shape, order="F" if columns_first else "C")
 
-    return _Entry(_squeezed(shape), read)
+    return _Entry(_squeeze(shape), read)
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
@@ -112,12 +112,12 @@ def _variable(path: Path, name: str) -> np.ndarray:
     return scipy_io.loadmat(path, variable_names=[name])[name]
 
 
-def _squeezed(shape: tuple[int, ...]) -> tuple[int, ...]:
+def _squeeze(shape: tuple[int, ...]) -> tuple[int, ...]:
     """Leave sides of 1 out, but of two sides."""
     return tuple(side for side in shape if side != 1) if len(shape) > 2 else tuple(shape)
 
 
-def _chosen(
+def _choose_array(
     path: Path, entries: dict[str, _Entry], count: int, want: Want, others: Sequence[str] = ()
 ) -> Table:  # fmt: skip
     """Read the array that is meant."""

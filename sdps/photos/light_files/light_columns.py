@@ -117,17 +117,17 @@ def upright(path: Path, table: Table, count: int, want: Want, signs: Sequence[in
         wanted = {"x", "y", "z"} <= set(kinds) or any(pair <= set(kinds) for pair in _PAIRS)
         if not (want.lights and wanted and "" not in kinds and len(set(kinds)) == len(kinds)):
             return table
-        return _transposed(replace(table, names=None, columns=kinds))
+        return _transpose(replace(table, names=None, columns=kinds))
     if table.columns:
         return table
     along = rows == count and width in {*want.widths, *(width + 1 for width in want.widths)}
     across = width == count and rows in want.widths
     if across and (not along or (want.lights and _columns_are_lights(path, table.values, signs))):
-        return _transposed(table)
+        return _transpose(table)
     return table
 
 
-def _transposed(table: Table) -> Table:
+def _transpose(table: Table) -> Table:
     rows, width = table.values.shape
     note = f"{rows} rows of {width} numbers were taken as {width} lights of {rows} numbers each"
     return replace(table, values=table.values.T, lines=(), notes=(*table.notes, note))

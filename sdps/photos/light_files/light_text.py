@@ -116,7 +116,7 @@ def _content(path: Path, text: str, want: Want) -> tuple[Heading | None, list[tu
 
 def _rows(number: int, line: str, style: _Style, heading: Heading | None) -> Iterator[_Row]:
     """Yield the row of a line; several where semicolons separate rows, as in MATLAB."""
-    mapped = None if heading is None else _mapped(number, line, heading)
+    mapped = None if heading is None else _read_mapping(number, line, heading)
     parts = [part for part in line.split(";") if part.strip("()[]{}, \t")]
     if mapped is not None:
         yield mapped
@@ -148,7 +148,7 @@ def _row(number: int, line: str, style: _Style) -> _Row:
         begin = field.start() + opened
         if opened and text[:opened].strip(_OPENING):
             break
-    return _Row(number, line, _cleaned(line[:begin]), tuple(reversed(values)), comma)
+    return _Row(number, line, _clean(line[:begin]), tuple(reversed(values)), comma)
 
 
 def _name_last(number: int, line: str, style: _Style) -> _Row:
@@ -162,11 +162,11 @@ def _name_last(number: int, line: str, style: _Style) -> _Row:
         values.append(_float(core))
         comma |= "," in core
         end = field.end()
-    name = _cleaned(line[end:])
+    name = _clean(line[end:])
     return _Row(number, line, name, tuple(values), comma) if values else _Row(number, line, name)
 
 
-def _cleaned(name: str) -> str:
+def _clean(name: str) -> str:
     name = name.strip(" \t,;|'\"").rstrip(" \t,;:=|([{'\"").lstrip("{[")
     return "" if name.strip("-*•([{ ") == "" else name.strip(" \t'\"")
 
@@ -175,7 +175,7 @@ def _float(text: str) -> float:
     return float(text.replace(",", ".").lower().replace("d", "e"))
 
 
-def _mapped(number: int, line: str, heading: Heading) -> _Row | None:
+def _read_mapping(number: int, line: str, heading: Heading) -> _Row | None:
     """Read a row as its heading says; None where it has another number of columns."""
     if heading.separator is None:
         cells = line.split()
@@ -218,7 +218,7 @@ def _without_count(rows: list[_Row], count: int) -> tuple[list[_Row], list[str]]
     return (others if said == count == len(others) else rows), []
 
 
-def _allowed(want: Want, heading: Heading | None) -> set[int]:
+def _is_allowed(want: Want, heading: Heading | None) -> set[int]:
     """Return how many numbers a row may have, a number of the picture included."""
     known = len(heading.numbers) if heading is not None else 0
     widths = {known, known + 1, known + 3} if known else set(want.widths)
@@ -229,7 +229,7 @@ def _fits(layout: tuple[int, bool], rows: int, count: int, want: Want, heading: 
     """Tell whether so many rows of a layout (numbers, with a name) can be lights, or one row for each axis."""
     width, named = layout
     turned = rows in want.widths and (width == count or (named and width > 1))
-    return width in _allowed(want, heading) or turned or (named and rows == 2 and width > 1)
+    return width in _is_allowed(want, heading) or turned or (named and rows == 2 and width > 1)
 
 
 def _layout(row: _Row) -> tuple[int, bool]:

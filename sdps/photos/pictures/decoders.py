@@ -93,7 +93,7 @@ def _by_opencv(path: Path, data: bytes | bytearray, kind: str, profile: bytes | 
         raise InputError(f"{path}: pixels are {pixels.dtype}; save it with 8 or 16 bits or 32-bit floats")
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     alpha = pixels[..., 3] if channels == 4 else None
-    rgb = pixels[..., 2::-1] if channels >= 3 else _repeated(pixels)
+    rgb = pixels[..., 2::-1] if channels >= 3 else _repeat_grey(pixels)
     return Decoded(np.ascontiguousarray(rgb), alpha, 8 * pixels.dtype.itemsize, profile, _orientation(orientation))
 
 
@@ -116,15 +116,15 @@ def _by_pillow(*formats: str) -> Callable[[Path, bytes], Decoded]:
 def _exr(path: Path, data: bytes) -> Decoded:
     found = read_exr_colours(path, "copy it again or leave it out")
     pixels, bits = found.pixels.astype(np.float32), 8 * found.pixels.dtype.itemsize
-    return Decoded(_repeated(pixels), found.alpha, bits, layer=found.layer)
+    return Decoded(_repeat_grey(pixels), found.alpha, bits, layer=found.layer)
 
 
 def _pnm(path: Path, data: bytes) -> Decoded:
     pixels = read_netpbm(path, data)
-    return Decoded(pixels if pixels.ndim == 3 else _repeated(pixels), None, 8 * pixels.dtype.itemsize)
+    return Decoded(pixels if pixels.ndim == 3 else _repeat_grey(pixels), None, 8 * pixels.dtype.itemsize)
 
 
-def _repeated(pixels: np.ndarray) -> np.ndarray:
+def _repeat_grey(pixels: np.ndarray) -> np.ndarray:
     """Return (H, W), (H, W, C) with C >= 3, or with a grey channel first, as (H, W, 3)."""
     pixels = pixels.reshape(*pixels.shape[:2], -1)
     wide = pixels[..., :3] if pixels.shape[2] >= 3 else pixels[..., :1]

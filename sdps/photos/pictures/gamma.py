@@ -26,7 +26,7 @@ def resolve_gamma(gamma: str | float, coding: Coding, folders: Sequence[Path]) -
         InputError: a gamma that is none.
     """
     if str(gamma) != "auto":
-        applied = _given_gamma(gamma)
+        applied = _read_gamma(gamma)
         return applied, f"values are taken as {_words(applied)}, as you said"
     if coding.floating:
         return "linear", f"values are taken as linear, because the files are {coding}"
@@ -45,7 +45,7 @@ def resolve_gamma(gamma: str | float, coding: Coding, folders: Sequence[Path]) -
     )
 
 
-def _given_gamma(gamma: str | float) -> str | float:
+def _read_gamma(gamma: str | float) -> str | float:
     if str(gamma) in ("linear", "srgb"):
         return str(gamma)
     try:

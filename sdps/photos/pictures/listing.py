@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from render.shared.errors import InputError
 from render.shared.tables import natural_key, read_names
 from sdps.photos.pictures.picture_kinds import NAMED, SUFFIXES, UNREAD
-from sdps.photos.pictures.picture_names import AMBIENT, DARK, MASK, is_bare, named_roles
+from sdps.photos.pictures.picture_names import AMBIENT, DARK, MASK, is_bare, name_roles
 
 LISTS = ("names.txt", "filenames.txt")
 """Files that name the photographs in order; the first that is there decides."""
@@ -60,7 +60,7 @@ def list_pictures(folder: Path, names: Sequence[str] | None = None) -> Listing:
     if listed is not None:
         choice = _by_list(folder, listed)
     files, there, place = choice.files, choice.there, choice.place
-    roles = named_roles(there)
+    roles = name_roles(there)
     notes = [f"the pictures are those of its folder {place}"] if place else []
     notes += choice.notes
     notes += [
@@ -89,13 +89,13 @@ class _Choice:
 
 
 def _by_list(folder: Path, listed: Path) -> _Choice:
-    files, place = _listed(listed)
+    files, place = _read_list(listed)
     if listed.parent != folder:
         base = listed.parent.relative_to(folder).as_posix()
         files, place = [f"{base}/{name}" for name in files], f"{base}/{place}".rstrip("/")
     there = _pictures(folder) + _below(folder, place)
-    others = [name for name in there if name not in files and named_roles(there).get(name) != MASK]
-    left = f"; not in it: {_joined(others)}" if others else ""
+    others = [name for name in there if name not in files and name_roles(there).get(name) != MASK]
+    left = f"; not in it: {_join(others)}" if others else ""
     return _Choice(
         files, set(files), there, place, [f"{listed.name} names the {len(files)} pictures and their order{left}"]
     )
@@ -103,16 +103,16 @@ def _by_list(folder: Path, listed: Path) -> _Choice:
 
 def _by_name(folder: Path, names: Sequence[str] | None) -> _Choice:
     there, place = _pictures(folder), ""
-    roles = named_roles(there)
+    roles = name_roles(there)
     if all(name in roles for name in there):
         place = _only_folder(folder, there)
         there += _below(folder, place)
-        roles = named_roles(there)
+        roles = name_roles(there)
     usual = [name for name in there if roles.get(name) in (None, DARK)]
-    files, certain = (usual, set()) if names is None else _chosen(folder, names, usual, there)
+    files, certain = (usual, set()) if names is None else _choose(folder, names, usual, there)
     notes = [] if names is None else [f"{len(files)} of {len(usual)} pictures were chosen by name"]
     left = {name: role for name, role in roles.items() if name not in files and role != MASK}
-    return _Choice(files, certain, there, place, notes + _left_out(left if names is None else {}))
+    return _Choice(files, certain, there, place, notes + _name_left_out(left if names is None else {}))
 
 
 def find_light_files(folder: Path) -> list[str]:
@@ -142,7 +142,7 @@ def _folders(folder: Path) -> list[str]:
                 pictures = _pictures(path)
             except OSError:  # not ours to read
                 continue
-            if len(pictures) - len(named_roles(pictures)) >= 2:
+            if len(pictures) - len(name_roles(pictures)) >= 2:
                 found.append(path.name)
     return found
 
@@ -160,7 +160,7 @@ def _only_folder(folder: Path, there: Sequence[str]) -> str:
     return folders[0] if folders else ""
 
 
-def _listed(path: Path) -> tuple[list[str], str]:
+def _read_list(path: Path) -> tuple[list[str], str]:
     """Return the files that a list names, and the folder in the list's folder that they lie in, empty for itself."""
     folder, names = path.parent, read_names(path)
     best: list[str | None] = []
@@ -168,7 +168,7 @@ def _listed(path: Path) -> tuple[list[str], str]:
         pictures = {name.lower(): name for name in reversed(_pictures(folder / place))}
         stems = Counter(Path(name).stem for name in pictures)
         bare = {Path(name).stem: whole for name, whole in pictures.items() if stems[Path(name).stem] == 1}
-        found = [_found(folder, place, name, pictures, bare) for name in names]
+        found = [_find(folder, place, name, pictures, bare) for name in names]
         if None not in found:
             files = [name for name in found if name is not None]
             twice = next((name for name, count in Counter(files).items() if count > 1), None)
@@ -182,7 +182,7 @@ def _listed(path: Path) -> tuple[list[str], str]:
     raise InputError(f"{path}: names {missing}, which is not there; copy it there or drop the line")
 
 
-def _found(folder: Path, place: str, name: str, pictures: dict[str, str], bare: dict[str, str]) -> str | None:
+def _find(folder: Path, place: str, name: str, pictures: dict[str, str], bare: dict[str, str]) -> str | None:
     """Find what a list names: as it stands, or the last part of a path from elsewhere, with or without suffix."""
     parts = PurePosixPath(name.replace("\\", "/"))
     inside = not parts.is_absolute() and ".." not in parts.parts and not re.match(r"[A-Za-z]:", name)
@@ -193,7 +193,7 @@ def _found(folder: Path, place: str, name: str, pictures: dict[str, str], bare: 
     return None if found is None else f"{place}/{found}" if place else found
 
 
-def _chosen(
+def _choose(
     folder: Path, names: Sequence[str], usual: Sequence[str], there: Sequence[str]
 ) -> tuple[list[str], set[str]]:
     """Expand patterns, in their order, and take out what those with `!` match; return those named in full as well."""
@@ -219,17 +219,17 @@ def _matches(file: str, pattern: str) -> bool:
     return fnmatch(file, pattern) or fnmatch(Path(file).name, pattern)
 
 
-def _left_out(roles: dict[str, str]) -> list[str]:
+def _name_left_out(roles: dict[str, str]) -> list[str]:
     """Say which pictures are left out, and why."""
     kinds: dict[str, list[str]] = {}
     for name, role in roles.items():
         kinds.setdefault(role, []).append(name)
     why = {AMBIENT: "ambient; not yet subtracted"}
-    texts = [f"{_joined(names)} ({why.get(role, role + ' by name')})" for role, names in kinds.items()]
+    texts = [f"{_join(names)} ({why.get(role, role + ' by name')})" for role, names in kinds.items()]
     return [f"left out: {', '.join(texts)}; --images takes what it names"] if texts else []
 
 
-def _joined(names: Sequence[str]) -> str:
+def _join(names: Sequence[str]) -> str:
     """Name files, of very many the first and the last."""
     if len(names) <= _MOST:
         return ", ".join(names)

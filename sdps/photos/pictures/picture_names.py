@@ -35,7 +35,7 @@ def split_words(name: str) -> list[str]:
     return [word.lower() for run in runs for word in _HUMPS.sub(" ", run).split()]
 
 
-def named_roles(names: Sequence[str]) -> dict[str, str]:
+def name_roles(names: Sequence[str]) -> dict[str, str]:
     """Return what those pictures are by their names that are not photographs by theirs.
 
     A word counts where it stands by itself, so `unmasked`, `masked` and `normandy` say nothing. A word that most of the

@@ -168,7 +168,7 @@ def test_rank_correlation_is_that_of_the_shared_materials():
 
 
 def test_methods_are_read_and_distinguished(tmp_path):
-    found = {m.name: m for m in eval_figures.wanted_methods(["least-squares", "pf14", "pf14"], tmp_path)}
+    found = {m.name: m for m in eval_figures.choose_methods(["least-squares", "pf14", "pf14"], tmp_path)}
     assert set(found) == {"least-squares, true lights", "pf14"}
     least, maxima = found["least-squares, true lights"], found["pf14"]
     assert least.lighting == "true" and not sweep.finds(least, "direction_mae")
@@ -179,21 +179,21 @@ def test_methods_are_read_and_distinguished(tmp_path):
     assert not sweep.finds(replace(pair, intensities="true"), "intensity_error")
     blind = Method(name="x", normals="upsfcn")
     assert sweep.paper_row(blind) == "B9" and not sweep.finds(blind, "direction_mae")
-    assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "bunny") == 6.9
-    assert pf14.published(pair, "normal_mae", "phenolic", "biased:100", "sphere") is None
+    assert pf14.find_published(pair, "normal_mae", "phenolic", "biased:100", "bunny") == 6.9
+    assert pf14.find_published(pair, "normal_mae", "phenolic", "biased:100", "sphere") is None
     with pytest.raises(InputError, match="want METHOD or LIGHTS"):
-        eval_figures.wanted_methods(["a+b+c+d"], tmp_path)
+        eval_figures.choose_methods(["a+b+c+d"], tmp_path)
     with pytest.raises(InputError, match="unknown"):
-        eval_figures.wanted_methods(["pf-14"], tmp_path)
+        eval_figures.choose_methods(["pf-14"], tmp_path)
 
 
 def test_default_methods_are_those_with_weights(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(pretrained, "list_shipped", list)
-    names = [method.name for method in eval_figures.wanted_methods([], tmp_path)]
+    names = [method.name for method in eval_figures.choose_methods([], tmp_path)]
     assert names == ["pf14", "least-squares, true lights"] and "classical methods only" in caplog.text
     for name in ("lcnet", "nenet"):
         write_text(tmp_path / "models" / name / f"{name}.safetensors", "not read here")
-    assert next(m.name for m in eval_figures.wanted_methods([], tmp_path)) == "lcnet + nenet"
+    assert next(m.name for m in eval_figures.choose_methods([], tmp_path)) == "lcnet + nenet"
 
 
 # ---- whole runs

@@ -12,7 +12,7 @@ from sdps import photos
 from sdps.photos.analysis.motion import Tracker, second_look
 from sdps.photos.checks import Finding
 from sdps.photos.masks import Variation, automatic_mask
-from sdps.photos.measures import spread
+from sdps.photos.measures import measure_spread
 
 RING = np.arange(12) * 2 * np.pi * 5 / 12
 AROUND = np.stack([0.8 * np.cos(RING), 0.8 * np.sin(RING), np.full(12, 0.6)], axis=-1)
@@ -238,7 +238,7 @@ def test_similar_and_frontal_lights(tmp_path: Path, tilt: float) -> None:
 def test_the_spread_of_singular_values() -> None:
     for degrees in (10, 20, 40):
         images, mask = folders.matte(cone(degrees))
-        values = spread(images.mean(-1)[:, mask])
+        values = measure_spread(images.mean(-1)[:, mask])
         assert 0.05 < values[1] / (degrees / 10) < 0.11
         assert values[2] > 0.4 * values[1]
 

@@ -15,7 +15,7 @@ import torch
 from pipelines.evaluate.benchmarks import suite
 from pipelines.evaluate.benchmarks.diligent import OBJECTS, DiligentConfig, diligent_objects
 from pipelines.evaluate.evaluation import Result
-from pipelines.evaluate.published import published_rows
+from pipelines.evaluate.published import read_published_rows
 from pipelines.evaluate.report.sections import read_sections
 from pipelines.evaluate.score_tables import object_table
 from render.shared.config import to_plain
@@ -55,7 +55,7 @@ def scores(out: Path) -> dict:
 
 @pytest.mark.parametrize("quantity", ["directions", "intensities", "normals"])
 def test_published_rows_are_whole_and_average_to_what_was_printed(quantity):
-    for row in published_rows("diligent", quantity):
+    for row in read_published_rows("diligent", quantity):
         assert set(row.figures) in (set(), set(OBJECTS)), row.method
         if row.figures:
             tolerance = 0.0011 if row.average < 1 else 0.06  # averages were printed from unrounded figures
@@ -63,9 +63,9 @@ def test_published_rows_are_whole_and_average_to_what_was_printed(quantity):
 
 
 def test_known_cells_of_the_paper():
-    rows = {row.method: row for row in published_rows("diligent", "normals")}
+    rows = {row.method: row for row in read_published_rows("diligent", "normals")}
     assert rows["SDPS-Net"].figures["harvest"] == 17.43 and rows["LINO-UniPS"].figures["reading"] == 6.67
-    assert published_rows("diligent", "directions")[1].figures["goblet"] == 10.36
+    assert read_published_rows("diligent", "directions")[1].figures["goblet"] == 10.36
 
 
 def test_exact_answers_tables_and_resuming(tree, models, tmp_path, capsys, monkeypatch):
@@ -143,7 +143,7 @@ def test_any_of_the_folders_is_taken(tree, where):
 def test_foreign_objects_alone_have_no_published_rows():
     found = {"ours": {"cone": Result({"normal_mae": 1.0})}}
     table = object_table("t", found, "normal_mae", present=["cone"], known=OBJECTS, digits=2,
-                         published=published_rows("diligent", "normals"))  # fmt: skip
+                         published=read_published_rows("diligent", "normals"))  # fmt: skip
     assert table.header == ("method", "source", "cone", "this object") and len(table.rows) == 1
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.evaluate.benchmarks import stacks
 from pipelines.evaluate.benchmarks.lit_photographs import gourd_apple_objects, light_stage_objects, pick_front
-from pipelines.evaluate.published import published_rows
+from pipelines.evaluate.published import read_published_rows
 from render.shared.errors import InputError
 from render.shared.images import write_png
 from sdps.classical import registry
@@ -42,7 +42,7 @@ def normals_off(item) -> float:
 @pytest.mark.parametrize("quantity", ["directions", "intensities"])
 @pytest.mark.parametrize("dataset", ["gourd-apple", "light-stage"])
 def test_published_rows_average_to_what_was_printed(dataset, quantity):
-    for row in published_rows(dataset, quantity):
+    for row in read_published_rows(dataset, quantity):
         if row.figures:
             tolerance = 0.0011 if row.average < 1 else 0.011
             assert np.mean(list(row.figures.values())) == pytest.approx(row.average, abs=tolerance), row.method

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sdps.photos.pictures.picture_names import AMBIENT, DARK, MASK, NORMALS, named_roles, split_words
+from sdps.photos.pictures.picture_names import AMBIENT, DARK, MASK, NORMALS, name_roles, split_words
 
 SHOTS = [f"p{number:02}.png" for number in range(1, 9)]
 
@@ -23,7 +23,7 @@ SHOTS = [f"p{number:02}.png" for number in range(1, 9)]
     ],
 )  # fmt: skip
 def test_words_say_what_a_picture_is(name: str, role: str) -> None:
-    assert named_roles([*SHOTS, name]) == {name: role}
+    assert name_roles([*SHOTS, name]) == {name: role}
 
 
 @pytest.mark.parametrize(
@@ -32,21 +32,21 @@ def test_words_say_what_a_picture_is(name: str, role: str) -> None:
      "without-mask_1.png", "abnormal.png", "depths_of_field"[:4] + "n.png", "darkness.png", "DSC_0001.JPG", "01.png"],
 )  # fmt: skip
 def test_parts_of_words_say_nothing(name: str) -> None:
-    assert named_roles([*SHOTS, name]) == {}
+    assert name_roles([*SHOTS, name]) == {}
 
 
 def test_a_word_that_most_names_share_is_the_objects() -> None:
     african = [f"african_mask_{number}.jpg" for number in range(12)]
-    assert named_roles(african) == {}
-    assert named_roles([*african, "mask.png", "african_mask_normal.png"]) == {
+    assert name_roles(african) == {}
+    assert name_roles([*african, "mask.png", "african_mask_normal.png"]) == {
         "mask.png": MASK, "african_mask_normal.png": NORMALS,
     }  # fmt: skip
-    assert named_roles([f"normal_{number}.png" for number in range(5)]) == {}
+    assert name_roles([f"normal_{number}.png" for number in range(5)]) == {}
 
 
 def test_one_mask_for_each_photograph_is_not_most() -> None:
     masks = [f"{number}_mask.png" for number in range(5)]
-    assert named_roles([*(f"{number}.png" for number in range(5)), *masks, "mask.png"]) == dict.fromkeys(
+    assert name_roles([*(f"{number}.png" for number in range(5)), *masks, "mask.png"]) == dict.fromkeys(
         [*masks, "mask.png"], MASK
     )
 
