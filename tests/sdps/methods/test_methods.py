@@ -267,7 +267,7 @@ def test_the_page_shows_the_pair_trained_here_and_the_best_shipped_way(runs: Pat
     assert both == ["lcnet + nenet", "lcnet + psfcn (shipped)", least_squares]
     write_weights(kept.with_name("lcnet-soft.safetensors"), "lcnet-soft")
     assert merltest.pick_pictured(rows.normal_methods(runs))[1] == "lcnet-soft + psfcn (shipped)"
-    given = [Method(name="psfcn, true lights", lights="true", normals="psfcn")]
+    given = [Method(name="psfcn, true lights", lighting="true", normals="psfcn")]
     assert merltest.pick_pictured(given) == ["psfcn, true lights", least_squares]
 
 
