@@ -140,14 +140,16 @@ Commands = Mapping[str, Command | Group]
 
 
 GROUPS = {
-    "what goes in": {"preset", "set", "models", "data", "mask", "images", "gamma", "scale", "self-test", "method",
-                     "methods", "objects"},
+    "what goes in": {"preset", "set", "models", "data", "mask", "images", "gamma", "scale", "anyway", "self-test",
+                     "objects"},
     "lights": {"lights", "light-set", "intensities", "frame", "light-distance"},
+    "how it is solved": {"method", "methods", "refine", "discontinuities", "read-out", "light-views", "normal-views",
+                         "keep-stray-light", "lighting", "normals"},
     "which scenes": {"ids", "split", "limit", "count", "skip-missing", "shard", "retry-failed", "shapes", "materials",
                      "category", "role"},
     "what comes out": {"out", "json", "layout", "bits", "exposure", "mitsuba", "photographs", "tensorboard"},
     "the machine": {"workers", "keep-free", "timeout", "cache-gb", "cluster", "cluster-config", "stream", "precision",
-                    "light-views", "normal-views", "verify"},
+                    "verify"},
 }  # fmt: skip
 """Headings of flags in every command's help; a flag that is not here stands under `options`."""
 

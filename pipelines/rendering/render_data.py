@@ -42,7 +42,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=0, metavar="N",
                         help="processes (default: what cores and memory allow; 1 on a GPU)")  # fmt: skip
     parser.add_argument("--keep-free", type=float, default=budget.KEEP_FREE / 1e9, metavar="GB",
-                        help="disk space to leave free")  # fmt: skip
+                        help=f"disk space to leave free (default: {budget.KEEP_FREE / 1e9:.1f})")  # fmt: skip
 
 
 def run_options(args: argparse.Namespace) -> RunOptions:

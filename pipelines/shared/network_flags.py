@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--normal-views", type=int, default=default.normal_views, metavar="N",
                         help="the same for normals, each at full cost (default: the method's)")  # fmt: skip
     parser.add_argument("--keep-stray-light", dest="stray_light", action="store_false",
-                        help="leave on the images what they show where the object is in shadow")  # fmt: skip
+                        help="do not remove the light that reaches shadowed parts of the object")  # fmt: skip
 
 
 def describe(runners: Sequence["Runner"], config: InferenceConfig) -> str:
