@@ -1,1 +1,1 @@
-"""Thin entry points: parse, build, run. The only room that knows both `render` and `sdps`."""
+"""The commands, thin: parse, build, run; with the app and the evaluation, which need both `render` and `sdps`."""

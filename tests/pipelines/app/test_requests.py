@@ -158,20 +158,23 @@ def test_a_large_manifest_is_read_off_the_event_loop(
     read = data_routes.read_manifest
     scene = json.loads(client.get("/data/scenes?folder=run/data"))[0]["id"]
 
-    def slow(folder: Path) -> Any:
-        time.sleep(3.0)
-        return read(folder)
-
-    monkeypatch.setattr(data_routes, "read_manifest", slow)
     for method, path in (("GET", "scene"), ("POST", "start")):
+        begun, go, released = threading.Event(), threading.Event(), []
+
+        def slow(folder: Path, begun: threading.Event = begun, go: threading.Event = go, found: list = released) -> Any:
+            begun.set()
+            found.append(go.wait(30))  # False: nothing else was answered meanwhile
+            return read(folder)
+
+        monkeypatch.setattr(data_routes, "read_manifest", slow)
         data_routes._index_manifest.cache_clear()
         asking = threading.Thread(target=client.send, args=(method, f"/data/{path}?folder=run/data&id={scene}"))
         asking.start()
-        time.sleep(0.1)
-        began = time.monotonic()
+        assert begun.wait(30)
         client.get("/static/icon.svg")
-        assert time.monotonic() - began < 1.5
+        go.set()
         asking.join()
+        assert released[0]
 
 
 def test_a_scene_that_was_rendered_again_is_shown_anew(tmp_path: Path, served: tuple[str, Any], client: Client) -> None:

@@ -2,10 +2,8 @@
 
 import json
 import threading
-import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -16,9 +14,8 @@ from app_server import Client, application, eventually
 from pipelines.app.common import jobs as module
 from pipelines.app.common.jobs import Job, Jobs
 
-SLOW = 4.0
-AT_ONCE = 2.0
-"""Seconds, generous for a busy machine; a call that waits for the slow end of a process takes twice as many."""
+PATIENCE = 30.0
+"""Seconds after which something that should have happened has not."""
 
 
 @pytest.fixture
@@ -33,36 +30,46 @@ def state(job: Job, wanted: str) -> bool:
     return eventually(lambda: job.state == wanted)
 
 
-def slow_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the end of a process take seconds, as that of a large one may."""
-    join = BaseProcess.join
-    monkeypatch.setattr(BaseProcess, "join", lambda self, timeout=None: (time.sleep(SLOW), join(self, timeout))[1])
+class Ends:
+    """Holds up the end of every process until it is let go, as that of a large one takes long.
 
+    Attributes:
+        begun: Set once somebody waits for a process to end.
+        missed: Whether somebody waited in vain: nothing that a test calls may be held up by it.
+    """
 
-@contextmanager
-def at_once() -> Iterator[None]:
-    began = time.monotonic()
-    yield
-    assert time.monotonic() - began < AT_ONCE
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.begun, self.missed, self._go = threading.Event(), False, threading.Event()
+        join = BaseProcess.join
+
+        def wait(process: BaseProcess, timeout: float | None = None) -> None:
+            self.begun.set()
+            self.missed |= not self._go.wait(PATIENCE)
+            join(process, timeout)
+
+        monkeypatch.setattr(BaseProcess, "join", wait)
+
+    def let_go(self) -> None:
+        """Let processes end; first make sure that somebody waits, and that nobody else had to."""
+        assert self.begun.wait(PATIENCE) and not self.missed
+        self._go.set()
 
 
 def test_nothing_but_the_queues_thread_waits_for_a_process(jobs: Jobs, monkeypatch: pytest.MonkeyPatch) -> None:
     running = jobs.submit("me", "sleep", seconds=60, place="/a")
     assert running is not None and state(running, "running")
-    slow_to_end(monkeypatch)
-    with at_once():
-        jobs.cancel(running)
-        assert jobs.describe(running)["state"] == "cancelled"
-    time.sleep(0.4)  # now the thread waits
-    with at_once():
-        waiting = jobs.submit("me", "echo", place="/a")
-        other = jobs.submit("you", "echo")
-        assert waiting is not None and other is not None
-        assert jobs.describe(waiting)["before"] == 0 and jobs.works_in(Path("/a"))
-        jobs.forget("me")
-        assert not jobs.works_in(Path("/a")) and jobs.get("me", waiting.id) is None
+    ends = Ends(monkeypatch)
+    jobs.cancel(running)
+    assert jobs.describe(running)["state"] == "cancelled"
+    assert ends.begun.wait(PATIENCE)
+    waiting = jobs.submit("me", "echo", place="/a")
+    other = jobs.submit("you", "echo")
+    assert waiting is not None and other is not None
+    assert jobs.describe(waiting)["before"] == 0 and jobs.works_in(Path("/a"))
+    jobs.forget("me")
+    assert not jobs.works_in(Path("/a")) and jobs.get("me", waiting.id) is None
+    ends.let_go()
     assert state(other, "done")
-    monkeypatch.undo()
 
 
 def test_the_server_answers_while_a_worker_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,38 +77,26 @@ def test_the_server_answers_while_a_worker_ends(tmp_path: Path, monkeypatch: pyt
     pytest.importorskip("uvicorn", reason="needs pip install sdps[app]")
     monkeypatch.setattr(module, "serve", pretend_worker.serve)
     with application(tmp_path) as (address, app):
-        client, longest, over = Client(address), [0.0], threading.Event()
-
-        def watch() -> None:
-            while not over.is_set():
-                began = time.monotonic()
-                with urllib.request.urlopen(f"{address}/static/icon.svg", timeout=30) as answer:
-                    answer.read()
-                longest[0] = max(longest[0], time.monotonic() - began)
-                time.sleep(0.05)
-
+        client = Client(address)
         job = client.post("/studio/start/gallery")
         assert client.wait(job)["state"] == "done"
         running = app.state.jobs.submit(client.token, "sleep", seconds=60)
         assert state(running, "running")
         with monkeypatch.context() as patched:
-            slow_to_end(patched)
-            watching = threading.Thread(target=watch)
-            watching.start()
-            with at_once():
-                assert client.post(f"/jobs/{running.id}/cancel")["state"] == "cancelled"
-            for _ in range(4):
-                time.sleep(0.1)
-                with at_once():
-                    client.get(f"/jobs/{running.id}")
-                    client.post("/photographs/sets")
-            app.state.jobs.submit(client.token, "sleep", seconds=60)
-            time.sleep(SLOW)
-            with at_once():
-                app.state.jobs.forget(client.token)
-            over.set()
-            watching.join()
-        assert longest[0] < AT_ONCE
+            ends = Ends(patched)
+            assert client.post(f"/jobs/{running.id}/cancel")["state"] == "cancelled"
+            assert ends.begun.wait(PATIENCE)
+            client.get(f"/jobs/{running.id}")
+            client.post("/photographs/sets")
+            with urllib.request.urlopen(f"{address}/static/icon.svg", timeout=PATIENCE) as answer:
+                answer.read()
+            ends.let_go()
+        running = app.state.jobs.submit(client.token, "sleep", seconds=60)
+        assert state(running, "running")
+        with monkeypatch.context() as patched:
+            ends = Ends(patched)
+            app.state.jobs.forget(client.token)
+            ends.let_go()
 
 
 def test_a_worker_that_died_while_idle_costs_no_job(jobs: Jobs) -> None:

@@ -273,13 +273,14 @@ def test_one_who_is_cancelled_waits_for_the_thread_before_it_cleans_up(tmp_path:
     from pipelines.app.common.sessions import Session
 
     session = Session("token", tmp_path)
-    written = []
+    written, begun, go = [], threading.Event(), threading.Event()
 
     def write(coming: Incoming) -> None:
         for number in range(20):
             coming.take(10, "a")
             (coming.folder / str(number)).write_bytes(bytes(10))
-            time.sleep(0.02)
+            begun.set()
+            go.wait(30)  # for what is cancelled
         written.append(coming.folder)
 
     async def upload() -> None:
@@ -288,10 +289,11 @@ def test_one_who_is_cancelled_waits_for_the_thread_before_it_cleans_up(tmp_path:
 
     async def cancelled() -> None:
         task = asyncio.create_task(upload())
-        await asyncio.sleep(0.1)
+        assert await asyncio.to_thread(begun.wait, 30)
         for _ in range(3):
             task.cancel()
-            await asyncio.sleep(0.02)
+            await asyncio.sleep(0)
+        go.set()
         with pytest.raises(asyncio.CancelledError):
             await task
 
