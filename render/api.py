@@ -54,10 +54,10 @@ def shape(source: ShapeLike) -> TriangleMesh:
     if isinstance(source, TriangleMesh):
         reach = float(np.linalg.norm(source.vertices, axis=1).max())
         if reach > _UNIT:
-            raise InputError(f"mesh: reaches to radius {reach:.3g}, beyond the unit sphere; use its normalised()")
+            raise InputError(f"mesh: reaches to radius {reach:.3g}, beyond the unit sphere; use its normalise()")
         return source
     if isinstance(source, trimesh.Trimesh):
-        return from_trimesh(source).normalised()
+        return from_trimesh(source).normalise()
     return registry.load(str(source))
 
 

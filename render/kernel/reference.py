@@ -56,7 +56,7 @@ def scene_dict(
             },
             "sampler": {"type": "independent", "sample_count": spp},
         },
-        "object": build_mesh(mesh.posed(view), bsdf),
+        "object": build_mesh(mesh.pose(view), bsdf),
         "light": _POINT if near else _DIRECTIONAL,
     }
 

@@ -133,7 +133,7 @@ def save(folder: str | Path, spec: SceneSpec, mesh: TriangleMesh | None = None) 
         raise InputError(f"{folder}: holds other files; choose a new folder for the Mitsuba scene")
     with atomic_folder(folder) as temporary:
         bsdfs = [_material(temporary, number, material) for number, material in enumerate(surface.components)]
-        _write_mesh(temporary / MESH, mesh.posed(spec.view), shares)
+        _write_mesh(temporary / MESH, mesh.pose(spec.view), shares)
         tree = ET.ElementTree(_scene(spec, _blend(bsdfs)))
         ET.indent(tree, space="    ")
         tree.write(temporary / SCENE, encoding="utf-8", xml_declaration=True)

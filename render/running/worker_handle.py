@@ -82,7 +82,7 @@ class WorkerHandle:
                 return (line["spec"], line["bytes"]) == (scene.digest(), size) and is_finished(line)
         return False
 
-    def blamed(self) -> tuple[str, ...]:
+    def find_blamed(self) -> tuple[str, ...]:
         """Return the scenes it was at when it ended; if it had not begun its chunk, those of the first view."""
         if self.current or not self.left or self.left is not self.given:
             return self.current

@@ -210,7 +210,7 @@ class LocalPool:
         if not worker.ready:
             last = f": {tail.splitlines()[-1]}" if tail else ""
             return [Fatal(f"a rendering process did not start ({reason}){last}; run `sdps doctor`")]
-        blamed = worker.blamed()  # if nobody were, the next process would end in the same way, for ever
+        blamed = worker.find_blamed()  # if nobody were, the next process would end in the same way, for ever
         for id in blamed:
             worker.tick_off(id)
         if worker.left:

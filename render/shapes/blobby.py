@@ -69,8 +69,8 @@ def blobby(seed: int) -> TriangleMesh:
     rng = seeds.generator(seed, "blobby")
     kind = ("radial", "flowing", "merged")[rng.integers(3)]
     if kind == "merged":
-        return polygonise(merge_balls(rng), half_size=1.8, triangles=60_000).normalised()
-    return displace_sphere(rng, draw_parameters(rng, flowing=kind == "flowing")).normalised()
+        return polygonise(merge_balls(rng), half_size=1.8, triangles=60_000).normalise()
+    return displace_sphere(rng, draw_parameters(rng, flowing=kind == "flowing")).normalise()
 
 
 def merge_balls(rng: np.random.Generator) -> Field:

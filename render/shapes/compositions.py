@@ -37,7 +37,7 @@ def composition(seed: int) -> TriangleMesh:
     Object 0 is the ground, bowl or niche where there is one.
     """
     rng = seeds.generator(seed, "composition")
-    return join(KINDS[kind(seed)][0](rng)).normalised()
+    return join(KINDS[kind(seed)][0](rng)).normalise()
 
 
 def kind(seed: int) -> str:
@@ -98,12 +98,12 @@ def links(rng: np.random.Generator) -> list[TriangleMesh]:
         position = float(link.vertices[:, 0].min() + link.vertices[:, 0].max()) / 2 + ring
         roll += 90 + rng.uniform(-25, 25)
     turn = Rotation.random(rng=rng).as_matrix()
-    return [link.rotated(turn) for link in chain]
+    return [link.rotate(turn) for link in chain]
 
 
 def concave(rng: np.random.Generator) -> list[TriangleMesh]:
     """Build a single deeply concave object, in half of the cases on a ground."""
-    body = polygonise(weather(rng, grounds.hollow(rng)), half_size=1.7, triangles=2 * TRIANGLES).normalised()
+    body = polygonise(weather(rng, grounds.hollow(rng)), half_size=1.7, triangles=2 * TRIANGLES).normalise()
     if rng.random() < 0.5:
         return [body]
     pile = [_mesh(grounds.ground(rng), 1.4)]
@@ -131,8 +131,8 @@ def part(rng: np.random.Generator) -> TriangleMesh:
         form, stands = weather(rng, RECIPES[name][0](rng)), name in _STANDING and rng.random() < 0.8
     else:
         form, stands = _solid(rng), False
-    mesh = polygonise(form, half_size=1.7, triangles=TRIANGLES).normalised()
-    return mesh.rotated(sdf.rotation("y", rng.uniform(-180, 180))) if stands else _lay_down(rng, mesh)
+    mesh = polygonise(form, half_size=1.7, triangles=TRIANGLES).normalise()
+    return mesh.rotate(sdf.rotation("y", rng.uniform(-180, 180))) if stands else _lay_down(rng, mesh)
 
 
 def _solid(rng: np.random.Generator) -> Field:
@@ -162,7 +162,7 @@ def _lay_down(rng: np.random.Generator, mesh: TriangleMesh) -> TriangleMesh:
     turns = Rotation.random(_POSES, rng=rng).as_matrix()  # (P, 3, 3)
     points = mesh.vertices - mesh.vertices.mean(0)
     heights = (-turns[:, 1] @ points.T).max(1)
-    return mesh.rotated(turns[int(heights.argmin())])
+    return mesh.rotate(turns[int(heights.argmin())])
 
 
 def _scale(rng: np.random.Generator, mesh: TriangleMesh, low: float, high: float) -> TriangleMesh:

@@ -59,7 +59,7 @@ def load_named(name: str) -> TriangleMesh:
             f"{path}: changed since the plan was made (SHA-256 {found}, planned {digits}); put the former file back, "
             "or plan again into another --out"
         )
-    return load_mesh(path).rotated(TO_Y[up]).normalised()
+    return load_mesh(path).rotate(TO_Y[up]).normalise()
 
 
 def _digits(path: Path) -> str:

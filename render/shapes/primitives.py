@@ -47,7 +47,7 @@ def bunny() -> TriangleMesh:
     # The file is z-up with the tail towards +x and its right side towards +y.
     x, y, z = mesh.vertices.T
     nx, ny, nz = mesh.normals.T
-    return replace(mesh, vertices=np.stack([x, z, -y], axis=1), normals=np.stack([nx, nz, -ny], axis=1)).normalised()
+    return replace(mesh, vertices=np.stack([x, z, -y], axis=1), normals=np.stack([nx, nz, -ny], axis=1)).normalise()
 
 
 def bunny_file() -> Path:

@@ -69,7 +69,7 @@ def _load(name: str) -> TriangleMesh:
     family = FAMILIES.get(base)
     if family is None:
         if Path(name).suffix[1:].lower() in trimesh.available_formats() or Path(name).is_file():
-            return load_mesh(name).normalised()
+            return load_mesh(name).normalise()
         raise unknown("shape", name, FAMILIES, "or give the path of a mesh file")
     if not family.seeded:
         if colon:

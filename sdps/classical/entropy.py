@@ -69,7 +69,7 @@ def entropy(
         raise InputError(f"want at least 1 start and 100 samples, got {starts} and {samples}")
     prepared = prepare(images, mask, front=front)
     standard = standard_form(prepared.factors)
-    surface = prepared.factors.transformed(standard).surface
+    surface = prepared.factors.transform(standard).surface
     surface = generator(seed, "entropy").permutation(surface)[:samples]
     minima = _search(surface, starts)
     best = Gbr(*minima[0, 1:])

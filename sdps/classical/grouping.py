@@ -72,7 +72,7 @@ def grouping(
     rng = generator(seed, "grouping")
     pixels, albedo, normal = _groups(prepared, rng)
     standard = standard_form(prepared.factors)
-    best, residual = _best_draw(prepared.factors.transformed(standard).surface[pixels], albedo, normal, draws, rng)
+    best, residual = _best_draw(prepared.factors.transform(standard).surface[pixels], albedo, normal, draws, rng)
     return conclude(prepared, standard.then(best), Notes(albedo_groups=int(albedo.max()) + 1, residual=residual))
 
 

@@ -269,7 +269,7 @@ class Cycle:
         z = np.zeros(right.shape, np.float32)
         if self.coarser is None:
             # The mean of a component is free: what rounding makes of it would grow without bound.
-            z[self.mask] = self._centred(self.exact.matvec(self._centred(right[self.mask].astype(np.float64))))
+            z[self.mask] = self._centre(self.exact.matvec(self._centre(right[self.mask].astype(np.float64))))
             return z
         for colour in (0, 1):
             _relax(self.across, self.down, right, z, colour)
@@ -280,7 +280,7 @@ class Cycle:
             _relax(self.across, self.down, right, z, colour)
         return z
 
-    def _centred(self, values: np.ndarray) -> np.ndarray:
+    def _centre(self, values: np.ndarray) -> np.ndarray:
         """Return values (n,) less their mean over each component."""
         return values - (np.bincount(self.labels, values) / np.bincount(self.labels))[self.labels]
 

@@ -70,7 +70,7 @@ class TriangleMesh:
                 raise InputError(f"mesh objects: expected a number for each of {len(faces)} faces, got {objects.shape}")
             object.__setattr__(self, "objects", objects)
 
-    def normalised(self) -> "TriangleMesh":
+    def normalise(self) -> "TriangleMesh":
         """Centre the mesh on its bounding sphere and scale it so that the farthest vertex is at radius 1."""
         centred = self.vertices - bounding_centre(self.vertices)
         radius = np.linalg.norm(centred, axis=1).max()
@@ -78,7 +78,7 @@ class TriangleMesh:
             raise InputError("mesh vertices: all at one point")
         return replace(self, vertices=centred / radius)
 
-    def rotated(self, rotation: np.ndarray) -> "TriangleMesh":
+    def rotate(self, rotation: np.ndarray) -> "TriangleMesh":
         """Apply the rotation matrix `rotation` (3, 3), acting on column vectors, to positions and normals."""
         rotation = np.asarray(rotation, dtype=np.float64)
         if rotation.shape != (3, 3) or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
@@ -88,9 +88,9 @@ class TriangleMesh:
         turn = rotation.T.astype(np.float32)
         return replace(self, vertices=self.vertices @ turn, normals=unit(self.normals @ turn))
 
-    def posed(self, view: View) -> "TriangleMesh":
+    def pose(self, view: View) -> "TriangleMesh":
         """Rotate, scale and move the mesh into the camera frame (units: half image widths)."""
-        turned = self.rotated(view.matrix())
+        turned = self.rotate(view.matrix())
         return replace(turned, vertices=turned.vertices * view.scale + np.array([*view.offset, 0.0]))
 
 

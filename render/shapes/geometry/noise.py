@@ -34,7 +34,7 @@ class Waves:
         cosines = np.cos(angles)
         return self.weights @ np.sin(angles), [self.weights @ (cosines * (self.vectors @ way)) for way in tangents]
 
-    def drawn_out(self, direction: np.ndarray, factor: float) -> "Waves":
+    def stretch(self, direction: np.ndarray, factor: float) -> "Waves":
         """Turn lumps into ridges along the unit vector `direction`: wave vectors lean away from it by `factor`.
 
         Wave numbers stay, and with them the spacing across the ridges.

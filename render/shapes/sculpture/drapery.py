@@ -19,7 +19,7 @@ def folds(rng: np.random.Generator, spacing: float, *, tilt: float = 0.25) -> Fi
     number = np.pi / spacing  # furrows lie where the noise is zero, twice per wave
     way = np.array([rng.normal(0, tilt), 1.0, rng.normal(0, tilt)])
     waves = scalar_waves(rng, 0.75 * number, 1.3 * number, count=10, slope=0)
-    waves = waves.drawn_out(way / np.linalg.norm(way), np.exp(rng.uniform(np.log(6), np.log(24))))
+    waves = waves.stretch(way / np.linalg.norm(way), np.exp(rng.uniform(np.log(6), np.log(24))))
     kind = rng.random()
     if kind < 0.35:
         pattern = sdf.furrows(waves, rng.uniform(0.15, 0.5))  # full lobes, as of heavy wool

@@ -38,7 +38,7 @@ def sculpture(seed: int) -> TriangleMesh:
     """Build the sculpture of `seed`, closed, upright (y up), within the unit sphere."""
     rng = seeds.generator(seed, "sculpture")
     build, _ = RECIPES[recipe(seed)]
-    return polygonise(weather(rng, build(rng)), half_size=1.7).normalised()
+    return polygonise(weather(rng, build(rng)), half_size=1.7).normalise()
 
 
 def weather(rng: np.random.Generator, solid: Field) -> Field:

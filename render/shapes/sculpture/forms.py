@@ -60,7 +60,7 @@ def rock(rng: np.random.Generator) -> Field:
         strata = scalar_waves(rng, 10, 30, count=10, slope=0.5)
         axis, spread = _directions(rng, 1)[0], rng.uniform(4, 10)
         for way in np.linalg.svd(axis[None])[2][1:]:  # the two directions within a layer
-            strata = strata.drawn_out(way, spread)
+            strata = strata.stretch(way, spread)
         stone = sdf.displace(stone, strata, rng.uniform(0.01, 0.03))
     if rng.random() < 0.5:
         lines = sdf.cracks(scalar_waves(rng, 3, 8), rng.uniform(0.08, 0.2))

@@ -44,7 +44,7 @@ def _add_hair(rng: np.random.Generator, face: Field) -> Field:
     strand = np.array([rng.normal(0, 0.3), -1, rng.normal(0, 0.5)])
     waves = scalar_waves(rng, 14, 26, count=16, slope=0)
     if rng.random() < 0.65:
-        waves = waves.drawn_out(strand / np.linalg.norm(strand), rng.uniform(3, 6))
+        waves = waves.stretch(strand / np.linalg.norm(strand), rng.uniform(3, 6))
     relief = sdf.furrows(waves, 0.25)
     swirl, strength = vector_waves(rng, 3, 7, count=8), rng.uniform(0.02, 0.1)
     style = rng.random()

@@ -38,7 +38,7 @@ class Factors:
     lights: np.ndarray
     singular: np.ndarray
 
-    def transformed(self, gbr: Gbr) -> "Factors":
+    def transform(self, gbr: Gbr) -> "Factors":
         """Return the factors after a bas-relief transformation."""
         surface, lights = gbr.apply(self.surface, self.lights)
         return replace(self, surface=surface, lights=lights)

@@ -96,7 +96,7 @@ def conclude(prepared: Prepared, gbr: Gbr, notes: Notes = NO_NOTES) -> Estimate:
         gbr: The method's bas-relief transformation of the prepared factors.
         notes: What the method notes besides `albedo` and `gbr`.
     """
-    factors = orient(prepared.factors.transformed(gbr), prepared.mask)
+    factors = orient(prepared.factors.transform(gbr), prepared.mask)
     strength = np.linalg.norm(factors.lights, axis=0)
     directions = (factors.lights / np.maximum(strength, 1e-12)).T
     directions[strength <= 0.0] = (0.0, 0.0, 1.0)

@@ -79,7 +79,7 @@ def read_lights(
     axes = turn * table.signs  # the file's own axes first
     if table.doubt:
         _stop(faults, table.doubt)
-    vectors, strengths, said = _ordered(path, table, files, axes.sum(axis=1).tolist())
+    vectors, strengths, said = _order_rows(path, table, files, axes.sum(axis=1).tolist())
     vectors = vectors @ axes.T
     lengths = np.linalg.norm(vectors, axis=1)
     zero = [file for file, length in zip(files, lengths, strict=True) if length < 1e-9]
@@ -158,7 +158,7 @@ def write_lights(
     write_json(path, {"frame": FRAME, "images": rows})
 
 
-def _ordered(
+def _order_rows(
     path: Path, table: Table, files: Sequence[str], signs: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return vectors (L, 3) as the file has them, intensities (L, 0), (L, 1) or (L, 3) and notes, a row per picture."""

@@ -124,7 +124,7 @@ def test_object_ids_are_what_rays_meet_first(built):
     mesh, size = built["heap"], 32
     view = View(rotation=tuple(compositions.sdf.rotation("yx", 20, 40).ravel()), scale=1.1)
     truth, _ = support.render(mesh, "lambertian:0.5", lights=support.unit([0, 0, 1]), view=view, size=size, spp=16)
-    posed = [part.posed(view) for part in objects(mesh)]
+    posed = [part.pose(view) for part in objects(mesh)]
     fine = 4 * size
     axis = (np.arange(fine) + 0.5) / fine * 2 - 1
     x, y = np.meshgrid(axis, -axis)

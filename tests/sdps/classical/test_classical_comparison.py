@@ -35,7 +35,7 @@ def best_error(factors: Factors, truth: np.ndarray) -> float:
 
     def error(parameters: np.ndarray) -> float:
         gbr = Gbr(parameters[0], parameters[1], float(np.exp(np.clip(parameters[2], -5.0, 5.0))))
-        return float(angle_degrees(factors.transformed(gbr).normals(), truth).mean())
+        return float(angle_degrees(factors.transform(gbr).normals(), truth).mean())
 
     starts = ([0.0, 0.0, depth] for depth in (-0.7, 0.0, 0.7))
     return min(optimize.minimize(error, start, method="Nelder-Mead").fun for start in starts)

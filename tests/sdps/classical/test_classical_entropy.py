@@ -40,9 +40,9 @@ def test_brightness_does_not_matter():
 def test_standard_form_does_not_depend_on_the_start():
     scene = few_albedos(2)
     factors = prepare(scene.images, scene.mask, front="none").factors
-    expected = factors.transformed(standard_form(factors)).surface
-    other = factors.transformed(Gbr(0.7, -1.3, 2.5))
-    np.testing.assert_allclose(other.transformed(standard_form(other)).surface, expected, atol=1e-9)
+    expected = factors.transform(standard_form(factors)).surface
+    other = factors.transform(Gbr(0.7, -1.3, 2.5))
+    np.testing.assert_allclose(other.transform(standard_form(other)).surface, expected, atol=1e-9)
 
 
 def test_same_seed_same_answer():

@@ -71,8 +71,8 @@ def test_equal_lights_resolve_the_ambiguity():
 
 def test_equal_intensity_undoes_any_transformation(exact):
     surface, lights = truth(exact), exact.lights.T.astype(np.float64)  # all of strength one
-    factors = Factors(surface, lights, np.ones(3)).transformed(Gbr(0.4, -0.3, 0.6))
-    recovered = factors.transformed(equal_intensity(factors))
+    factors = Factors(surface, lights, np.ones(3)).transform(Gbr(0.4, -0.3, 0.6))
+    recovered = factors.transform(equal_intensity(factors))
     assert np.allclose(recovered.lights, lights, atol=1e-4)
 
 

@@ -27,7 +27,7 @@ def prepared(scene: scenes.Scene) -> Prepared:
 def solve(prepared: Prepared, maxima: pf14.Maxima, start: Gbr | None = None) -> np.ndarray:
     """Return the normals (H, W, 3) found from factors that a transformation has put elsewhere first."""
     start = start or Gbr()
-    gbr = pf14.median_gbr(*pf14.intersect(prepared.factors.transformed(start), maxima))
+    gbr = pf14.median_gbr(*pf14.intersect(prepared.factors.transform(start), maxima))
     return conclude(prepared, start.then(gbr)).normals
 
 

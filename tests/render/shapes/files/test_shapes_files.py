@@ -367,7 +367,7 @@ def test_the_console_stays_clean(tmp_path, recwarn, caplog, capfd, case):
     }  # fmt: skip
     (tmp_path / case).write_text(contents[case])
     try:
-        load_mesh(tmp_path / case).normalised()
+        load_mesh(tmp_path / case).normalise()
     except InputError as error:
         assert "\n" not in str(error)
     assert not recwarn.list and not caplog.records and capfd.readouterr() == ("", "")

@@ -51,7 +51,7 @@ def test_arrays_get_their_dtypes():
 def test_normalised_centres_on_the_bounding_sphere():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=2.5)
     points = np.asarray(ball.vertices) + np.array([4.0, -1.0, 2.0])
-    mesh = TriangleMesh(vertices=points, faces=ball.faces, normals=vertex_normals(points, ball.faces)).normalised()
+    mesh = TriangleMesh(vertices=points, faces=ball.faces, normals=vertex_normals(points, ball.faces)).normalise()
     radii = np.linalg.norm(mesh.vertices, axis=1)
     assert radii.max() == pytest.approx(1, abs=1e-6)
     assert radii.min() > 0.98
@@ -59,13 +59,13 @@ def test_normalised_centres_on_the_bounding_sphere():
 
 def test_rotated_turns_positions_and_normals():
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # about z: x to y
-    mesh = triangle().rotated(quarter)
+    mesh = triangle().rotate(quarter)
     np.testing.assert_allclose(mesh.vertices[0], [0, 1, 0], atol=1e-7)
     np.testing.assert_allclose(mesh.normals[0], [0, 1, 0], atol=1e-7)
     with pytest.raises(InputError, match="mirrors"):
-        triangle().rotated(np.diag([1.0, 1, -1]))
+        triangle().rotate(np.diag([1.0, 1, -1]))
     with pytest.raises(InputError, match="orthonormal"):
-        triangle().rotated(2 * np.eye(3))
+        triangle().rotate(2 * np.eye(3))
 
 
 def test_area_weights_follow_the_larger_face():
@@ -192,7 +192,7 @@ def test_a_damaged_file_loads_or_ends_in_one_line_that_names_it(tmp_path, suffix
             damaged[place] = rng.integers(256)
         path.write_bytes(damaged)
         try:
-            load_mesh(path).normalised()
+            load_mesh(path).normalise()
         except InputError as error:
             refused += 1
             assert "\n" not in str(error) and str(path) in str(error)

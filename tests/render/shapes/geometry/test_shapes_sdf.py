@@ -40,7 +40,7 @@ def test_waves_have_unit_variance_and_vector_waves_no_divergence():
 
 def test_drawn_out_waves_keep_their_wave_number_and_slow_down_along_the_direction():
     waves = scalar_waves(generator(2, "test"), 10.0, 20.0)
-    ridges = waves.drawn_out(np.array([0.0, 1.0, 0.0]), 10.0)
+    ridges = waves.stretch(np.array([0.0, 1.0, 0.0]), 10.0)
     np.testing.assert_allclose(np.linalg.norm(ridges.vectors, axis=1), np.linalg.norm(waves.vectors, axis=1), rtol=1e-5)
     assert np.abs(ridges.vectors[:, 1]).mean() < 0.3 * np.abs(waves.vectors[:, 1]).mean()
 
