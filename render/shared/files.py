@@ -1,9 +1,13 @@
 """Writing files so that a reader meets either the whole file or none."""
 
+import errno
 import hashlib
 import json
 import os
+import random
 import re
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -16,7 +20,10 @@ from render.shared.temporary import discard, temporary_path, tidy
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _DIGITS = re.compile(r"[0-9a-fA-F_:]+")
 _LONG_NUMBER = re.compile(r"[0-9a-fA-F_:]{256}")
-_TRIES = 9  # to put a folder in place, while other processes put theirs
+_PUTTING = threading.Lock()  # threads of this process take turns; other processes are waited for
+# What a rename says where another process has just put a folder (or, replacing a link, a file); Windows' own first.
+_ANOTHER = {errno.EACCES if os.name == "nt" else errno.ENOTEMPTY, errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR}
+_WAIT_S = 30.0  # how long to try to put a folder in place, while other processes put theirs
 _PLAIN_NAME = re.compile(r"(?!\.)[^/\\\0-\x1f\x7f]{1,200}")
 
 
@@ -84,7 +91,8 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
                 elif below.is_dir():
                     _flush_folder(below)
             _flush_folder(temporary)
-            _put_in_place(temporary, path)
+            with _PUTTING:
+                _put_in_place(temporary, path)
     finally:
         discard(temporary)
 
@@ -97,9 +105,9 @@ def _tidy_once(folder: Path) -> None:
 
 def _put_in_place(new: Path, path: Path) -> None:
     """Rename a folder to `path`. What was there is moved aside, and removed only once the new one stands there."""
-    aside = []
+    aside, given_up = [], time.monotonic() + _WAIT_S
     try:
-        for left in reversed(range(_TRIES)):
+        while True:
             if os.path.lexists(path):
                 aside.append(temporary_path(path, "old"))
                 with suppress(FileNotFoundError):  # another process was faster
@@ -107,16 +115,17 @@ def _put_in_place(new: Path, path: Path) -> None:
             try:
                 os.replace(new, path)
                 break
-            except OSError:  # another process has put one there
-                if not left or not os.path.lexists(path):
+            except OSError as error:
+                if error.errno not in _ANOTHER or time.monotonic() > given_up:
                     raise
+            time.sleep(random.uniform(0, 0.02))  # or processes in step would meet again and again
         _flush_folder(path.parent)  # before the old one is removed
     finally:
         for old in reversed(aside):
             if not os.path.lexists(path):
-                with suppress(OSError):
+                with suppress(OSError):  # another process was faster
                     os.rename(old, path)
-            else:
+            if os.path.lexists(path):
                 discard(old)
 
 

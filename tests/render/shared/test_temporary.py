@@ -1,10 +1,12 @@
 """Temporary names: one per writer, removed by nobody while the writer may be alive, and folders that come back."""
 
+import errno
 import fcntl
 import os
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -141,6 +143,35 @@ def test_threads_that_replace_one_folder_leave_a_whole_one(tmp_path: Path) -> No
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == names
     assert len({path.read_text() for path in (tmp_path / "a").iterdir()}) == 1
+
+
+def test_a_folder_is_put_in_place_however_often_another_process_is_faster(tmp_path: Path, monkeypatch) -> None:
+    real, faster = os.replace, iter(range(40))
+
+    def replace(source: Path, target: Path) -> None:
+        if target == tmp_path / "a" and next(faster, None) is not None:
+            target.mkdir()
+            (target / "theirs").write_text("")
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    with files.atomic_folder(tmp_path / "a") as folder:
+        (folder / "ours").write_text("")
+    assert next(faster, None) is None
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["ours"]
+
+
+def test_a_folder_that_may_not_be_put_in_place_fails_at_once(tmp_path: Path, monkeypatch) -> None:
+    def replace(*_paths: Path) -> None:
+        raise PermissionError(errno.EPERM, "not permitted")
+
+    (tmp_path / "a").mkdir()
+    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr(time, "sleep", lambda _: pytest.fail("waited"))
+    with pytest.raises(InputError, match="not permitted"), files.atomic_folder(tmp_path / "a"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
 def test_a_link_or_a_file_in_the_place_of_a_folder_is_replaced_itself(tmp_path: Path) -> None:
