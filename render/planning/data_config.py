@@ -47,10 +47,15 @@ class DataConfig:
         near_lights: Share of the views, in [0, 1], whose lights are near: points at distances drawn from
             `near_light_distance`, in the directions that `lights` gives from the object's centre, where their
             irradiance is pi.
-        near_light_distance: Range of these distances, in half image widths, drawn uniformly in 1 / distance.
+        near_light_distance: Range of these distances, in half image widths, drawn uniformly in 1 / distance; the upper
+            end may be `.inf`.
+        near_light_spread: The lights of a view stand about equally far: their distances have one of that range in
+            common, and factors whose logarithms have a standard deviation of up to this, drawn for each view, as
+            lamps held by hand do. None: each distance is drawn by itself.
         camera: `orthographic` or `perspective` for all views, or `mixed`: half of the views each, drawn at random.
         camera_distance: Range of the distance of a perspective camera from the plane of the object's centre, in half
-            image widths, drawn as that of lights. The field of view is 2 atan(1 / distance): 28 to 11 degrees.
+            image widths, drawn as that of lights, but never below 1.5 of the object's radius. The field of view is
+            2 atan(1 / distance): 28 to 11 degrees.
         size: Image side in pixels, a multiple of 4.
         spp: Camera samples per pixel; more did not make trained networks better (docs/studies/renderer.md).
         bounces: Interreflection bounces.
@@ -83,6 +88,7 @@ class DataConfig:
     light_count: int = 64
     near_lights: float = 0.0
     near_light_distance: tuple[float, float] = (2.5, 6.0)
+    near_light_spread: float | None = None
     camera: str = "orthographic"
     camera_distance: tuple[float, float] = (4.0, 10.0)
     size: int = 128
@@ -167,16 +173,17 @@ class DataConfig:
             raise InputError("tiles: parts of an image need camera: orthographic; set tiles to 1")
         sizes = {family: (self.upright_scale if self.stands(family) else self.scale)[1] for family in self.families}
         largest = max(size * self.tiles_of(family) for family, size in sizes.items())
-        used = {"near_light_distance": self.near_lights > 0, "camera_distance": self.camera != "orthographic"}
-        for name, is_used in used.items():
+        for name in ("near_light_distance", "camera_distance"):
             low, high = getattr(self, name)
             if not 0 < low <= high:
                 raise InputError(f"{name} must be two rising positive numbers, got {low}, {high}")
-            if is_used and low <= largest:
-                raise InputError(
-                    f"{name} must be above the radius of the largest object ({largest:g} by scale and upright_scale), "
-                    f"got {low}"
-                )
+        if self.near_lights > 0 and self.near_light_distance[0] <= largest:
+            raise InputError(
+                f"near_light_distance must be above the radius of the largest object ({largest:g} by scale and "
+                f"upright_scale), got {self.near_light_distance[0]}"
+            )
+        if self.near_light_spread is not None and not 0 <= self.near_light_spread <= 1:
+            raise InputError(f"near_light_spread must be in [0, 1], got {self.near_light_spread}")
 
     def stands(self, family: str) -> bool:
         """Return whether the shapes of a family have an up and stand."""

@@ -27,6 +27,7 @@ __all__ = ["DataConfig", "is_validation", "material_pool", "plan", "random_view"
 POSES_TRIED = 24  # per view, before the shape is given up
 SHAPES_TRIED = 8
 HELD_OUT = "held-out"  # the materials that training never sees
+_CLEAR = 1.5  # of the object's radius: no camera stands nearer
 EMPTY = 0.02  # share of the frame below which a tile shows nothing worth rendering
 
 
@@ -216,14 +217,15 @@ def _draw_pose(config: DataConfig, keys: tuple[Any, ...], rng: np.random.Generat
     halves = generator(config.seed, *keys, "cameras")
     if config.camera != PERSPECTIVE and not (config.camera == MIXED and halves.random() < 0.5):
         return pose
-    (distance,) = _distances(config.camera_distance, 1, generator(config.seed, *keys, "camera"))
+    low, high = (max(limit, _CLEAR * pose.scale) for limit in config.camera_distance)
+    (distance,) = _distances((low, high), 1, generator(config.seed, *keys, "camera"))
     return replace(pose, camera_distance=distance)
 
 
 def _distances(limits: tuple[float, float], count: int, rng: np.random.Generator) -> tuple[float, ...]:
     """Draw distances uniformly in 1 / distance, which what they change in an image follows."""
     low, high = limits
-    return tuple(round(1 / float(value), 6) for value in rng.uniform(1 / high, 1 / low, count))
+    return tuple(round(1 / max(float(value), 1e-6), 6) for value in rng.uniform(1 / high, 1 / low, count))
 
 
 def _near(config: DataConfig, keys: tuple[Any, ...]) -> tuple[float, ...]:
@@ -231,7 +233,12 @@ def _near(config: DataConfig, keys: tuple[Any, ...]) -> tuple[float, ...]:
     rng = generator(config.seed, *keys, "near")
     if rng.random() >= config.near_lights:
         return ()
-    return _distances(config.near_light_distance, config.light_count, rng)
+    if config.near_light_spread is None:
+        return _distances(config.near_light_distance, config.light_count, rng)
+    (common,) = _distances(config.near_light_distance, 1, rng)
+    factors = np.exp(rng.uniform(0, config.near_light_spread) * rng.standard_normal(config.light_count))
+    least = config.near_light_distance[0]  # beyond the object
+    return tuple(round(max(common * float(factor), least), 6) for factor in factors)
 
 
 def _draw_view(config: DataConfig, family: str, keys: tuple[Any, ...], mesh: Any) -> View | None:

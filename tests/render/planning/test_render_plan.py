@@ -72,6 +72,20 @@ def test_near_lights_and_perspective_leave_all_else_alone():
     assert [scene.view.camera_distance for scene in framed] == [scene.view.camera_distance for scene in plan(config)]
 
 
+def test_lights_of_a_view_stand_about_equally_far_and_no_camera_stands_in_the_object():
+    config = replace(
+        SMALL, families={"blobby": 40}, views=1, near_lights=1.0, near_light_distance=(2.5, float("inf")),
+        near_light_spread=0.2, camera="perspective", camera_distance=(1.3, float("inf")),
+    )  # fmt: skip
+    scenes = by_id(plan(config)).values()
+    logs = np.log([scene.light_distances for scene in scenes])  # (scenes, L)
+    assert 2.5 <= np.exp(logs.min()) < 3.5 and np.exp(logs.max()) > 20
+    assert 0.01 < logs.std(axis=1).min() + 0.01 and logs.std(axis=1).max() < 0.35
+    assert np.abs(np.median(logs, axis=1) - np.log(5.0)).mean() < 1.2  # half of them nearer than twice 2.5
+    nearest = np.array([scene.view.camera_distance / scene.view.scale for scene in scenes])
+    assert nearest.min() >= 1.49 and nearest.max() > 8 and (nearest < 2.5).mean() > 0.15
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -79,7 +93,8 @@ def test_near_lights_and_perspective_leave_all_else_alone():
         ({"near_lights": 0.5, "near_light_distance": (1.1, 3.0)}, "near_light_distance must be above the radius"),
         ({"near_light_distance": (3.0, 2.0)}, "near_light_distance must be two rising"),
         ({"camera": "perspektive"}, "perspective"),
-        ({"camera": "perspective", "camera_distance": (1.0, 3.0)}, "camera_distance must be above the radius"),
+        ({"near_light_spread": -0.1}, "near_light_spread must be in"),
+        ({"camera": "perspective", "camera_distance": (0.0, 3.0)}, "camera_distance must be two rising"),
         ({"camera": "perspective", "tiles": 2, "upright_scale": (1.0, 1.5)}, "camera: orthographic"),
     ],
 )

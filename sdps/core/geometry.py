@@ -1,0 +1,148 @@
+"""Where an object, its camera and its lamps stood: lines of sight, positions, and how light reaches each pixel.
+
+Camera frame: x right, y up, z to the camera. Lengths are in pixels at the object's mean depth; the origin lies there,
+at the principal point. A pinhole stands at (0, 0, f), f its focal length in pixels, so that a point (X, Y, Z) is seen
+at (x, y) = (X, Y) / (1 - Z / f); an orthographic camera has f = inf. Pixel p, light i:
+
+    v'_p   = (-x_p / f, -y_p / f, 1),  v_p = v'_p / |v'_p|                 line of sight, from the surface to the camera
+    X_p    = (x_p (1 - z_p / f),  y_p (1 - z_p / f),  z_p)                 position
+    off_pi = l_i - rho_i (X_p - C) / R                                     towards lamp i, in its distances
+    l_pi   = off_pi / |off_pi|,   falloff_pi = 1 / |off_pi|^2              direction, and irradiance over that at C
+
+The object has its middle C, the mean of its pixels at mean depth, and its radius R, half the longer side of its box.
+Lamp i stands in the direction l_i from C, at the distance R / rho_i; rho is its nearness, 0 of a distant lamp. Slopes
+of the surface are -n_x / (n . v') and -n_y / (n . v'): the derivatives of z where f = inf, else of
+w = -f log(1 - z / f). `render.records.view_geometry` has the same camera, its lengths in half image widths.
+"""
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from render.shared.errors import InputError
+from sdps.core.lighting import library
+
+Array = TypeVar("Array", np.ndarray, torch.Tensor)
+FAR = 0.01
+"""Nearness below which lamps count as distant: over the object, directions differ by a degree at most."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera; orthographic unless it has a focal length.
+
+    Attributes:
+        focal: Focal length in pixels; inf: orthographic.
+        principal: Column and row of the principal point, (0, 0) the centre of the first pixel; None: the middle of the
+            picture.
+
+    Raises:
+        InputError: a focal length that is not above 0, or a principal point that is not two finite numbers.
+    """
+
+    focal: float = np.inf
+    principal: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.focal > 0.0:
+            raise InputError(f"focal length must be above 0, got {self.focal:g}; leave it out if it is not known")
+        if self.principal is not None and not np.isfinite(self.principal).all():
+            raise InputError(f"principal point must be a column and a row, got {self.principal}")
+
+    @property
+    def is_perspective(self) -> bool:
+        """Whether lines of sight differ."""
+        return bool(np.isfinite(self.focal))
+
+    def middle(self, shape: tuple[int, int]) -> tuple[float, float]:
+        """Return column and row of the principal point of a picture (H, W)."""
+        return self.principal or ((shape[1] - 1) / 2, (shape[0] - 1) / 2)
+
+    def crop(self, shape: tuple[int, int], row: int, column: int) -> "Camera":
+        """Return the camera of a part of a picture (H, W) that begins at a row and a column."""
+        if not self.is_perspective and self.principal is None:
+            return self
+        x, y = self.middle(shape)
+        return Camera(self.focal, (x - column, y - row))
+
+    def scale(self, factor: float) -> "Camera":
+        """Return the camera of the picture at `factor` times its size."""
+        principal = None
+        if self.principal is not None:
+            principal = ((self.principal[0] + 0.5) * factor - 0.5, (self.principal[1] + 0.5) * factor - 0.5)
+        return Camera(self.focal * factor, principal)
+
+    def image_points(self, shape: tuple[int, int]) -> np.ndarray:  # (H, W, 2)
+        """Return x and y of every pixel of a picture (H, W), float64."""
+        column, row = self.middle(shape)
+        x, y = np.arange(shape[1]) - column, row - np.arange(shape[0])
+        return np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=-1).astype(np.float64)
+
+    def sights(self, shape: tuple[int, int]) -> np.ndarray:  # (H, W, 3)
+        """Return v' of every pixel of a picture (H, W), float64: towards the camera, with z = 1."""
+        tilts = -self.image_points(shape) / self.focal if self.is_perspective else np.zeros((*shape, 2))
+        return np.concatenate([tilts, np.ones((*shape, 1))], axis=-1)
+
+    def views(self, shape: tuple[int, int]) -> np.ndarray:  # (H, W, 3)
+        """Return the unit vectors v from the surface to the camera, of every pixel of a picture (H, W), float64."""
+        towards = self.sights(shape)
+        return towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+
+    def positions(self, heights: np.ndarray) -> np.ndarray:  # (H, W, 3)
+        """Return X of every pixel, of heights z (H, W) in pixels, float64."""
+        shrunk = 1.0 - np.asarray(heights, np.float64)[..., None] / self.focal
+        return np.concatenate([self.image_points(heights.shape) * shrunk, heights[..., None]], axis=-1)
+
+    def height(self, logarithmic: Array) -> Array:
+        """Return z of w = -f log(1 - z / f), what slopes integrate to, any shape."""
+        if not self.is_perspective:
+            return logarithmic
+        return -self.focal * library(logarithmic).expm1(-logarithmic / self.focal)
+
+
+ORTHOGRAPHIC = Camera()
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """An object before its camera.
+
+    Attributes:
+        camera: The camera.
+        shape: (H, W) of its picture.
+        centre: (3,) float64, C.
+        radius: R.
+    """
+
+    camera: Camera
+    shape: tuple[int, int]
+    centre: np.ndarray
+    radius: float
+
+    @classmethod
+    def of(cls, mask: np.ndarray, camera: Camera = ORTHOGRAPHIC) -> "Capture":
+        """Return the capture of an object's pixels (H, W) bool."""
+        rows, columns = np.nonzero(mask)
+        column, row = camera.middle(mask.shape)
+        centre = np.array([columns.mean() - column, row - rows.mean(), 0.0])
+        return cls(camera, mask.shape, centre, max(np.ptp(rows), np.ptp(columns)) / 2 + 0.5)
+
+    def places(self, heights: np.ndarray | None = None) -> np.ndarray:  # (H, W, 3)
+        """Return (X - C) / R of every pixel, float64; of heights (H, W) in pixels, or at the object's mean depth."""
+        heights = np.zeros(self.shape) if heights is None else heights
+        return (self.camera.positions(heights) - self.centre) / self.radius
+
+
+def reach(places: Array, directions: Array, nearness: Array) -> tuple[Array, Array]:
+    """Return how light reaches pixels: l (P, L, 3) unit, and falloff (P, L); NumPy, or torch and differentiable.
+
+    Args:
+        places: (P, 3), (X - C) / R.
+        directions: (L, 3) unit, from C to the lamps.
+        nearness: rho, (L,) or a number as an array ().
+    """
+    off = directions - nearness[..., None] * places[:, None]  # (P, L, 3)
+    squared = (off * off).sum(-1)
+    return off / squared[..., None] ** 0.5, 1.0 / squared
