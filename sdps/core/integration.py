@@ -1,5 +1,8 @@
 """From normals to depth, by masked least squares on the graph of neighbouring pixels.
 
+Under perspective the unknown is w = -f log(1 - z / f), and n . v', v' a pixel's line of sight (`Camera.sights`), takes
+the place of n_z; the equations stay. "facing" is the one or the other.
+
 Legend: (H, W) image sides, n mask pixels, m edges between neighbours of the mask. An edge runs from pixel a to pixel b,
 one column to its right or one row above it, so that along it x or y grows by 1.
 """
@@ -15,11 +18,12 @@ from scipy.sparse.csgraph import connected_components
 
 from render.shared.errors import InputError
 from render.shared.progress import share, stage
+from sdps.core.geometry import ORTHOGRAPHIC, Camera
 from sdps.core.laplacian import laplacian, multigrid, solve
 from sdps.core.large_depth import Cycle, Edges, Slopes, bilateral_edges, measure, right_side, smooth_edges, solve_grid
 
 STEEPEST = 0.03
-"""Least n_z that is believed, so that slopes stop at 33. Half a pixel inside the rim of a sphere of radius R pixels,
+"""Least n_z (n . v') that is believed, so that slopes stop at 33. Half a pixel inside the rim of a sphere of radius R pixels,
 n_z is sqrt(1 / R), so this is the rim of R = 1100."""
 _TOLERANCE = 1e-7  # of the linear system
 _ROUGH = 1e-4  # the same while weights still change
@@ -33,23 +37,26 @@ _BAND = 2**18  # pixels looked at at once
 
 @dataclass(frozen=True, eq=False)
 class Depth:
-    """Depth of a surface seen orthographically.
+    """Depth of a surface; `camera.positions(z)` are its points.
 
     Attributes:
-        z: (H, W) float32, towards the camera (nearer is larger), in pixel widths; mean 0 over each component, 0 outside
-            the mask.
+        z: (H, W) float32, towards the camera (nearer is larger), in pixel widths at the mean depth; 0 outside the mask.
+            Its mean over each component is 0; under perspective, that of w, which scales each component so that the
+            geometric mean of its distances to the camera is the focal length.
         mask: (H, W) bool.
         labels: (H, W) int32, number of the connected component (4 neighbours) from 0, -1 outside the mask. How far one
-            component lies before another is not in the normals.
+            component lies before another (under perspective: how large it is) is not in the normals.
         components: Number of components.
         residuals: (H, W) float32, angle in degrees between an edge of the surface and the tangent plane of the mean of
-            its two normals: RMS over a pixel's edges, 0 outside the mask and at pixels without neighbours.
+            its two normals: RMS over a pixel's edges, 0 outside the mask and at pixels without neighbours. Under
+            perspective w stands for z.
         residual: RMS of the same over all edges; 0 for an integrable map, up to discretisation.
-        below: Share of mask pixels whose n_z was under `STEEPEST` and was raised to it.
+        below: Share of mask pixels whose n_z (n . v') was under `STEEPEST` and was raised to it.
         torn: Share of edges taken for discontinuities (weight under 1 % of a smooth edge's); 0 without
             `discontinuities`.
         iterations: Linear systems solved.
         seconds: Wall time.
+        camera: The camera that saw the normals.
     """
 
     z: np.ndarray
@@ -62,6 +69,7 @@ class Depth:
     torn: float
     iterations: int
     seconds: float
+    camera: Camera = ORTHOGRAPHIC
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +80,7 @@ class _Graph:
         edges: (2, m) pixels a and b.
         count: n.
         along: (2, m) float64, n_x or n_y at a and b.
-        facing: (2, m) float64, n_z at a and b, at least `STEEPEST`.
+        facing: (2, m) float64, n_z (n . v') at a and b, at least `STEEPEST`.
         before, after: (m,) the edge of the same direction that ends at a, and that which starts at b; -1 for none.
     """
 
@@ -88,6 +96,7 @@ def integrate(
     normals: np.ndarray,
     mask: np.ndarray,
     *,
+    camera: Camera = ORTHOGRAPHIC,
     discontinuities: bool = False,
     sharpness: float = 2.0,
     most: int = 100,
@@ -100,13 +109,15 @@ def integrate(
 
     With `discontinuities` each pixel has a one-sided equation per neighbour, n_z (z' - z) + n_x = 0, and of the two
     neighbours left and right, or above and below, the one across the smaller step counts more. These are the bilateral
-    weights of Cao et al., Bilateral Normal Integration (ECCV 2022), for an orthographic camera:
+    weights of Cao et al., Bilateral Normal Integration (ECCV 2022), for an orthographic camera, and w for log depth
+    for a pinhole:
     sigmoid(k ((n_z dz of the other side)^2 - (n_z dz of this side)^2)), found again until the energy settles.
 
     Args:
         normals: (H, W, 3) camera frame (x right, y up, z to the camera), of any length and real type; not read
             outside the mask.
         mask: (H, W) bool.
+        camera: The camera that saw them.
         discontinuities: Let depth jump where neighbouring slopes disagree.
         sharpness: k of the weights.
         most: Reweightings at most.
@@ -121,18 +132,20 @@ def integrate(
         raise InputError(f"sharpness must be positive and most at least 1, got {sharpness} and {most}")
     stage("depth")
     if unit is None:
-        return _integrate_large(np.asarray(normals), mask, sharpness if discontinuities else 0.0, most, started)
-    graph = _graph(unit, mask)
+        return _integrate_large(np.asarray(normals), mask, camera, sharpness if discontinuities else 0.0, most, started)
+    facing = _facing(unit, mask, camera)
+    graph = _graph(unit, facing, mask)
     z, weights, iterations = *_smooth(graph), 1
     if discontinuities and len(weights):
         z, weights, iterations = _bilateral(graph, z, sharpness, most)
     torn = (weights < 0.01 * (graph.facing**2).mean(axis=0)).mean() if discontinuities and len(weights) else 0.0
     diagnostics: dict[str, Any] = {
-        "below": float((unit[:, 2] < STEEPEST).mean()),
+        "below": float((facing < STEEPEST).mean()),
         "torn": float(torn),
         "iterations": iterations,
     }
-    return Depth(mask=mask, **_lay_out(graph, mask, z), **diagnostics, seconds=time.perf_counter() - started)
+    laid = _lay_out(graph, mask, z, camera)
+    return Depth(mask=mask, **laid, **diagnostics, seconds=time.perf_counter() - started, camera=camera)
 
 
 def check_normals(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -152,12 +165,19 @@ def check_normals(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return inside / lengths[:, None]
 
 
-def _graph(unit: np.ndarray, mask: np.ndarray) -> _Graph:
+def _facing(unit: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:  # (n,)
+    """Return n . v' of unit normals (n, 3)."""
+    if not camera.is_perspective:
+        return unit[:, 2]
+    return np.einsum("nc,nc->n", unit, camera.sights(mask.shape)[mask])
+
+
+def _graph(unit: np.ndarray, facing: np.ndarray, mask: np.ndarray) -> _Graph:
     """Connect each mask pixel to those on its right and above it."""
     count = len(unit)
     index = np.full(mask.shape, -1, np.int64)
     index[mask] = np.arange(count)
-    facing = np.maximum(unit[:, 2], STEEPEST)
+    facing = np.maximum(facing, STEEPEST)
     parts, offset = [], 0
     for axis, near, far in ((0, index[:, :-1], index[:, 1:]), (1, index[1:], index[:-1])):
         both = (near >= 0) & (far >= 0)
@@ -224,7 +244,7 @@ def _shares(graph: _Graph, z: np.ndarray, sharpness: float) -> np.ndarray:
     return shares
 
 
-def _lay_out(graph: _Graph, mask: np.ndarray, z: np.ndarray) -> dict[str, Any]:
+def _lay_out(graph: _Graph, mask: np.ndarray, z: np.ndarray, camera: Camera) -> dict[str, Any]:
     """Centre the components, measure the residuals, and return both as `Depth` holds them."""
     joined = coo_matrix((np.ones(graph.edges.shape[1], np.int8), tuple(graph.edges)), (graph.count, graph.count))
     components, labels = connected_components(joined, directed=False)
@@ -240,7 +260,7 @@ def _lay_out(graph: _Graph, mask: np.ndarray, z: np.ndarray) -> dict[str, Any]:
         return image
 
     return {
-        "z": picture(z, 0),
+        "z": picture(camera.height(z), 0),
         "labels": picture(labels, -1),
         "components": int(components),
         "residuals": picture(np.sqrt(total / np.maximum(number, 1)), 0),
@@ -248,11 +268,13 @@ def _lay_out(graph: _Graph, mask: np.ndarray, z: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _integrate_large(normals: np.ndarray, mask: np.ndarray, sharpness: float, most: int, started: float) -> Depth:
+def _integrate_large(
+    normals: np.ndarray, mask: np.ndarray, camera: Camera, sharpness: float, most: int, started: float
+) -> Depth:
     """Do what `integrate` does on the grid itself; `sharpness` 0 for a surface without jumps."""
     box = tuple(slice(int(at[0]), int(at[-1]) + 1) for at in (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)))
     inside = np.ascontiguousarray(mask[box])
-    slopes, below = _slopes(normals, mask, box)
+    slopes, below = _slopes(normals, mask, box, camera)
     edges = Edges(*(np.zeros(inside.shape, np.float32) for _ in Edges._fields))
     z, iterations = np.zeros(inside.shape), 1
     smooth_edges(slopes, inside, edges)
@@ -266,10 +288,10 @@ def _integrate_large(normals: np.ndarray, mask: np.ndarray, sharpness: float, mo
         del weights
         with share(0.3, 1.0):
             iterations, weights = _reweight(slopes, inside, z, sharpness, most)
+    laid = _lay_out_large(slopes, inside, z, weights, mask.shape, box, camera)
     return Depth(
-        mask=mask, below=below, iterations=iterations, **_lay_out_large(slopes, inside, z, weights, mask.shape, box),
-        seconds=time.perf_counter() - started,
-    )  # fmt: skip
+        mask=mask, below=below, iterations=iterations, **laid, seconds=time.perf_counter() - started, camera=camera
+    )
 
 
 def _lay_out_large(
@@ -279,14 +301,15 @@ def _lay_out_large(
     weights: tuple[np.ndarray, np.ndarray],
     shape: tuple[int, int],
     box: tuple[slice, ...],
+    camera: Camera,
 ) -> dict[str, Any]:
-    """Do what `_laid_out` does, and tell the share of torn edges."""
+    """Do what `_lay_out` does, and tell the share of torn edges."""
     found, components = ndimage.label(inside)
     labels, depth, residuals = np.full(shape, -1, np.int32), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     labels[box] = found - 1
     numbers, heights = found[inside], z[inside]
     sums, counts = np.bincount(numbers, heights), np.bincount(numbers)
-    depth[box][inside] = heights - (sums / np.maximum(counts, 1))[numbers]
+    depth[box][inside] = camera.height(heights - (sums / np.maximum(counts, 1))[numbers])
     rows, angles = np.zeros((len(inside), 3)), np.zeros(inside.shape, np.float32)
     measure(slopes, inside, z, weights[0], weights[1], angles, rows)
     residuals[box] = angles
@@ -297,7 +320,9 @@ def _lay_out_large(
     }  # fmt: skip
 
 
-def _slopes(normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...]) -> tuple[Slopes, float]:
+def _slopes(
+    normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...], camera: Camera
+) -> tuple[Slopes, float]:
     """Return unit normals of the box, a few rows at a time, and the share that faces the camera too little."""
     shape = mask[box].shape
     slopes = Slopes(*(np.zeros(shape, np.float32) for _ in Slopes._fields))
@@ -309,8 +334,9 @@ def _slopes(normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...]) -> tu
         if not inside.any():
             continue
         unit = check_normals(normals[rows, box[1]], inside)
-        flat += int((unit[:, 2] < STEEPEST).sum())
-        for part, values in zip(slopes, (unit[:, 0], unit[:, 1], np.maximum(unit[:, 2], STEEPEST)), strict=True):
+        facing = _facing(unit, inside, camera.crop(mask.shape, rows.start, box[1].start))
+        flat += int((facing < STEEPEST).sum())
+        for part, values in zip(slopes, (unit[:, 0], unit[:, 1], np.maximum(facing, STEEPEST)), strict=True):
             part[start : start + step][inside] = values
     return slopes, flat / int(mask.sum())
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from sdps.core.geometry import Camera
+
 
 def grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Return x and y (H, W) in pixels from the image's centre, y up."""
@@ -51,3 +53,32 @@ def balls(size: int = 96, radius: float = 18.0) -> tuple[np.ndarray, np.ndarray]
         z[before] = right + ball[before]
         normals[before] = (np.stack([x - right, y - up, ball], axis=-1) / radius)[before]
     return z, normals
+
+
+def sphere_before(
+    camera: Camera, size: int, radius: float, centre: tuple[float, float, float], part: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points (H, W, 3), normals and mask of a sphere that a pinhole sees, out to `part` of its outline."""
+    rays = -camera.sights((size, size))  # from (0, 0, f)
+    off = np.array([0.0, 0.0, camera.focal]) - centre
+    squared, half = (rays**2).sum(-1), rays @ off
+    under = half**2 - squared * (off @ off - radius**2)
+    mask = under > (1.0 - part**2) * radius**2 * squared
+    along = (-half - np.sqrt(np.maximum(under, 0.0))) / squared
+    points = rays * along[..., None] + [0.0, 0.0, camera.focal]
+    return points, ((points - centre) / radius * mask[..., None]).astype(np.float32), mask
+
+
+def plane_before(camera: Camera, shape: tuple[int, int], normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (H, W, 3) and normals of a plane through the origin that a pinhole sees."""
+    rays = -camera.sights(shape)
+    along = -camera.focal * normal[2] / (rays @ normal)
+    normals = np.broadcast_to(normal / np.linalg.norm(normal), (*shape, 3)).astype(np.float32)
+    return rays * along[..., None] + [0.0, 0.0, camera.focal], normals
+
+
+def off_points(found: np.ndarray, truth: np.ndarray, mask: np.ndarray, focal: float) -> np.ndarray:  # (n,)
+    """Return how far points (H, W, 3) are from the truth, once this is scaled from the pinhole to the same mean."""
+    pinhole = np.array([0.0, 0.0, focal])
+    scale = np.exp(np.log(1.0 - found[mask][:, 2] / focal).mean() - np.log(1.0 - truth[mask][:, 2] / focal).mean())
+    return np.linalg.norm(found[mask] - (pinhole + scale * (truth[mask] - pinhole)), axis=-1)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import scipy.sparse as sparse
 from scipy.sparse.linalg import spsolve
-from surface_scenes import balls, from_slopes, grid, sphere, waves
+from surface_scenes import balls, from_slopes, grid, off_points, plane_before, sphere, sphere_before, waves
 
 from render.shared.errors import InputError
-from sdps.core.integration import Depth, integrate
+from sdps.core.geometry import Camera
+from sdps.core.integration import LARGE, Depth, integrate
 from sdps.core.laplacian import laplacian, multigrid, solve
 
 
@@ -198,3 +199,48 @@ def test_a_porous_mask_of_many_components_is_solved(size):
     assert depth.components > size
     labels, off = depth.labels[mask], (depth.z - truth)[mask]
     assert np.abs(off - (np.bincount(labels, off) / np.bincount(labels))[labels]).max() < 0.01
+
+
+@pytest.mark.parametrize("most", [LARGE, 0])
+@pytest.mark.parametrize("principal", [None, (30.0, 90.0)])
+def test_a_sphere_before_a_pinhole_is_where_it_is(principal, most, monkeypatch):
+    monkeypatch.setattr("sdps.core.integration.LARGE", most)
+    camera = Camera(1.5 * 128, principal)
+    truth, normals, mask = sphere_before(camera, 128, 45.0, (8.0, -5.0, -20.0), 0.97)
+    depth = integrate(normals, mask, camera=camera)
+    assert depth.camera is camera and depth.components == 1
+    off = off_points(camera.positions(depth.z.astype(float)), truth, mask, camera.focal)
+    assert off.mean() < 0.01 and off.max() < 0.05
+    distant = integrate(normals, mask)
+    wrong = off_points(camera.positions(distant.z.astype(float)), truth, mask, camera.focal)
+    assert wrong.mean() > 50 * off.mean() and wrong.max() > 1.0
+    w = -camera.focal * np.log(1.0 - depth.z[mask].astype(float) / camera.focal)
+    assert abs(w.mean()) < 1e-4
+    assert integrate(normals, mask, camera=camera, discontinuities=True).below == depth.below == 0
+
+
+def test_a_slanted_plane_before_a_pinhole_is_flat():
+    camera = Camera(150.0)
+    truth, normals = plane_before(camera, (80, 100), np.array([-0.5, 0.3, 1.0]))
+    mask = np.ones((80, 100), bool)
+    for discontinuities in (False, True):
+        depth = integrate(normals, mask, camera=camera, discontinuities=discontinuities)
+        assert off_points(camera.positions(depth.z.astype(float)), truth, mask, 150.0).max() < 0.02
+        assert depth.residual < 0.1
+    distant = camera.positions(integrate(normals, mask).z.astype(float))
+    assert off_points(distant, truth, mask, 150.0).max() > 5.0
+
+
+def test_a_very_long_focal_length_is_orthographic():
+    _, normals, mask = sphere(64, 29.0, 0.95)
+    near = integrate(normals, mask, camera=Camera(1e7)).z
+    assert np.allclose(near, integrate(normals, mask).z, atol=1e-3)
+
+
+def test_the_least_slope_is_that_towards_the_line_of_sight():
+    camera = Camera(100.0)
+    normals = np.zeros((9, 99, 3), np.float32)
+    normals[..., 0], normals[..., 2] = 3.0, 1.0
+    x = np.arange(99) - 49.0
+    expected = ((1.0 - 0.03 * x) / np.sqrt(10.0) < 0.03).mean()
+    assert integrate(normals, np.ones((9, 99), bool), camera=camera).below == pytest.approx(expected)
