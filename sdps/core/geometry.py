@@ -95,6 +95,14 @@ class Camera:
         shrunk = 1.0 - np.asarray(heights, np.float64)[..., None] / self.focal
         return np.concatenate([self.image_points(heights.shape) * shrunk, heights[..., None]], axis=-1)
 
+    def place(
+        self, shape: tuple[int, int], rows: np.ndarray, columns: np.ndarray, heights: np.ndarray
+    ) -> np.ndarray:  # (n, 3)
+        """Return X of some pixels of a picture (H, W), of their rows, columns and heights (n,), float64."""
+        column, row = self.middle(shape)
+        shrunk = 1.0 - np.asarray(heights, np.float64) / self.focal
+        return np.stack([(columns - column) * shrunk, (row - rows) * shrunk, heights], axis=-1)
+
     def height(self, logarithmic: Array) -> Array:
         """Return z of w = -f log(1 - z / f), what slopes integrate to, any shape."""
         if not self.is_perspective:

@@ -23,8 +23,8 @@ from sdps.core.laplacian import laplacian, multigrid, solve
 from sdps.core.large_depth import Cycle, Edges, Slopes, bilateral_edges, measure, right_side, smooth_edges, solve_grid
 
 STEEPEST = 0.03
-"""Least n_z (n . v') that is believed, so that slopes stop at 33. Half a pixel inside the rim of a sphere of radius R pixels,
-n_z is sqrt(1 / R), so this is the rim of R = 1100."""
+"""Least n_z (n . v') that is believed, so that slopes stop at 33. Half a pixel inside the rim of a sphere of radius R
+pixels, n_z is sqrt(1 / R), so this is the rim of R = 1100."""
 _TOLERANCE = 1e-7  # of the linear system
 _ROUGH = 1e-4  # the same while weights still change
 _SETTLED = 1e-3
@@ -320,9 +320,7 @@ def _lay_out_large(
     }  # fmt: skip
 
 
-def _slopes(
-    normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...], camera: Camera
-) -> tuple[Slopes, float]:
+def _slopes(normals: np.ndarray, mask: np.ndarray, box: tuple[slice, ...], camera: Camera) -> tuple[Slopes, float]:
     """Return unit normals of the box, a few rows at a time, and the share that faces the camera too little."""
     shape = mask[box].shape
     slopes = Slopes(*(np.zeros(shape, np.float32) for _ in Slopes._fields))

@@ -12,6 +12,7 @@ from trimesh.visual.color import ColorVisuals
 
 from render.shared.errors import InputError, unknown
 from render.shared.files import atomic_path
+from sdps.core.geometry import ORTHOGRAPHIC, Camera
 from sdps.core.integration import Depth
 from sdps.photos.response import to_linear
 
@@ -41,6 +42,8 @@ def mesh(
     depth: Depth | np.ndarray,
     mask: np.ndarray | None = None,
     *,
+    camera: Camera | None = None,
+    millimetres: float | None = None,
     colour: np.ndarray | None = None,
     normals: np.ndarray | None = None,
     steepest: float | None = None,
@@ -48,13 +51,16 @@ def mesh(
 ) -> trimesh.Trimesh:
     """Triangulate the masked pixels: a vertex at each pixel's centre, two triangles between four, one between three.
 
-    The frame is the camera's, x right, y up, z to the camera, with the origin at the image's centre and the longer
-    image side 2 long. Triangles face the camera (anticlockwise when seen from it). Of a square's two diagonals the one
-    across the smaller step is taken. Pixels that are part of no triangle (lines one pixel wide) get no vertex.
+    The frame is the camera's, x right, y up, z to the camera, with the origin at the principal point (the image's
+    centre) at depth 0; the longer image side is 2 long there, or as long as `millimetres` says. Triangles face the
+    camera (anticlockwise when seen from it). Of a square's two diagonals the one across the smaller step is taken.
+    Pixels that are part of no triangle (lines one pixel wide) get no vertex.
 
     Args:
         depth: Of `integrate`, or (H, W) z in pixels towards the camera.
         mask: (H, W) bool; that of `depth` if not given.
+        camera: The camera that saw it; that of `depth` if not given, and orthographic for an array.
+        millimetres: Millimetres per pixel at depth 0: the mesh is in millimetres.
         colour: (H, W, 3) uint8, sRGB colours of the vertices.
         normals: (H, W, 3), normals of the vertices, not those of the triangles around them.
         steepest: Leave out triangles with an edge that rises by more pixels than this per pixel, such as walls across
@@ -64,6 +70,7 @@ def mesh(
     Raises:
         InputError: sizes or types that do not fit, depth that is not finite, or no triangle.
     """
+    camera = camera or (depth.camera if isinstance(depth, Depth) else ORTHOGRAPHIC)
     z, mask = _check(depth, mask, colour, normals)
     height, width = mask.shape
     few = slice(None, None, every), slice(None, None, every)
@@ -78,9 +85,9 @@ def mesh(
         raise InputError("no three neighbouring mask pixels make a triangle; mark a larger object, or raise steepest")
     used, faces = np.unique(faces, return_inverse=True)
     rows, columns = rows[used], columns[used]
-    places = every * columns - (width - 1) / 2, (height - 1) / 2 - every * rows, every * z[rows, columns]
+    places = camera.place((height, width), every * rows, every * columns, every * z[rows, columns])
     return trimesh.Trimesh(
-        vertices=np.stack(places, axis=-1) * unit_scale((height, width)),
+        vertices=places * (millimetres or unit_scale((height, width))),
         faces=faces.reshape(-1, 3),
         vertex_normals=None if normals is None else np.asarray(normals[few][rows, columns], np.float64),
         vertex_colors=None if colour is None else colour[few][rows, columns],

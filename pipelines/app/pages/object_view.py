@@ -131,4 +131,5 @@ def _mesh(result: "Inference", path: Path) -> None:
     colour = None
     if albedo is not None:
         colour = pictures.tone_map(albedo[few] / max(float(np.percentile(albedo[mask], 99)), 1e-9))
-    write_mesh(mesh(z[few] / step, mask[few], colour=colour, normals=result.normals[few]), path)
+    camera = result.depth.camera.scale(1.0 / step)
+    write_mesh(mesh(z[few] / step, mask[few], camera=camera, colour=colour, normals=result.normals[few]), path)

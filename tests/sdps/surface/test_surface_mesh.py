@@ -7,12 +7,13 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from surface_scenes import balls, sphere
+from surface_scenes import balls, sphere, sphere_before
 from trimesh.exchange.gltf import load_glb
 from trimesh.exchange.obj import load_obj
 from trimesh.exchange.ply import load_ply
 
 from render.shared.errors import InputError
+from sdps.core.geometry import Camera
 from sdps.core.integration import integrate
 from sdps.surface.meshing import FORMATS, mesh, unit_scale, write_mesh
 
@@ -49,6 +50,27 @@ def test_longer_side_is_two():
     wide = mesh(np.zeros((10, 40)), mask)
     assert np.allclose(wide.bounds, [[-0.975, -0.225, 0], [0.975, 0.225, 0]])
     assert np.allclose(np.abs(mesh(np.zeros((40, 10)), mask.T).bounds[:, 1]), 0.975)
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_sphere_before_a_pinhole_is_a_sphere(every):
+    camera = Camera(150.0, (40.0, 60.0))
+    points, normals, mask = sphere_before(camera, 100, 36.0, (6.0, 4.0, -10.0), 0.95)
+    depth = integrate(normals, mask, camera=camera)
+    found = mesh(depth, normals=normals, millimetres=0.25, every=every)
+
+    def radius(vertices: np.ndarray) -> tuple[float, float]:
+        squares = (vertices**2).sum(-1)
+        fit = np.linalg.lstsq(np.column_stack([2 * vertices, np.ones(len(vertices))]), squares, rcond=None)[0]
+        off = np.abs(np.linalg.norm(vertices - fit[:3], axis=-1) - np.sqrt(fit[3] + (fit[:3] ** 2).sum()))
+        return float(np.sqrt(fit[3] + (fit[:3] ** 2).sum())), float(off.max())
+
+    scale = np.exp(-np.log(1.0 - points[mask][:, 2] / 150.0).mean())  # the object's mean depth is the focal length
+    size, off = radius(np.asarray(found.vertices))
+    assert size == pytest.approx(0.25 * 36.0 * scale, rel=1e-3) and off < 0.01
+    assert (np.asarray(found.face_normals) * (np.array([0, 0, 37.5]) - found.triangles_center)).sum(-1).min() > 0
+    flat = mesh(depth, camera=Camera(), millimetres=0.25, every=every)
+    assert radius(np.asarray(flat.vertices))[1] > 0.15
 
 
 def test_triangles_face_the_camera_and_agree_with_the_normals(dome, surface):
