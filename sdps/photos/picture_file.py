@@ -13,6 +13,7 @@ from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
 from sdps.photos.pictures.decoders import DECODERS
+from sdps.photos.pictures.lens import NO_LENS, Lens
 from sdps.photos.pictures.picture_kinds import NAMED, SUFFIXES, Coding, foreign_kind, name_kind, picture_kind
 from sdps.photos.response import profile_exponent
 
@@ -27,6 +28,7 @@ class Picture:
         coding: How the values are meant.
         orientation: EXIF orientation tag, 1 to 8.
         layer: Which layer of an EXR file it was, empty where it has no name.
+        lens: What its EXIF data say.
     """
 
     pixels: np.ndarray
@@ -34,6 +36,7 @@ class Picture:
     coding: Coding
     orientation: int = 1
     layer: str = ""
+    lens: Lens = NO_LENS
 
 
 def decode(path: Path) -> Picture:
@@ -49,7 +52,7 @@ def decode(path: Path) -> Picture:
     with _quiet(), decoding(path, name_kind(kind), "copy it again or leave it out"):
         read = DECODERS[kind](path, data)
     coding = Coding(kind, read.bits, read.pixels.dtype.kind == "f", profile_exponent(read.profile))
-    return Picture(read.pixels, read.alpha, coding, read.orientation, read.layer)
+    return Picture(read.pixels, read.alpha, coding, read.orientation, read.layer, read.lens)
 
 
 def is_misnamed(name: str, kind: str) -> bool:

@@ -11,13 +11,15 @@ import numpy as np
 
 from render.shared.errors import InputError
 from render.shared.imaging.reducing import check_scale, reduce_image, smaller_shape
+from sdps.core.geometry import ORTHOGRAPHIC, Camera
 from sdps.photos.faults import Faults
-from sdps.photos.light_files.light_choice import known_lights
+from sdps.photos.light_files.light_choice import KnownLights, known_lights
 from sdps.photos.picture_file import decode, orient_pixels
-from sdps.photos.pictures.listing import list_pictures
+from sdps.photos.pictures.lens import NOT_KNOWN, Wanted, read_wanted
+from sdps.photos.pictures.listing import Listing, list_pictures
 from sdps.photos.pictures.picture_kinds import Coding
 from sdps.photos.response import to_linear
-from sdps.photos.survey import survey
+from sdps.photos.survey import Survey, survey
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +46,9 @@ class Photographs:
         lights_name: Name of the file of the directions; empty without one.
         lights_frame: The frame flag it was read with; empty where the file states its own frame.
         scale: What the sides of the files' pictures are multiplied by as they are read.
+        camera: The camera, in pixels of the pictures as read; orthographic where nothing is known.
+        camera_origin: Where its focal length is from, in words.
+        pixel_size: Millimetres per pixel, as read, at the object's mean depth; None where it is not known.
     """
 
     folder: Path
@@ -62,6 +67,9 @@ class Photographs:
     lights_name: str = ""
     lights_frame: str = ""
     scale: float = 1.0
+    camera: Camera = ORTHOGRAPHIC
+    camera_origin: str = NOT_KNOWN
+    pixel_size: float | None = None
 
     def __len__(self) -> int:
         return len(self.files)
@@ -97,6 +105,15 @@ class Photographs:
         return images
 
     @property
+    def camera_summary(self) -> str:
+        """Kind of camera, its focal length and where that is from, in words."""
+        if not self.camera.is_perspective:
+            return "orthographic, looking along -z"
+        point = self.camera.principal
+        middle = "" if point is None else f", principal point {point[0]:.6g}, {point[1]:.6g}"
+        return f"perspective, focal length {self.camera.focal:.0f} px ({self.camera_origin}){middle}"
+
+    @property
     def saturation(self) -> float:
         """Linear value from which on a pixel of integer files counts as saturated; infinite for floating point."""
         return float("inf") if self.coding.floating else float(to_linear(np.array([253], np.uint8), self.gamma)[0])
@@ -113,39 +130,61 @@ def load(
     names: Sequence[str] | None = None,
     anyway: bool = False,
     scale: float = 1.0,
+    focal: str | float | None = None,
+    principal: str | Sequence[float] | None = None,
+    pixel_size: float | None = None,
 ) -> Photographs:
-    """Look through a folder of photographs of a static object under one distant light each, seen orthographically.
+    """Look through a folder of photographs of a static object under one distant light each (docs/guides/capture.md).
 
-    Every file is decoded once, one at a time, so that a damaged one is found now (the folder: docs/guides/capture.md).
+    Every file is decoded once, one at a time, so that a damaged one is found now.
 
     Args:
         folder: Pictures of one kind and size, and what may lie there with them.
         mask: A picture, bright where the object is; None for the folder's mask or, without one, an automatic mask.
-        lights: A lights file (docs/guides/capture.md), or `folder` for that of the folder; None for unknown lights.
+        lights: A lights file, or `folder` for that of the folder; None for unknown lights.
         intensities: A file of intensities, `folder` for its light_intensities.txt, or `equal`; None for those of
             `lights`, which are found from the photographs where it has none.
         frame: Axes of the lights file: y-up, y-down, x-left, z-away, xy-swapped, several joined by commas.
         gamma: linear, srgb, the exponent of a power curve, or auto by kind of file and colour profile.
         names: Files or glob patterns to use, in this order; one that begins with `!` leaves files out.
-        anyway: Go on where a check stops although one could: values that are not finite in the mask, pictures that
-            never change without a mask, lights behind the object. `check` then lists these as errors.
-        scale: Reduces pictures and mask by area averaging of linear values as they are read; 0.5 halves the sides, and
-            takes a quarter of the time and memory. Above 0, at most 1.
+        anyway: Go on where a check stops although one could; `check` then lists these as errors.
+        scale: Reduces pictures and mask by area averaging of linear values as they are read; above 0, at most 1.
+        focal: Focal length: `28mm` (35 mm equivalent), `3772px` or a number of pixels, `orthographic`; None or `auto`:
+            as the files' EXIF data say, orthographic where they do not. Pixels here and below are the files', turned.
+        principal: Column and row of the principal point, "2016,1512" or two numbers; None: the middle.
+        pixel_size: Millimetres per pixel at the object's mean depth, for depth and meshes in millimetres.
 
     Raises:
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
     """
-    folder, scale = Path(folder), check_scale(scale)
-    listing = list_pictures(folder, names)
-    faults = Faults(anyway)
+    wanted, folder, scale = read_wanted(focal, principal, pixel_size), Path(folder), check_scale(scale)
+    listing, faults = list_pictures(folder, names), Faults(anyway)
     seen = survey(folder, listing, gamma, None if mask is None else Path(mask), faults, scale)
+    known = _find_lights(listing, seen, lights, intensities, frame, faults)
+    return _assemble(folder, listing, seen, known, wanted, faults, scale)
+
+
+def _find_lights(
+    listing: Listing, seen: Survey, lights: str | Path | None, intensities: str | Path | None, frame: str,
+    faults: Faults,
+) -> KnownLights:  # fmt: skip
+    """Read the lights; their errors say what was left out of the pictures."""
     try:
-        known = known_lights(listing.places, seen.files, lights, intensities, frame, faults)
+        return known_lights(listing.places, seen.files, lights, intensities, frame, faults)
     except InputError as error:
         raise InputError(f"{error} ({seen.left_out})" if seen.left_out else error) from error
+
+
+def _assemble(
+    folder: Path, listing: Listing, seen: Survey, known: KnownLights, wanted: Wanted, faults: Faults, scale: float
+) -> Photographs:
+    """Put together what was found, with the camera."""
+    by = wanted.find(seen.lenses, seen.full, seen.mask.shape)
     return Photographs(
         folder=folder, files=seen.files, shape=seen.mask.shape, bits=seen.coding.bits, gamma=seen.gamma,
         mask=seen.mask, mask_origin=seen.origin, light_directions=known.directions, intensities=known.intensities,
-        lights_name=known.name, lights_frame=known.frame, notes=(*listing.notes, *seen.notes, *known.notes),
-        coding=seen.coding, orientation=seen.orientation, overridden=tuple(faults.overridden), scale=scale,
+        lights_name=known.name, lights_frame=known.frame,
+        notes=(*listing.notes, *seen.notes, *by.notes, *known.notes), coding=seen.coding,
+        orientation=seen.orientation, overridden=tuple(faults.overridden), scale=scale, camera=by.camera,
+        camera_origin=by.origin, pixel_size=by.pixel_size,
     )  # fmt: skip

@@ -14,6 +14,7 @@ from sdps.photos.masks import Variation, automatic_mask, bright_part
 from sdps.photos.picture_file import Picture, decode, is_misnamed, orient_pixels
 from sdps.photos.pictures.contents import judge_content, like_mask
 from sdps.photos.pictures.gamma import resolve_gamma
+from sdps.photos.pictures.lens import Lens
 from sdps.photos.pictures.listing import Listing
 from sdps.photos.pictures.picture_kinds import LOSSY, Coding
 from sdps.photos.pictures.picture_names import MASK, is_bare
@@ -35,6 +36,8 @@ class Survey:
         origin: `file` or `automatic`.
         notes: What was decided, in plain sentences.
         left_out: Which pictures were left out for what they look like, empty for none.
+        full: (H, W) of the files' pictures, once turned.
+        lenses: What the EXIF data of the photographs say.
     """
 
     files: tuple[str, ...]
@@ -45,6 +48,8 @@ class Survey:
     origin: str
     notes: tuple[str, ...]
     left_out: str = ""
+    full: tuple[int, int] = (0, 0)
+    lenses: frozenset[Lens] = frozenset()
 
 
 def survey(
@@ -89,7 +94,7 @@ def survey(
     return Survey(
         files=tuple(name for name in listing.files if name in look.kept), coding=look.first.coding, gamma=look.gamma,
         orientation=look.first.orientation, mask=mask, origin="automatic" if masks.file is None else "file",
-        notes=(*notes, said), left_out=left_out,
+        notes=(*notes, said), left_out=left_out, full=look.full, lenses=frozenset(look.lenses),
     )  # fmt: skip
 
 
@@ -109,6 +114,7 @@ class _Look:
     groups: dict[tuple[tuple[int, ...], Coding], list[str]] = field(default_factory=dict)
     layers: dict[str, list[str]] = field(default_factory=dict)
     turns: set[int] = field(default_factory=set)
+    lenses: set[Lens] = field(default_factory=set)
     first: Picture | None = None
     gamma: str | float = "linear"
     why: str = ""
@@ -172,6 +178,7 @@ class _Look:
         if (shape, picture.coding) != (self.first.pixels.shape[:2], self.first.coding):
             return  # refused when all are known
         self.turns.add(picture.orientation)
+        self.lenses.add(picture.lens)
         pixels = orient_pixels(picture.pixels, self.first.orientation)
         if picture.coding.floating:
             touched = reduce_image((~np.isfinite(pixels).all(-1)).astype(np.float32), self.shape) > 0

@@ -19,6 +19,7 @@ from PIL import Image
 from render.shared.decoding import check_picture, check_unpacked, silence
 from render.shared.errors import InputError
 from render.shared.imaging.exr_colours import read_exr_colours
+from sdps.photos.pictures.lens import EXIF, NO_LENS, Lens, read_lens
 from sdps.photos.pictures.netpbm import read_netpbm
 
 _ORIENTATION = 274
@@ -37,6 +38,7 @@ class Decoded:
         profile: The embedded colour profile.
         orientation: EXIF orientation tag, 1 to 8.
         layer: Which layer of an EXR file it was, empty where it has no name.
+        lens: What its EXIF data say.
     """
 
     pixels: np.ndarray
@@ -45,6 +47,7 @@ class Decoded:
     profile: bytes | None = None
     orientation: int = 1
     layer: str = ""
+    lens: Lens = NO_LENS
 
 
 def _png(path: Path, data: bytes) -> Decoded:
@@ -53,7 +56,8 @@ def _png(path: Path, data: bytes) -> Decoded:
         profile, exif = picture.info.get("icc_profile"), Image.Exif()
         exif.load(picture.info.get("exif", b""))  # not getexif(), which decodes the pixels
         picture.verify()  # its checksums; libpng would print
-    return _by_opencv(path, _only_pixels(data), "PNG", profile, exif.get(_ORIENTATION, 1))
+    lens = read_lens(lambda: exif.get_ifd(EXIF))
+    return _by_opencv(path, _only_pixels(data), "PNG", profile, exif.get(_ORIENTATION, 1), lens)
 
 
 def _only_pixels(data: bytes) -> bytes:
@@ -76,13 +80,16 @@ def _tiff(path: Path, data: bytes | bytearray) -> Decoded:
         tags, order = page.tags, file.byteorder
         profile = bytes(tags[_PROFILE].value) if _PROFILE in tags else None
         orientation = int(tags[_ORIENTATION].value) if _ORIENTATION in tags else 1
+        lens = read_lens(lambda: tags[EXIF].value if EXIF in tags else {})
         if orientation != 1:  # OpenCV turns such pictures by itself, or fails; the tag must be gone before
             data = bytearray(data)
             struct.pack_into(f"{order}H", data, tags[_ORIENTATION].valueoffset, 1)
-    return _by_opencv(path, data, "TIFF", profile, orientation)
+    return _by_opencv(path, data, "TIFF", profile, orientation, lens)
 
 
-def _by_opencv(path: Path, data: bytes | bytearray, kind: str, profile: bytes | None, orientation: int) -> Decoded:
+def _by_opencv(
+    path: Path, data: bytes | bytearray, kind: str, profile: bytes | None, orientation: int, lens: Lens
+) -> Decoded:
     with silence():
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
@@ -94,7 +101,8 @@ def _by_opencv(path: Path, data: bytes | bytearray, kind: str, profile: bytes | 
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     alpha = pixels[..., 3] if channels == 4 else None
     rgb = pixels[..., 2::-1] if channels >= 3 else _repeat_grey(pixels)
-    return Decoded(np.ascontiguousarray(rgb), alpha, 8 * pixels.dtype.itemsize, profile, _orientation(orientation))
+    bits = 8 * pixels.dtype.itemsize
+    return Decoded(np.ascontiguousarray(rgb), alpha, bits, profile, _orientation(orientation), lens=lens)
 
 
 def _by_pillow(*formats: str) -> Callable[[Path, bytes], Decoded]:
@@ -104,11 +112,11 @@ def _by_pillow(*formats: str) -> Callable[[Path, bytes], Decoded]:
         with Image.open(io.BytesIO(data), formats=formats) as picture:
             check_picture(path, picture, data)
             profile, orientation = picture.info.get("icc_profile"), picture.getexif().get(_ORIENTATION, 1)
-            alpha = None
+            lens, alpha = read_lens(lambda: picture.getexif().get_ifd(EXIF)), None
             if "A" in picture.getbands() or "transparency" in picture.info:
                 alpha = np.asarray(picture.convert("RGBA"))[..., 3]
             pixels = np.asarray(picture.convert("RGB"))
-        return Decoded(pixels, alpha, 8, profile, _orientation(orientation))
+        return Decoded(pixels, alpha, 8, profile, _orientation(orientation), lens=lens)
 
     return decode
 
