@@ -169,11 +169,10 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     directions = scene.light_directions()
     if len(stored.images) != len(directions):
         raise InputError(f"scene {scene.id}: {len(stored.images)} images for {len(directions)} lights; render it again")
-    if options.augmentation.mixed is None:
-        chosen = choose_images(directions, options, rng)
+    chosen = None if options.augmentation.mixed is not None else choose_images(directions, options, rng)
+    if chosen is not None:
         images, directions = stored.images[chosen].astype(np.float32), directions[chosen]  # (Q, H, W, 3)
     else:
-        chosen = None
         images, directions = _mix(scene, stored.images, options, rng)
     normals, mask = stored.normals, stored.mask
     layout = lay_out(scene, stored.depth, mask, chosen)
@@ -190,17 +189,22 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     images, intensities = augment(images, mask, options.augmentation, rng)
     corner = _crop_corner(mask, options.crop, options.min_object, rng) if options.crop else (0, 0)
     return Batch(
-        images=torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))),
+        images=_channels_first(images),
         mask=torch.from_numpy(mask[None].astype(np.float32)),
-        normals=torch.from_numpy(np.ascontiguousarray(normals.transpose(2, 0, 1), dtype=np.float32)),
+        normals=_channels_first(normals),
         directions=torch.from_numpy(placed.directions),
         intensities=torch.from_numpy(intensities),
         corner=torch.tensor(corner),
         seed=torch.tensor(seed),
         nearness=torch.from_numpy(placed.nearness),
-        places=torch.from_numpy(np.ascontiguousarray(placed.places.transpose(2, 0, 1))),
-        sights=torch.from_numpy(np.ascontiguousarray(placed.sights.transpose(2, 0, 1))),
+        places=_channels_first(placed.places),
+        sights=_channels_first(placed.sights),
     )
+
+
+def _channels_first(pictures: np.ndarray) -> Tensor:  # (..., 3, H, W) float32
+    """Return pictures (..., H, W, 3) as networks take them."""
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(pictures, -1, -3), dtype=np.float32))
 
 
 def _mix(

@@ -81,7 +81,7 @@ def test_geometry_turns_and_shrinks_with_the_scene() -> None:
     inside = half.mask[0].numpy() > 0
     shrunk = whole.places.numpy().reshape(3, 16, 2, 16, 2).mean(axis=(2, 4))
     core = inside & (whole.mask[0].numpy().reshape(16, 2, 16, 2).mean(axis=(1, 3)) == 1)
-    assert np.abs(half.places.numpy() - shrunk)[:, core].max() < 0.06
+    assert np.abs(half.places.numpy() - shrunk)[:, core].max() < 0.12
 
 
 def test_lamps_of_a_sample_are_equally_strong_where_the_object_is() -> None:
