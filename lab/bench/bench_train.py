@@ -259,7 +259,7 @@ def plain_loop(model: str, batch: Batch) -> Callable[[], object]:
     def step() -> float:
         if isinstance(network, LightingNetwork):
             prediction = network(batch.images, batch.mask)
-            loss = network.loss(prediction, batch.directions, batch.intensities)["total"]
+            loss = network.loss(prediction, Lights(batch.directions, batch.intensities))["total"]
         else:
             assert isinstance(network, FusionNetwork), model
             lights = Lights(batch.directions, batch.intensities)

@@ -40,6 +40,7 @@ class SceneArrays(NamedTuple):
     images: np.ndarray  # (L, H, W, 3) float16, linear radiance under irradiance pi
     normals: np.ndarray  # (H, W, 3) float32, unit, camera frame, zero outside the mask
     mask: np.ndarray  # (H, W) bool
+    depth: np.ndarray  # (H, W) float32, half image widths
 
 
 class Ready(NamedTuple):

@@ -161,7 +161,7 @@ class ChunkRenderer:
             with self.stages.time("write"):
                 size = self.rendering.write(self.config.folder / scene.file, shard)
         elif np.isfinite(shard.images).all():
-            arrays = SceneArrays(shard.images, shard.normals, shard.mask)
+            arrays = SceneArrays(shard.images, shard.normals, shard.mask, shard.depth)
             size = sum(array.nbytes for array in arrays)
         else:
             raise InputError(f"scene {scene.id}: the images have infinite or NaN values")

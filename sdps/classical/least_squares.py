@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from render.shared.errors import InputError
-from sdps.classical.common.geometry import MIN_CONDITION, unit_normals
 from sdps.classical.common.observations import REC601, Observations, observe
+from sdps.classical.common.outlines import MIN_CONDITION, unit_normals
 from sdps.classical.common.weighted import solve_weighted
 from sdps.core.estimate import NO_NOTES, Estimate, Notes
 from sdps.core.intensities import grey

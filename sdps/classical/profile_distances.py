@@ -20,8 +20,8 @@ from render.shared.errors import InputError
 from render.shared.imaging.vectors import spiral, unit
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
-from sdps.classical.common.geometry import outward_gradient
 from sdps.classical.common.observations import observe
+from sdps.classical.common.outlines import outward_gradient
 from sdps.classical.common.weighted import normal_equations
 from sdps.classical.profile_lights import CLIP, POWER, Lights, find_lights
 from sdps.core.estimate import Estimate, Notes

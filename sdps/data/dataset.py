@@ -22,6 +22,7 @@ from render.shared.imaging.mixing import LightStage, mix, require_enough
 from render.shared.seeds import generator
 from sdps.core.symmetry import Symmetry
 from sdps.data.augment import Augmentation, augment
+from sdps.data.sample_geometry import Layout, lay_out, place
 from sdps.data.scene_store import PackedImages, SceneStore, StoredScene, list_finished, require_equal_counts
 
 _CROP_DRAWS = 8
@@ -38,6 +39,9 @@ class Batch(NamedTuple):
     intensities: Tensor  # (B, Q) float32
     corner: Tensor  # (B, 2) int64, row and column of the crop's upper left corner
     seed: Tensor  # (B,) int64, non-negative, of the sample alone: for randomness a stage adds
+    nearness: Tensor  # (B, Q) float32, rho of the lamps (`sdps.core.geometry`), 0 of distant ones
+    places: Tensor  # (B, 3, S, S) float32, where pixels lie, in the object's radii from its middle; 0 outside the mask
+    sights: Tensor  # (B, 3, S, S) float32, towards the camera, z = 1
 
     def to(self, device: torch.device) -> "Batch":
         """Copy every tensor to `device`."""
@@ -165,30 +169,42 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     directions = scene.light_directions()
     if len(stored.images) != len(directions):
         raise InputError(f"scene {scene.id}: {len(stored.images)} images for {len(directions)} lights; render it again")
-    if options.augmentation.mixed is None:
-        chosen = choose_images(directions, options, rng)
+    chosen = None if options.augmentation.mixed is not None else choose_images(directions, options, rng)
+    if chosen is not None:
         images, directions = stored.images[chosen].astype(np.float32), directions[chosen]  # (Q, H, W, 3)
     else:
         images, directions = _mix(scene, stored.images, options, rng)
     normals, mask = stored.normals, stored.mask
+    layout = lay_out(scene, stored.depth, mask, chosen)
     if options.augmentation.symmetries:
         symmetry = Symmetry(int(rng.integers(4)), bool(rng.integers(2)))
         images, normals, mask = symmetry.images(images, 1), symmetry.images(normals, 0), symmetry.images(mask, 0)
-        normals, directions = symmetry.vectors(normals), symmetry.vectors(directions)
+        normals, directions, layout = symmetry.vectors(normals), symmetry.vectors(directions), layout.turn(symmetry)
     if options.rescale and min(mask.shape) > options.size:
-        images, normals, mask = _rescale(images, normals, mask, options, rng)
-    images, normals, mask = _resize(images, normals, mask, options.size)
+        images, normals, mask, layout = _rescale(images, normals, mask, layout, options, rng)
+    images, normals, mask, layout = _resize(images, normals, mask, layout, options.size)
+    placed = place(layout, mask, directions)
+    if layout.positions is not None:
+        images = images / placed.irradiance[:, None, None, None]
     images, intensities = augment(images, mask, options.augmentation, rng)
     corner = _crop_corner(mask, options.crop, options.min_object, rng) if options.crop else (0, 0)
     return Batch(
-        images=torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))),
+        images=_channels_first(images),
         mask=torch.from_numpy(mask[None].astype(np.float32)),
-        normals=torch.from_numpy(np.ascontiguousarray(normals.transpose(2, 0, 1), dtype=np.float32)),
-        directions=torch.from_numpy(np.ascontiguousarray(directions, dtype=np.float32)),
+        normals=_channels_first(normals),
+        directions=torch.from_numpy(placed.directions),
         intensities=torch.from_numpy(intensities),
         corner=torch.tensor(corner),
         seed=torch.tensor(seed),
+        nearness=torch.from_numpy(placed.nearness),
+        places=_channels_first(placed.places),
+        sights=_channels_first(placed.sights),
     )
+
+
+def _channels_first(pictures: np.ndarray) -> Tensor:  # (..., 3, H, W) float32
+    """Return pictures (..., H, W, 3) as networks take them."""
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(pictures, -1, -3), dtype=np.float32))
 
 
 def _mix(
@@ -233,8 +249,9 @@ def collate(samples: Sequence[Batch | InputError]) -> Batch | InputError:
 
 
 def _rescale(
-    images: np.ndarray, normals: np.ndarray, mask: np.ndarray, options: SampleOptions, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    images: np.ndarray, normals: np.ndarray, mask: np.ndarray, layout: Layout, options: SampleOptions,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Layout]:  # fmt: skip
     """Cut the square window that, brought to `size`, is the scene shrunk at random and then cropped at random.
 
     Two deviations from the authors' loader. It draws the new height and width apart from each other, in [128, H) and
@@ -246,22 +263,28 @@ def _rescale(
     side = round(options.size * shorter / rng.integers(options.size, shorter, endpoint=True))
     row, column = _crop_corner(mask, side, options.min_object, rng)
     window = np.s_[row : row + side, column : column + side]
-    return images[:, *window], normals[window], mask[window]
+    return images[:, *window], normals[window], mask[window], layout.select(window)
 
 
 def _resize(
-    images: np.ndarray, normals: np.ndarray, mask: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    images: np.ndarray, normals: np.ndarray, mask: np.ndarray, layout: Layout, size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Layout]:
     """Bring a scene of another size to (size, size), normals to unit length, the mask to its majority."""
     if images.shape[1:3] == (size, size):
-        return images, normals, mask
-    stack = np.concatenate([images, normals[None], np.repeat(mask[None, ..., None], 3, -1)]).astype(np.float32)
+        return images, normals, mask, layout
+    laid = np.concatenate([layout.image, layout.depth[..., None]], axis=-1)
+    stack = np.concatenate([images, laid[None], normals[None], np.repeat(mask[None, ..., None], 3, -1)])
+    stack = stack.astype(np.float32)
     tensor = torch.from_numpy(np.ascontiguousarray(stack.transpose(0, 3, 1, 2)))
     shrunk = functional.interpolate(tensor, (size, size), mode="bilinear", antialias=True)
     resized = shrunk.numpy().transpose(0, 2, 3, 1)
-    images, normals, mask = resized[:-2], resized[-2], resized[-1, ..., 0] > 0.5
+    (images, laid, normals), share = (resized[:-3], *resized[-3:-1]), resized[-1, ..., 0]
+    mask = share > 0.5
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    return images, np.where(mask[..., None], normals / np.maximum(length, 1e-6), 0.0), mask
+    # Depth is 0 outside the object: what is averaged there counts for nothing.
+    depth = np.where(mask, laid[..., 2] / np.maximum(share, 0.5), 0.0).astype(np.float64)
+    layout = layout._replace(image=laid[..., :2].astype(np.float64), depth=depth)
+    return images, np.where(mask[..., None], normals / np.maximum(length, 1e-6), 0.0), mask, layout
 
 
 def _crop_corner(mask: np.ndarray, side: int, min_object: float, rng: np.random.Generator) -> tuple[int, int]:

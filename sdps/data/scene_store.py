@@ -16,7 +16,7 @@ from render.shared.errors import InputError
 from render.shared.files import atomic_path
 
 CACHE_FOLDER = "cache"
-_LAYOUT = "packed"  # names what an entry holds, so that those of earlier versions are not taken for it
+_LAYOUT = "packed with depth"  # names what an entry holds, so that those of earlier versions are not taken for it
 _log = logging.getLogger(__name__)
 
 
@@ -56,6 +56,7 @@ class StoredScene(NamedTuple):
     images: np.ndarray | PackedImages  # (L, H, W, 3) float16
     normals: np.ndarray  # (H, W, 3) float32
     mask: np.ndarray  # (H, W) bool
+    depth: np.ndarray  # (H, W) float32, half image widths
 
 
 class SceneStore:
@@ -92,14 +93,14 @@ class SceneStore:
             stored = _decode(shard_path(self.folder, scene), scene)
             packed = PackedImages.of(stored.images)
             # The images come last: where they are, the ground truth is.
-            layers = [stored.normals, stored.mask[..., None], packed.kept[..., None]]
+            layers = [stored.normals, *(layer[..., None] for layer in (stored.mask, packed.kept, stored.depth))]
             _save(truth, np.concatenate(layers, axis=-1, dtype=np.float32))
             _save(images, packed.values)
             return stored
         with decoding(images, "an entry of the cache", f"delete {images.parent}"):
-            ground = np.load(truth)  # (H, W, 5)
+            ground = np.load(truth)  # (H, W, 6)
             packed = PackedImages(np.load(images, mmap_mode="r"), ground[..., 4] > 0.5)
-            return StoredScene(packed, ground[..., :3], ground[..., 3] > 0.5)
+            return StoredScene(packed, ground[..., :3], ground[..., 3] > 0.5, ground[..., 5])
 
 
 def list_finished(folder: Path, split: str, *, skip_missing: bool = False) -> list[SceneSpec]:
@@ -161,7 +162,7 @@ def _identity(folder: Path, scene: SceneSpec) -> str:
 
 def _decode(path: Path, scene: SceneSpec) -> StoredScene:
     shard = read_shard(path, scene)
-    return StoredScene(shard.images, shard.normals, shard.mask)
+    return StoredScene(shard.images, shard.normals, shard.mask, shard.depth)
 
 
 def _save(path: Path, array: np.ndarray) -> None:

@@ -13,8 +13,8 @@ from torch.utils.data import DataLoader
 from render.records.manifest import MANIFEST
 from render.records.shards import file_hash
 from render.shared.errors import InputError
-from sdps.core.interrupts import leave_signals_to_parent
 from sdps.data.dataset import Batch, SceneDataset, collate
+from sdps.data.interrupts import leave_signals_to_parent
 from sdps.data.order import PackedOrder, SampleStream
 
 

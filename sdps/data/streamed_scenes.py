@@ -29,8 +29,8 @@ from sdps.data.sources import share_of_batch
 class SceneStream(Protocol):
     """Scenes as they are rendered, endlessly; `next` waits for one and raises InputError where rendering fails."""
 
-    def __next__(self) -> tuple[SceneSpec, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Return a scene, and its images, normals and mask as in `StoredScene`."""
+    def __next__(self) -> tuple[SceneSpec, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """Return a scene, and its images, normals, mask and depth as in `StoredScene`."""
         ...
 
     def close(self) -> None:

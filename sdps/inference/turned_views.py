@@ -77,7 +77,8 @@ def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
     if expected is not None:
         spread = torch.rad2deg((directions - mean).square().sum(-1).mean(0).sqrt())  # (B, Q)
         expected = (expected.square() - spread.square()).clamp(min=expected.square() / len(found)).sqrt()
-    return Lights(mean, intensities, confidence, expected)
+    near = [lights.nearness.float() for _, lights in found if lights.nearness is not None]
+    return Lights(mean, intensities, confidence, expected, torch.stack(near).mean(0) if near else None)
 
 
 def mean_normals(

@@ -30,11 +30,11 @@ class Lights(NamedTuple):
     intensities: Tensor  # (B, Q) float32, positive, relative
     confidence: Tensor | None = None  # (B, Q) float32 in [0, 1], the product of the likeliest direction classes
     expected_error: Tensor | None = None  # (B, Q) float32, degrees to expect of the direction; None: not predicted
+    nearness: Tensor | None = None  # (B, Q) float32, rho of the lamps (`sdps.core.geometry`); None: taken for distant
 
     def select(self, images: slice) -> "Lights":
         """Return the lights of some images."""
-        sure, error = (None if each is None else each[:, images] for each in (self.confidence, self.expected_error))
-        return Lights(self.directions[:, images], self.intensities[:, images], sure, error)
+        return Lights(*(None if each is None else each[:, images] for each in self))  # type: ignore[arg-type]
 
     def with_errors(self) -> "Lights":
         """Return estimated lights with errors to expect, the usual ones where none are predicted."""
@@ -90,12 +90,7 @@ class LightingNetwork(nn.Module, ABC):
         return type(predictions[0])(*(torch.cat(each, dim=1) for each in zip(*predictions, strict=True)))
 
     @abstractmethod
-    def loss(
-        self,
-        prediction: Any,
-        directions: Tensor,  # (B, Q, 3)
-        intensities: Tensor,  # (B, Q)
-    ) -> dict[str, Tensor]:
+    def loss(self, prediction: Any, truth: Lights) -> dict[str, Tensor]:
         """Return named losses, means over all images; `total` is the one to minimise."""
 
     @abstractmethod

@@ -118,9 +118,9 @@ class LCNet(LightingTrunk):
         heads = (self.azimuth, self.elevation, self.intensity)
         return LightingLogits(*(part(feature).flatten(1).unflatten(0, local.shape[:2]) for part in heads))
 
-    def loss(self, prediction: LightingLogits, directions: Tensor, intensities: Tensor) -> dict[str, Tensor]:
+    def loss(self, prediction: LightingLogits, truth: Lights) -> dict[str, Tensor]:
         """Return the cross-entropies of the true classes and their sum (SDPS-Net, eq. 2)."""
-        targets = self.classes.encode(directions, intensities)
+        targets = self.classes.encode(truth.directions, truth.intensities)
         pairs = zip(prediction._asdict().items(), targets, strict=True)
         terms = {name: class_loss(logits, target) for (name, logits), target in pairs}
         return {"total": torch.stack(list(terms.values())).sum(), **terms}

@@ -50,10 +50,10 @@ class LCNetReg(LightingTrunk):
         directions = functional.normalize(vectors, dim=1).unflatten(0, local.shape[:2])
         return RegressedLights(directions, scalars[:, 0].unflatten(0, local.shape[:2]))
 
-    def loss(self, prediction: RegressedLights, directions: Tensor, intensities: Tensor) -> dict[str, Tensor]:
+    def loss(self, prediction: RegressedLights, truth: Lights) -> dict[str, Tensor]:
         """Return 1 - cosine of the directions and the squared error of the intensities."""
-        direction = (1.0 - (prediction.directions * directions).sum(-1)).mean()
-        intensity = (prediction.intensities - intensities).square().mean()
+        direction = (1.0 - (prediction.directions * truth.directions).sum(-1)).mean()
+        intensity = (prediction.intensities - truth.intensities).square().mean()
         return {"total": direction + intensity, "direction": direction, "intensity": intensity}
 
     def read_lights(self, prediction: RegressedLights, read_out: ReadOut = "centre") -> Lights:
@@ -69,15 +69,15 @@ class LCNetSoft(LCNet):
     expected and true direction and the relative error of the expected intensity. Same layers as LCNet.
     """
 
-    def loss(self, prediction: LightingLogits, directions: Tensor, intensities: Tensor) -> dict[str, Tensor]:
+    def loss(self, prediction: LightingLogits, truth: Lights) -> dict[str, Tensor]:
         """Return soft cross-entropies, the errors of the expectation, and their weighted sum."""
-        targets = self.classes.encode_soft(directions, intensities)
+        targets = self.classes.encode_soft(truth.directions, truth.intensities)
         pairs = zip(prediction._asdict().items(), targets, strict=True)
         terms = {name: soft_class_loss(logits, target) for (name, logits), target in pairs}
         expected = self.read_lights(prediction)
         # The tiny constant keeps the gradient of the length finite where the estimate is perfect.
-        chord = ((expected.directions - directions).square().sum(-1) + 1e-8).sqrt().mean()
-        relative = ((expected.intensities - intensities).abs() / intensities).mean()
+        chord = ((expected.directions - truth.directions).square().sum(-1) + 1e-8).sqrt().mean()
+        relative = ((expected.intensities - truth.intensities).abs() / truth.intensities).mean()
         total = torch.stack(list(terms.values())).sum() + _EXPECTATION_WEIGHT * (chord + relative)
         return {"total": total, **terms, "chord": chord, "relative": relative}
 

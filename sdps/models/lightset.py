@@ -32,6 +32,8 @@ _BRIGHTEST = 6.0
 """Shading that counts as no more: highlights reach hundreds of times the average."""
 _USUAL_INTENSITY = 0.94
 """Geometric mean of intensities drawn evenly from 0.2 to 2. Images show only their ratios."""
+_USUAL_NEARNESS = -2.0
+"""Nearness that training begins with, before softplus: 0.13."""
 _TOGETHER = 32
 """Images that meet in use, about: many more than in training meet another mean, maximum and attention than it had."""
 
@@ -42,6 +44,7 @@ class SetPrediction(NamedTuple):
     directions: Tensor  # (B, Q, 3) float32, unit
     intensities: Tensor  # (B, Q) float32, positive, relative
     expected: Tensor  # (B, Q) float32, distance to the true direction
+    nearness: Tensor  # (B, Q) float32, rho of the lamps; 0 of a network that takes them for distant
 
 
 class Level(nn.Module):
@@ -90,11 +93,15 @@ class LightSetNet(LightingNetwork):
         blocks: Layers of attention across the images.
         heads: Of the attention.
         intensity_range: Intensities drawn in training.
+        nearness: Predict how near the lamps stand; the released networks before it take them for distant.
     """
 
+    added = ("near",)
+
     def __init__(
-        self, *, width: int = 256, blocks: int = 3, heads: int = 4, intensity_range: tuple[float, float] = (0.2, 2.0)
-    ) -> None:
+        self, *, width: int = 256, blocks: int = 3, heads: int = 4, intensity_range: tuple[float, float] = (0.2, 2.0),
+        nearness: bool = False,
+    ) -> None:  # fmt: skip
         super().__init__()
         if blocks < 0 or width < 1 or heads < 1 or width % heads:
             raise InputError(f"heads must divide width, and blocks be 0 or more, got {heads}, {width} and {blocks}")
@@ -104,6 +111,10 @@ class LightSetNet(LightingNetwork):
         self.read = nn.Linear(_WIDTHS[-1] * 16, width)
         self.blocks = nn.ModuleList(Attention(width, heads) for _ in range(blocks))
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 5))
+        self.near = nn.Linear(width, 1) if nearness else None
+        if self.near is not None:  # all lamps begin alike
+            nn.init.zeros_(self.near.weight)
+            nn.init.constant_(self.near.bias, _USUAL_NEARNESS)
 
     def encode(self, images: Tensor, mask: Tensor) -> Tensor:
         """Return the object's radiance and the mask, (B, Q, 4, S, S), of images of any side, 128 in use."""
@@ -122,12 +133,16 @@ class LightSetNet(LightingNetwork):
             tokens = block(tokens, likeness)
         # Never under autocast: a direction rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
         with torch.autocast(local.device.type, enabled=False):
-            values = self.out(tokens.float())  # (B, Q, 5)
+            read = self.out[0](tokens.float())
+            values = self.out[1](read)  # (B, Q, 5)
+            nearness = torch.zeros_like(values[..., 0])
+            if self.near is not None:
+                nearness = functional.softplus(self.near(read)[..., 0])
             # Towards the camera at first; lights behind the object are not to be found.
             directions = functional.normalize(values[..., :3] + values.new_tensor([0.0, 0.0, 0.5]), dim=-1)
             strengths = values[..., 3]
             intensities = _USUAL_INTENSITY * (strengths - strengths.mean(dim=1, keepdim=True)).exp()
-            return SetPrediction(directions, intensities, (values[..., 4] + LOG_USUAL).exp())
+            return SetPrediction(directions, intensities, (values[..., 4] + LOG_USUAL).exp(), nearness)
 
     def predict_parts(self, parts: list[Tensor], seed: int) -> SetPrediction:
         """Return what groups of images say; all images together give the intensities of a group their scale."""
@@ -142,22 +157,29 @@ class LightSetNet(LightingNetwork):
             some = self.predict(local[:, part])
             scale = (together.intensities[:, part] / some.intensities).log().mean(dim=1, keepdim=True).exp()
             found.directions[:, part], found.expected[:, part] = some.directions, some.expected
-            found.intensities[:, part] = some.intensities * scale
+            found.intensities[:, part], found.nearness[:, part] = some.intensities * scale, some.nearness
         return found
 
-    def loss(self, prediction: SetPrediction, directions: Tensor, intensities: Tensor) -> dict[str, Tensor]:
-        """Return the chord of the directions, the error of the relative intensities, and that of the expected error."""
+    def loss(self, prediction: SetPrediction, truth: Lights) -> dict[str, Tensor]:
+        """Return the chord of the directions, and the errors of intensities, expected error and nearness."""
+        directions, intensities = truth.directions, truth.intensities
         # The tiny constant keeps the gradient of a length finite where the estimate is perfect.
         chord = ((prediction.directions - directions).square().sum(-1) + 1e-6).sqrt()  # (B, Q)
         off = (intensities / prediction.intensities).log()
         relative = (off - off.mean(dim=1, keepdim=True)).abs().mean()
         likely = expected_distance_loss(prediction.expected, chord.detach()).mean()
         total = chord.mean() + 0.5 * relative + 0.02 * likely
-        return {"total": total, "chord": chord.mean(), "relative": relative, "expected": likely}
+        terms = {"chord": chord.mean(), "relative": relative, "expected": likely}
+        if self.near is not None and truth.nearness is not None:
+            terms["nearness"] = (prediction.nearness - truth.nearness).abs().mean()
+            total = total + terms["nearness"]
+        return {"total": total, **terms}
 
     def read_lights(self, prediction: SetPrediction, read_out: ReadOut = "centre") -> Lights:
         """Return the regressed lights; there are no classes to read out."""
-        return Lights(prediction.directions, prediction.intensities, expected_error=chord_degrees(prediction.expected))
+        errors = chord_degrees(prediction.expected)
+        nearness = None if self.near is None else prediction.nearness
+        return Lights(prediction.directions, prediction.intensities, expected_error=errors, nearness=nearness)
 
 
 def image_inputs(local: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,6 +10,8 @@ from sdps.training.pixel_stage import PixelStage
 from sdps.training.stages import LightingStage, NormalStage, Stage
 from sdps.training.training_config import LightingTraining, NormalTraining, TrainingConfig
 
+_ANOTHER = "runs.{}.start: {!r} has another network; name one of its kind"
+
 
 def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:
     """Return the stage that trains a run.
@@ -28,9 +30,12 @@ def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping
     if "start" in trained:
         first = trained["start"]
         try:
-            stage.network.load_state_dict(first.network.state_dict())
+            loaded = stage.network.load_state_dict(first.network.state_dict(), strict=False)
         except RuntimeError as error:
-            raise InputError(f"runs.{name}.start: {first.name!r} has another network; name one of its kind") from error
+            raise InputError(_ANOTHER.format(name, first.name)) from error
+        added = getattr(stage.network, "added", ())  # parts that weights of earlier kinds lack begin as they are made
+        if loaded.unexpected_keys or any(key.partition(".")[0] not in added for key in loaded.missing_keys):
+            raise InputError(_ANOTHER.format(name, first.name))
     return stage
 
 

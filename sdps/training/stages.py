@@ -94,13 +94,13 @@ class LightingStage(Stage):
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the network's own loss."""
-        terms = self.network.loss(self.network(batch.images, batch.mask), batch.directions, batch.intensities)
+        terms = self.network.loss(self.network(batch.images, batch.mask), true_lights(batch))
         return terms["total"], {f"{name}_loss": value for name, value in terms.items() if name != "total"}
 
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return the loss, and direction and intensity errors of every read-out."""
         prediction = self.network(batch.images, batch.mask)
-        values = {"loss": float(self.network.loss(prediction, batch.directions, batch.intensities)["total"])}
+        values = {"loss": float(self.network.loss(prediction, true_lights(batch))["total"])}
         for how in get_args(ReadOut):
             suffix = "" if how == "centre" else f"_{how}"
             values |= light_errors(self.network.read_lights(prediction, how), batch, suffix)
@@ -157,7 +157,7 @@ class NormalStage(Stage):
         if not self.source:
             return None
         if self.lighting is None:
-            return Lights(batch.directions, batch.intensities)
+            return true_lights(batch)
         network = cast(LightingNetwork, self.lighting.network)
         prediction = network(*resize_input(batch.images, batch.mask))
         return network.read_lights(prediction, self.config.read_out).with_errors()
@@ -173,8 +173,10 @@ class NormalStage(Stage):
         share = torch.tensor(drawn, device=batch.images.device)[:, None]  # (B, 1)
         directions = torch.lerp(lights.directions.float(), batch.directions, share[..., None])  # (B, Q, 3)
         intensities = torch.lerp(lights.intensities.float(), batch.intensities, share)  # (B, Q)
+        found = torch.zeros_like(batch.nearness) if lights.nearness is None else lights.nearness.float()
+        nearness = torch.lerp(found, batch.nearness, share)
         error = None if lights.expected_error is None else (1.0 - share) * lights.expected_error.float()
-        return Lights(functional.normalize(directions, dim=-1), intensities, expected_error=error)
+        return Lights(functional.normalize(directions, dim=-1), intensities, expected_error=error, nearness=nearness)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the network's own loss on the crops, as configured."""
@@ -219,7 +221,7 @@ def disturb(lights: Lights, seeds: list[int], limit: float) -> Lights:
     strays by itself; intensities err with the direction, and by themselves. A scene's share of all that is drawn
     evenly from 0 to `limit`.
     """
-    directions, intensities, expected = [], [], []
+    bent, strengths, expected = [], [], []
     for scene, seed in enumerate(seeds):
         rng = generator(seed, "light_error")
         share, count = rng.uniform(0.0, limit), lights.directions.shape[1]
@@ -227,13 +229,19 @@ def disturb(lights: Lights, seeds: list[int], limit: float) -> Lights:
         own = share * _SCATTERED * rng.standard_normal((count, 3))
         slope, noise = share * _UNEVEN * rng.standard_normal(3), share * _UNEVEN * rng.standard_normal(count)
         given = lights.directions[scene].cpu().numpy()
-        directions.append(given @ bend.T + own)
-        intensities.append(np.exp(given @ slope + noise))
+        bent.append(given @ bend.T + own)
+        strengths.append(np.exp(given @ slope + noise))
         expected.append(np.full(count, share * _STRAYED))
-    moved = torch.from_numpy(np.stack(directions)).to(lights.directions)
-    factors = torch.from_numpy(np.stack(intensities)).to(lights.intensities)
+    moved = torch.from_numpy(np.stack(bent)).to(lights.directions)
+    factors = torch.from_numpy(np.stack(strengths)).to(lights.intensities)
     errors = torch.from_numpy(np.stack(expected)).to(lights.intensities)
-    return Lights(functional.normalize(moved, dim=-1), lights.intensities * factors, expected_error=errors)
+    directions = functional.normalize(moved, dim=-1)
+    return lights._replace(directions=directions, intensities=lights.intensities * factors, expected_error=errors)
+
+
+def true_lights(batch: Batch) -> Lights:
+    """Return the lights of a batch's scenes."""
+    return Lights(batch.directions, batch.intensities, nearness=batch.nearness)
 
 
 def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:
@@ -244,7 +252,7 @@ def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:
         "intensity_classes": config.intensity_classes,
         "intensity_range": [low, high],
     }
-    return {name: value for name, value in values.items() if name in registry.network_options(model)}
+    return {name: value for name, value in values.items() if name in registry.network_options(model)} | config.options
 
 
 def freeze(model: TrainedModel) -> TrainedModel:
@@ -270,10 +278,13 @@ def light_errors(lights: Lights, batch: Batch, suffix: str) -> dict[str, float]:
     directions, intensities = (tensor.float().cpu().numpy() for tensor in lights[:2])
     true_directions, true_intensities = batch.directions.cpu().numpy(), batch.intensities.cpu().numpy()
     errors = [intensity_error(*pair) for pair in zip(intensities, true_intensities, strict=True)]
-    return {
+    values = {
         f"direction_mae{suffix}": direction_mae(directions, true_directions),
         f"intensity_error{suffix}": float(np.mean(errors)),
     }
+    if lights.nearness is not None:
+        values[f"nearness_error{suffix}"] = float((lights.nearness.float() - batch.nearness).abs().mean())
+    return values
 
 
 def crop(tensor: Tensor, corner: Tensor, side: int) -> Tensor:

@@ -26,8 +26,8 @@ from render.shared.config import to_plain
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
-from sdps.core.interrupts import StopRequest, stop_on_signal
 from sdps.data.dataset import Batch, SampleKey, SceneDataset, collate
+from sdps.data.interrupts import StopRequest, stop_on_signal
 from sdps.data.sources import BatchSource, StoredScenes
 from sdps.models.checkpoint import TrainedModel, code_version, load_state, save_state, save_weights
 from sdps.training.distributed import Team, team

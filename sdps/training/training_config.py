@@ -151,10 +151,12 @@ class LightingTraining(TrainingConfig):
     Attributes:
         direction_classes: K_d, classes of azimuth and of elevation.
         intensity_classes: K_e.
+        options: Options of the network over those of its registry entry, for variants of a model.
     """
 
     direction_classes: int = 36
     intensity_classes: int = 20
+    options: dict[str, bool | int | float | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()

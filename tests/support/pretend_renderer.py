@@ -69,7 +69,8 @@ def pretend(connection, config: WorkerConfig) -> None:
 
 
 def _blank() -> SceneArrays:
-    return SceneArrays(np.zeros((2, 4, 4, 3), np.float16), np.zeros((4, 4, 3), np.float32), np.ones((4, 4), bool))
+    flat = np.zeros((4, 4), np.float32)
+    return SceneArrays(np.zeros((2, 4, 4, 3), np.float16), np.zeros((4, 4, 3), np.float32), np.ones((4, 4), bool), flat)
 
 
 def _result(scene, config: WorkerConfig, spec: str, size: int = 64, arrays: SceneArrays | None = None) -> Result:

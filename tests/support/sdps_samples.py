@@ -1,6 +1,8 @@
 """How samples of tests are made."""
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from sdps.data.augment import Augmentation
 from sdps.data.dataset import SampleOptions
@@ -16,3 +18,11 @@ def options(**changes: object) -> SampleOptions:
 
 def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
+
+
+def distant_layout(images: Tensor) -> dict[str, Tensor]:
+    """Return the fields of a `Batch` that say where pixels and lamps lie: far, and seen orthographically."""
+    scenes, count, _, *sides = images.shape
+    sights = torch.zeros(scenes, 3, *sides)
+    sights[:, 2] = 1.0
+    return {"nearness": torch.zeros(scenes, count), "places": torch.zeros(scenes, 3, *sides), "sights": sights}

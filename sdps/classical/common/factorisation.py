@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from render.shared.errors import InputError
 from sdps.classical.common.gbr import Gbr
-from sdps.classical.common.geometry import outward_gradient, unit_normals
+from sdps.classical.common.outlines import outward_gradient, unit_normals
 
 _log = logging.getLogger(__name__)
 

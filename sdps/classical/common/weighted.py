@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sdps.classical.common.geometry import MIN_CONDITION
+from sdps.classical.common.outlines import MIN_CONDITION
 
 
 def normal_equations(

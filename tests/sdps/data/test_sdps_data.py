@@ -233,7 +233,8 @@ def ramp(height: int, width: int) -> StoredScene:
     rows, columns = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
     image = np.stack([rows, columns, np.ones_like(rows)], axis=-1) / 64.0
     normals = np.tile(np.array([0.6, 0.0, 0.8], np.float32), (height, width, 1))
-    return StoredScene(np.repeat(image[None], 4, 0).astype(np.float16), normals, np.ones((height, width), bool))
+    depth = np.zeros((height, width), np.float32)
+    return StoredScene(np.repeat(image[None], 4, 0).astype(np.float16), normals, depth == 0.0, depth)
 
 
 @pytest.mark.parametrize(("height", "width"), [(64, 64), (48, 80)])

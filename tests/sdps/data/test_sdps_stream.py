@@ -57,7 +57,7 @@ class Rendered:
         normals, mask = sphere_normals(16)
         images = to_half(np.full((len(scene.lights), 16, 16, 3), self.number / 16, np.float32) * mask[..., None])
         self.number += 1
-        return scene, StoredScene(images, normals, mask)
+        return scene, StoredScene(images, normals, mask, normals[..., 2])
 
     def close(self) -> None:
         self.closed.set()

@@ -35,7 +35,7 @@ def test_lighting_networks(name: str) -> None:
     network = create(name).to(META)
     images = torch.rand(2, 3, 3, INPUT_SIZE, INPUT_SIZE, device=META)
     prediction = network(images, torch.ones(2, 1, INPUT_SIZE, INPUT_SIZE, device=META))
-    loss = network.loss(prediction, vectors(2, 3, 3), torch.ones(2, 3, device=META))["total"]
+    loss = network.loss(prediction, Lights(vectors(2, 3, 3), torch.ones(2, 3, device=META)))["total"]
     assert loss.device == META
     for how in ("centre", "expectation"):
         assert network.read_lights(prediction, how).directions.device == META

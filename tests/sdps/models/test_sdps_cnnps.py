@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
+from sdps_samples import distant_layout
 from sdps_scenes import hemisphere_lights, shade, sphere_normals
 from torch import Tensor, nn
 
@@ -58,6 +59,7 @@ def sphere_batch(scenes: int = 2, lights: int = 12, size: int = 32) -> Batch:
         intensities=intensities,
         corner=torch.zeros(scenes, 2, dtype=torch.int64),
         seed=torch.arange(scenes),
+        **distant_layout(torch.from_numpy(images)),
     )
 
 

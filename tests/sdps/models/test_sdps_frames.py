@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from sdps_samples import distant_layout
 from torch import Tensor
 from torch.nn import functional
 
@@ -206,7 +207,8 @@ def _batch():
 
     seen = observations(6, 16)
     return Batch(seen.images, seen.mask, unit(1, 16, 16).permute(0, 3, 1, 2) * seen.mask, seen.directions,
-                 torch.ones(1, 6), torch.zeros(1, 2, dtype=torch.int64), torch.tensor([5]))  # fmt: skip
+                 torch.ones(1, 6), torch.zeros(1, 2, dtype=torch.int64), torch.tensor([5]),
+                 **distant_layout(seen.images))  # fmt: skip
 
 
 def test_the_errors_of_lights_make_a_difference(trained):

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from render.shared.errors import InputError
 from sdps.inference.chunked import lighting_prediction
+from sdps.models.base import Lights
 from sdps.models.blocks import parameter_count
 from sdps.models.lightset import LightSetNet, SetPrediction, image_inputs
 from sdps.models.registry import MODELS
@@ -137,9 +138,9 @@ def test_black_images_have_a_light(network, values):
 def test_the_scale_of_intensities_costs_nothing_and_the_ratios_do(network):
     directions = functional.normalize(torch.randn(1, 4, 3), dim=-1)
     strengths = torch.tensor([[0.3, 0.6, 1.2, 0.9]])
-    prediction = SetPrediction(directions, strengths, torch.full((1, 4), 0.1))
+    prediction = SetPrediction(directions, strengths, torch.full((1, 4), 0.1), torch.zeros(1, 4))
     alike, other = (
-        network.loss(prediction, directions, scale * torch.tensor([[0.3, 0.6, 1.2, last]]))["relative"]
+        network.loss(prediction, Lights(directions, scale * torch.tensor([[0.3, 0.6, 1.2, last]])))["relative"]
         for scale, last in ((2.0, 0.9), (1.0, 1.8))
     )
     assert alike < 1e-6
@@ -148,7 +149,7 @@ def test_the_scale_of_intensities_costs_nothing_and_the_ratios_do(network):
 
 def test_expected_errors_are_in_degrees(network):
     chord = torch.tensor([[2.0 * math.sin(math.radians(5.0)), 3.0]])
-    lights = network.read_lights(SetPrediction(torch.zeros(1, 2, 3), torch.ones(1, 2), chord))
+    lights = network.read_lights(SetPrediction(torch.zeros(1, 2, 3), torch.ones(1, 2), chord, torch.zeros(1, 2)))
     np.testing.assert_allclose(lights.expected_error, [[10.0, 180.0]], rtol=1e-5)
 
 

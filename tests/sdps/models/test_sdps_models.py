@@ -94,7 +94,7 @@ def test_lcnet_may_be_trained_on_half_the_size_first() -> None:
     network = LCNet()
     prediction = network(torch.rand(1, 2, 3, 64, 64), torch.ones(1, 1, 64, 64))
     assert prediction.azimuth.shape == (1, 2, 36)
-    network.loss(prediction, torch.tensor([[[0.0, 0.0, 1.0]] * 2]), torch.ones(1, 2))["total"].backward()
+    network.loss(prediction, Lights(torch.tensor([[[0.0, 0.0, 1.0]] * 2]), torch.ones(1, 2)))["total"].backward()
     assert all(parameter.grad is not None for parameter in network.parameters())
 
 
@@ -122,7 +122,7 @@ def test_resizing_for_lcnet_keeps_means() -> None:
 
 def test_lighting_loss_of_uniform_logits_is_the_log_of_the_class_counts() -> None:
     logits = LightingLogits(torch.zeros(2, 3, 36), torch.zeros(2, 3, 36), torch.zeros(2, 3, 20))
-    loss = LCNet().loss(logits, torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3), torch.ones(2, 3))
+    loss = LCNet().loss(logits, Lights(torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3), torch.ones(2, 3)))
     assert float(loss["azimuth"]) == pytest.approx(3.5835, abs=1e-4)  # ln 36
     assert float(loss["total"]) == pytest.approx(2 * 3.5835 + 2.9957, abs=1e-3)
 

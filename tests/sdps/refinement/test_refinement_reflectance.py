@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from sdps_scenes import hemisphere_lights
 
-from sdps.classical.common.geometry import unit_normals
+from sdps.classical.common.outlines import unit_normals
 from sdps.refinement.reflectance import LEAST_COSINE, MODES, evaluate_factor, measure_angles, mode_terms, shade
 
 RNG = np.random.default_rng(0)

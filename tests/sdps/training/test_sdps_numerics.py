@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from sdps_samples import distant_layout
 from sdps_scenes import hemisphere_lights, shade, sphere_normals
 
 from render.shared.config import to_plain
@@ -158,6 +159,7 @@ def difficult_batch(size: int) -> Batch:
         intensities=torch.tensor([[0.2, 2.0]]).repeat(5, 1),
         corner=torch.zeros(5, 2, dtype=torch.int64),
         seed=torch.arange(5),
+        **distant_layout(images),
     )
 
 

@@ -1,0 +1,103 @@
+"""Where the pixels of a training sample lie, and its lamps, as `sdps.core.geometry` counts them.
+
+Rendered scenes say where lamps stand from the centre of the whole object; in use nobody knows where that is. So a
+sample's lamps are those seen from C, the mean of the pixels it shows, and its images are what lamps of equal irradiance
+there would give.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from render.records.manifest import SceneSpec
+from render.records.view_geometry import image_points
+from sdps.core.symmetry import Symmetry
+
+
+class Layout(NamedTuple):
+    """Pixels of a sample, and its lamps; camera frame, half image widths of the scene.
+
+    Attributes:
+        image: (H, W, 2) float64, where each pixel lies in the picture.
+        depth: (H, W) float64, z, 0 outside the object.
+        camera: Distance of the camera; inf: orthographic.
+        positions: (Q, 3) float64, of near lamps; None: distant ones.
+        reference: (3,) where near lamps have irradiance pi.
+    """
+
+    image: np.ndarray
+    depth: np.ndarray
+    camera: float
+    positions: np.ndarray | None
+    reference: np.ndarray
+
+    def turn(self, symmetry: Symmetry) -> "Layout":
+        """Return the layout of the turned scene."""
+        flat = np.concatenate([self.image, np.zeros((*self.depth.shape, 1))], axis=-1)
+        image = symmetry.vectors(symmetry.images(flat, 0))[..., :2]
+        positions = None if self.positions is None else symmetry.vectors(self.positions)
+        return Layout(image, symmetry.images(self.depth, 0), self.camera, positions, symmetry.vectors(self.reference))
+
+    def select(self, window: tuple[slice, slice]) -> "Layout":
+        """Return the layout of a part of the picture."""
+        return self._replace(image=self.image[window], depth=self.depth[window])
+
+
+class Placed(NamedTuple):
+    """A layout as networks are given it.
+
+    Attributes:
+        places: (H, W, 3) float32, (X - C) / R.
+        sights: (H, W, 3) float32, v'.
+        directions: (Q, 3) float32, unit, from C to the lamps.
+        nearness: (Q,) float32, rho; 0 of distant lamps.
+        irradiance: (Q,) float32, at C, over pi.
+    """
+
+    places: np.ndarray
+    sights: np.ndarray
+    directions: np.ndarray
+    nearness: np.ndarray
+    irradiance: np.ndarray
+
+
+def lay_out(scene: SceneSpec, depth: np.ndarray, mask: np.ndarray, chosen: np.ndarray | None) -> Layout:
+    """Return the layout of a scene's pixels (H, W), and of the lamps `chosen`; None: light that is mixed."""
+    positions = None if chosen is None else scene.light_positions()
+    return Layout(
+        image=image_points(mask.shape), depth=np.where(mask, depth, 0.0).astype(np.float64),
+        camera=scene.view.camera_distance or np.inf,
+        positions=None if positions is None or chosen is None else positions[chosen].astype(np.float64),
+        reference=np.array([*scene.view.offset, 0.0]),
+    )  # fmt: skip
+
+
+def place(layout: Layout, mask: np.ndarray, directions: np.ndarray) -> Placed:
+    """Return a layout as networks are given it.
+
+    Args:
+        layout: The pixels and lamps.
+        mask: (H, W) bool.
+        directions: (Q, 3) unit, of distant lamps.
+    """
+    image, depth, camera, positions, reference = layout
+    inside, perspective = depth[mask], np.isfinite(camera)
+    mean = inside.mean() if len(inside) else 0.0
+    if perspective and len(inside):
+        mean = camera - float(np.exp(np.log(camera - inside).mean()))
+    shrunk = 1.0 - mean / camera
+    points = np.concatenate([image * (1.0 - depth / camera)[..., None], depth[..., None]], axis=-1)
+    seen = image[mask] if len(inside) else image.reshape(-1, 2)
+    pixel = float(np.abs(np.diff(image, axis=1)).max())
+    radius = float(np.ptp(seen, axis=0).max() + pixel) / 2 * shrunk
+    centre = np.array([*(seen.mean(axis=0) * shrunk), mean])
+    tilts = -image / camera if perspective else np.zeros_like(image)
+    nearness, irradiance = np.zeros(len(directions)), np.ones(len(directions))
+    if positions is not None:
+        off = positions - centre
+        away = np.linalg.norm(off, axis=1)
+        directions, nearness = off / away[:, None], radius / away
+        irradiance = (np.linalg.norm(positions - reference, axis=1) / away) ** 2
+    sights = np.concatenate([tilts, np.ones((*depth.shape, 1))], axis=-1)
+    found = ((points - centre) / radius * mask[..., None], sights, directions, nearness, irradiance)
+    return Placed(*(np.ascontiguousarray(part, np.float32) for part in found))
