@@ -67,6 +67,13 @@ class Camera:
         x, y = self.middle(shape)
         return Camera(self.focal, (x - column, y - row))
 
+    def thin(self, shape: tuple[int, int], step: int) -> "Camera":
+        """Return the camera of every `step`-th row and column of a picture (H, W)."""
+        if not self.is_perspective and self.principal is None:
+            return self
+        column, row = self.middle(shape)
+        return Camera(self.focal / step, (column / step, row / step))
+
     def scale(self, factor: float) -> "Camera":
         """Return the camera of the picture at `factor` times its size."""
         principal = None
