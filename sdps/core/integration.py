@@ -165,7 +165,8 @@ def _facing(unit: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:  
     """Return n . v' of unit normals (n, 3)."""
     if not camera.is_perspective:
         return unit[:, 2]
-    return np.einsum("nc,nc->n", unit, camera.sights(mask.shape)[mask])
+    points = camera.place(mask.shape, *np.nonzero(mask), np.zeros(len(unit)))  # of the mask alone: pictures are large
+    return unit[:, 2] - (unit * points).sum(axis=-1) / camera.focal
 
 
 def _graph(unit: np.ndarray, facing: np.ndarray, mask: np.ndarray) -> _Graph:
