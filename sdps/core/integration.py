@@ -165,7 +165,8 @@ def _facing(unit: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:  
     """Return n . v' of unit normals (n, 3)."""
     if not camera.is_perspective:
         return unit[:, 2]
-    points = camera.place(mask.shape, *np.nonzero(mask), np.zeros(len(unit)))  # of the mask alone: pictures are large
+    rows, columns = np.nonzero(mask)  # of the mask alone: pictures are large
+    points = camera.place(mask.shape, rows, columns, np.zeros(len(unit)))
     return unit[:, 2] - (unit * points).sum(axis=-1) / camera.focal
 
 

@@ -146,7 +146,7 @@ class Inference:
     def summary(self) -> dict[str, Any]:
         """Return what a reader needs to judge the result, JSON ready."""
         photos = self.photos
-        facts = {
+        facts: dict[str, Any] = {
             "verdict": self.verdict,
             "method": self.method,
             "weights": {name: str(path) for name, path in self.files.items()},
