@@ -49,6 +49,9 @@ class Photographs:
         camera: The camera, in pixels of the pictures as read; orthographic where nothing is known.
         camera_origin: Where its focal length is from, in words.
         pixel_size: Millimetres per pixel, as read, at the object's mean depth; None where it is not known.
+        light_nearness: (L,) float32, the object's radius over the distance of each lamp (`sdps.core.geometry`), 0 of
+            distant ones; None where it is not known.
+        nearness_each: Where it is not known, each lamp may have a distance of its own.
     """
 
     folder: Path
@@ -70,6 +73,8 @@ class Photographs:
     camera: Camera = ORTHOGRAPHIC
     camera_origin: str = NOT_KNOWN
     pixel_size: float | None = None
+    light_nearness: np.ndarray | None = None
+    nearness_each: bool = False
 
     def __len__(self) -> int:
         return len(self.files)
