@@ -94,8 +94,7 @@ def infer(
     runner = _runner(method, known, models, config, refine, len(photos))
     if not anyway:
         workload(photos, runner, discontinuities=discontinuities).check()
-    began = time.perf_counter()
-    intensities = photos.intensities
+    began, intensities = time.perf_counter(), photos.intensities
     if photos.light_directions is not None:  # after what costs nothing: it reads every photograph twice
         intensities, more = _question_lights(photos, models, config)
         findings = (*findings, *more)
