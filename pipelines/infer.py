@@ -43,6 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--frame", default="y-up", help="axes of the lights file: y-up, y-down, x-left, z-away, xy-swapped"
     )
+    parser.add_argument("--light-distance", default="auto", metavar="D",
+                        help="far, a number of object sizes, 400mm (with --pixel-size), or each: not the same for all "
+                        "lamps (default: by --lights, else not known)")  # fmt: skip
     parser.add_argument("--gamma", default="auto", help="linear, srgb, or an exponent (default: by kind of file)")
     parser.add_argument("--images", action="append", default=None, metavar="PATTERN",
                         help="files to use, in this order; one that begins with ! leaves files out")  # fmt: skip
@@ -100,7 +103,7 @@ def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:
     photos = load(
         args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
         gamma=args.gamma, names=args.images, anyway=args.anyway, scale=args.scale, focal=args.focal,
-        principal=args.principal, pixel_size=args.pixel_size,
+        principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance,
     )  # fmt: skip
     findings = tuple(check(photos))
     height, width = photos.shape

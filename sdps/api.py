@@ -26,6 +26,7 @@ from tqdm import tqdm
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.core.estimate import Estimate
+from sdps.core.geometry import ORTHOGRAPHIC, Camera
 from sdps.inference.estimator import check_lights
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
@@ -93,13 +94,15 @@ def infer(
     runner = _runner(method, known, models, config, refine, len(photos))
     if not anyway:
         workload(photos, runner, discontinuities=discontinuities).check()
-    began = time.perf_counter()
-    intensities = photos.intensities
+    began, intensities = time.perf_counter(), photos.intensities
     if photos.light_directions is not None:  # after what costs nothing: it reads every photograph twice
         intensities, more = _question_lights(photos, models, config)
         findings = (*findings, *more)
         _stop(photos, findings, anyway)
-    found = runner.estimate(photos, photos.mask, photos.light_directions, intensities, saturation=photos.saturation)
+    found = runner.estimate(
+        photos, photos.mask, photos.light_directions, intensities, saturation=photos.saturation,
+        nearness=photos.light_nearness, camera=photos.camera,
+    )  # fmt: skip
     seconds = time.perf_counter() - began
     return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
 
@@ -121,6 +124,8 @@ def estimate(
     *,
     light_directions: np.ndarray | None = None,
     intensities: np.ndarray | None = None,
+    light_nearness: np.ndarray | None = None,
+    camera: Camera = ORTHOGRAPHIC,
     models: str | Path | None = None,
     config: InferenceConfig | None = None,
     saturation: float = float("inf"),
@@ -135,6 +140,9 @@ def estimate(
         light_directions: (L, 3) known directions from the surface to the light (x right, y up, z to the camera).
         intensities: (L,) or (L, 3) known intensities, of any overall scale. Where only directions are known, a network
             finds them.
+        light_nearness: (L,) the object's radius over the distance of each lamp (`sdps.core.geometry`), 0 of distant
+            ones; None where it is not known.
+        camera: What the images were taken with.
         models: As for `infer`.
         config: As for `infer`.
         saturation: Radiance from which on a channel is clipped; refinement leaves such observations out.
@@ -152,7 +160,9 @@ def estimate(
         check_lights(len(images), light_directions)
         seen = see_lights(images, mask, _finder(models), config)
         intensities, _ = question_lights(images, mask, light_directions, None, seen)
-    return runner.estimate(images, mask, light_directions, intensities, saturation=saturation)
+    return runner.estimate(
+        images, mask, light_directions, intensities, saturation=saturation, nearness=light_nearness, camera=camera
+    )
 
 
 def available_methods(models: str | Path | None = None) -> dict[str, str]:

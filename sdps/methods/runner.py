@@ -13,6 +13,7 @@ from render.records.shards import file_hash
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.core.estimate import Estimate, constant_estimate
+from sdps.core.geometry import ORTHOGRAPHIC, Camera
 from sdps.core.metrics import score
 from sdps.inference.estimator import Estimator, default_device, load_model
 from sdps.inference.image_source import ImageSource
@@ -81,6 +82,9 @@ class Runner:
         intensities: np.ndarray | None,
         found: Found | None = None,
         saturation: float = float("inf"),
+        *,
+        nearness: np.ndarray | None = None,
+        camera: Camera = ORTHOGRAPHIC,
     ) -> Estimate:
         """Run the method; of the lights it sees what it is to be given.
 
@@ -91,6 +95,8 @@ class Runner:
             intensities: (L,) or (L, 3), or None where they are not known.
             found: Lights that methods found of these very images, by what they depend on; read, and added to.
             saturation: Radiance from which on a channel is clipped, which refinement then leaves out.
+            nearness: (L,) of the lamps (`sdps.core.geometry`), 0 of distant ones; None where it is not known.
+            camera: What the images were taken with.
 
         Raises:
             InputError: images or lights the method cannot work with, in one line.
@@ -101,16 +107,19 @@ class Runner:
             given["lights"] = lights
         if TRUE_LIGHTS in (method.lighting, method.intensities) and intensities is not None:
             given["intensities"] = intensities
-        estimate = self._estimate(images, mask, given, found)
+        estimate = self._estimate(images, mask, given, found, nearness, camera)
         return self._refine(images, mask, estimate, given, saturation) if method.refined else estimate
 
-    def _estimate(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
+    def _estimate(
+        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None,
+        nearness: np.ndarray | None, camera: Camera,
+    ) -> Estimate:  # fmt: skip
         """Run the method proper on what it is given."""
         method = self.method
         if method.normals == CONSTANT:
             return constant_estimate(len(images), mask)
         if method.normals in classical.METHODS:
-            return self._classical(images, mask, given, found)
+            return self._classical(images, mask, given, found, nearness, camera)
         if not method.normals:
             return self._lights(images, mask, given, found)
         if found is not None and method.lighting not in (NONE, TRUE_LIGHTS):
@@ -128,7 +137,10 @@ class Runner:
             found[key] = self.estimator.estimate_lights(images, mask, given.get("intensities"))
         return found[key]
 
-    def _classical(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
+    def _classical(
+        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None,
+        nearness: np.ndarray | None, camera: Camera,
+    ) -> Estimate:  # fmt: skip
         """Run a classical method, which holds the object's box of all images at once."""
         name = self.method.normals
         arguments: tuple[Any, ...] = ()

@@ -4,16 +4,17 @@ Legend: L pictures of H x W pixels.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from render.shared.errors import InputError
 from render.shared.imaging.reducing import check_scale, reduce_image, smaller_shape
-from sdps.core.geometry import ORTHOGRAPHIC, Camera
+from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture
 from sdps.photos.faults import Faults
 from sdps.photos.light_files.light_choice import KnownLights, known_lights
+from sdps.photos.light_files.light_distance import LightDistance, Yardstick, find_nearness, read_distance
 from sdps.photos.picture_file import decode, orient_pixels
 from sdps.photos.pictures.lens import NOT_KNOWN, Wanted, read_wanted
 from sdps.photos.pictures.listing import Listing, list_pictures
@@ -49,6 +50,9 @@ class Photographs:
         camera: The camera, in pixels of the pictures as read; orthographic where nothing is known.
         camera_origin: Where its focal length is from, in words.
         pixel_size: Millimetres per pixel, as read, at the object's mean depth; None where it is not known.
+        light_nearness: (L,) float32, the object's radius over the distance of each lamp (`sdps.core.geometry`), 0 of
+            distant ones; None where it is not known.
+        nearness_each: Where it is not known, each lamp may have a distance of its own.
     """
 
     folder: Path
@@ -70,6 +74,8 @@ class Photographs:
     camera: Camera = ORTHOGRAPHIC
     camera_origin: str = NOT_KNOWN
     pixel_size: float | None = None
+    light_nearness: np.ndarray | None = None
+    nearness_each: bool = False
 
     def __len__(self) -> int:
         return len(self.files)
@@ -133,6 +139,7 @@ def load(
     focal: str | float | None = None,
     principal: str | Sequence[float] | None = None,
     pixel_size: float | None = None,
+    light_distance: str | float | None = None,
 ) -> Photographs:
     """Look through a folder of photographs of a static object under one distant light each (docs/guides/capture.md).
 
@@ -153,15 +160,19 @@ def load(
             as the files' EXIF data say, orthographic where they do not. Pixels here and below are the files', turned.
         principal: Column and row of the principal point, "2016,1512" or two numbers; None: the middle.
         pixel_size: Millimetres per pixel at the object's mean depth, for depth and meshes in millimetres.
+        light_distance: How far all lamps stand from the object: a number of its sizes (the longer side of its outline's
+            box), `400mm`, `40cm`, `0.4m` (with `pixel_size`), or `far`. None or `auto`: as the positions in the lights
+            file say, else not known; `each`: not known, and not the same for all lamps.
 
     Raises:
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
     """
+    distance = read_distance(light_distance)
     wanted, folder, scale = read_wanted(focal, principal, pixel_size), Path(folder), check_scale(scale)
     listing, faults = list_pictures(folder, names), Faults(anyway)
     seen = survey(folder, listing, gamma, None if mask is None else Path(mask), faults, scale)
     known = _find_lights(listing, seen, lights, intensities, frame, faults)
-    return _assemble(folder, listing, seen, known, wanted, faults, scale)
+    return _place_lamps(_assemble(folder, listing, seen, known, wanted, faults, scale), seen, known, distance)
 
 
 def _find_lights(
@@ -188,3 +199,10 @@ def _assemble(
         orientation=seen.orientation, overridden=tuple(faults.overridden), scale=scale, camera=by.camera,
         camera_origin=by.origin, pixel_size=by.pixel_size,
     )  # fmt: skip
+
+
+def _place_lamps(photos: Photographs, seen: Survey, known: KnownLights, distance: LightDistance) -> Photographs:
+    """Say how near the lamps stand, where that is known."""
+    by = Yardstick(Capture.of(photos.mask).radius, photos.pixel_size, max(photos.shape) / max(seen.full))
+    nearness = find_nearness(distance, photos.files, by, known.distances, known.unit, known.name)
+    return replace(photos, light_nearness=nearness, nearness_each=distance.each)

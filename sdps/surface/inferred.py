@@ -221,7 +221,8 @@ class Inference:
         write_png(folder / "normal.png", _encode_normals(normals))
         write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
         if len(self.light_directions):
-            write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains)
+            near = self.photos.light_nearness
+            write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains, near)
         if self.refinement is not None:
             refined = self.refinement.refined
             _save_array(folder / "albedo.npy", refined.albedo)

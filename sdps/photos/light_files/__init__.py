@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -17,10 +17,12 @@ from sdps.photos.light_files.light_columns import split_columns, upright
 from sdps.photos.light_files.light_frame import frame_matrix
 from sdps.photos.light_files.light_json import FRAME
 from sdps.photos.light_files.light_names import in_order, join_split_names, take_numbers
+from sdps.photos.light_files.light_positions import ENDLESS, NEAR
 from sdps.photos.light_files.light_reading import read_table
-from sdps.photos.light_files.light_table import INTENSITIES, LIGHTS, Table
+from sdps.photos.light_files.light_table import INTENSITIES, LIGHTS, Near, Table
 
-SUFFIXES = (".txt", ".lp", ".csv", ".tsv", ".dat", ".npy", ".npz", ".mat", ".json", ".relight", ".dome")
+SUFFIXES = (".txt", ".lp", ".csv", ".tsv", ".dat", ".npy", ".npz", ".mat", ".json", ".relight", ".dome", ".yaml",
+            ".yml")  # fmt: skip
 """Of files in a folder of photographs that may be lights; a file that is named may have any."""
 
 _USUAL = ("lights.json", "light_directions.txt")
@@ -44,12 +46,16 @@ class Lights:
         intensities: (L,) or (L, 3) float32; None where the file has none.
         notes: Plain sentences about what was done.
         own_frame: The file states its axes, so that no flag may turn them.
+        distances: (L,) float64, of the lamps from the object's middle, in `unit`; None of a file of directions.
+        unit: mm, cm, m, pixels, or objects: sizes of the object.
     """
 
     directions: np.ndarray
     intensities: np.ndarray | None
     notes: tuple[str, ...]
     own_frame: bool = False
+    distances: np.ndarray | None = None
+    unit: str = ""
 
 
 def read_lights(
@@ -80,23 +86,19 @@ def read_lights(
     if table.doubt:
         _stop(faults, table.doubt)
     vectors, strengths, said = _order_rows(path, table, files, axes.sum(axis=1).tolist())
-    vectors = vectors @ axes.T
+    near = table.near
+    vectors = (vectors if near is None else vectors - near.object) @ axes.T
     lengths = np.linalg.norm(vectors, axis=1)
-    zero = [file for file, length in zip(files, lengths, strict=True) if length < 1e-9]
-    if zero:
-        subject = "the light of" if len(zero) == 1 else "the lights of"
-        raise InputError(
-            f"{path}: {subject} {list_names(zero)} {'is' if len(zero) == 1 else 'are'} 0 0 0; give the direction, or "
-            "leave the picture out"
-        )
+    _refuse_zero(path, lengths, files, near)
     directions = vectors / lengths[:, None]
     _refuse_behind(path, directions, files, frame, faults)
     turned = f", turned by {frame}" if (turn != np.eye(3)).any() else ""
     how = f", axes {frame}" if table.signs == (1, 1, 1) else turned
-    notes = [f"lights are those of {path.name}{how}", *said]
-    if np.abs(lengths - 1).max() > _LENGTH:
-        notes.append(f"light vectors had lengths from {lengths.min():.4g} to {lengths.max():.4g}; they were normalised")
-    return Lights(directions.astype(np.float32), _intensities(path, strengths, files), tuple(notes), own)
+    notes = [f"lights are those of {path.name}{how}", *said, *_describe(lengths, near)]
+    found = Lights(directions.astype(np.float32), _intensities(path, strengths, files), tuple(notes), own)
+    if near is None:
+        return found
+    return replace(found, distances=np.where(lengths < ENDLESS / 2, lengths, np.inf), unit=near.unit)
 
 
 def read_intensities(path: str | Path, files: Sequence[str]) -> np.ndarray:
@@ -140,22 +142,37 @@ def _may_be_lights(path: Path) -> bool:
 
 
 def write_lights(
-    path: str | Path, names: Sequence[str], directions: np.ndarray, intensities: np.ndarray | None = None
+    path: str | Path,
+    names: Sequence[str],
+    directions: np.ndarray,
+    intensities: np.ndarray | None = None,
+    nearness: np.ndarray | None = None,
 ) -> None:
     """Write lights.json: {"frame", "images": [{"file", "direction": [x, y, z], "intensity": i or [r, g, b]}]}.
+
+    With near lamps it is of the kind `near`, in the unit `objects`, and each of these has a "position" as well, from
+    the object's middle.
 
     Args:
         path: Destination, written atomically.
         names: (L,) file names of the pictures.
         directions: (L, 3) unit, from the surface to the light; x right, y up, z to the camera.
         intensities: (L,) or (L, 3), up to one common scale; None for 1.
+        nearness: (L,) the object's radius over the distance of each lamp, 0 of distant ones; None: not known.
     """
+    directions = np.asarray(directions, np.float64)
     values = np.ones(len(names)) if intensities is None else np.asarray(intensities)
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"file": str(name), "direction": np.round(direction, 6).tolist(), "intensity": np.round(value, 6).tolist()}
-        for name, direction, value in zip(names, np.asarray(directions, np.float64), values, strict=True)
+        for name, direction, value in zip(names, directions, values, strict=True)
     ]
-    write_json(path, {"frame": FRAME, "images": rows})
+    content: dict[str, Any] = {"frame": FRAME}
+    if nearness is not None and np.any(nearness):
+        content |= {"kind": NEAR, "unit": "objects"}
+        for row, direction, near in zip(rows, directions, np.asarray(nearness, np.float64), strict=True):
+            if near > 0.0:
+                row["position"] = np.round(direction / (2.0 * near), 6).tolist()
+    write_json(path, content | {"images": rows})
 
 
 def _order_rows(
@@ -167,8 +184,37 @@ def _order_rows(
     if table.strengths is not None and table.values.shape[1] == 3:
         table = replace(table, values=np.hstack([table.values, table.strengths]))
     values, said = in_order(path, table, files)
+    if table.near is not None and table.columns and "x" not in table.columns:
+        raise InputError(f"{path}: near lamps need positions x y z; angles do not say how far they are")
     vectors, strengths, notes = split_columns(path, table, values, LIGHTS)
     return vectors, strengths, (*notes, *said)
+
+
+def _refuse_zero(path: Path, lengths: np.ndarray, files: Sequence[str], near: Near | None) -> None:
+    """Refuse vectors of length 0."""
+    zero = [file for file, length in zip(files, lengths, strict=True) if length < 1e-9]
+    if zero and near is not None:
+        raise InputError(f"{path}: the lamp of {list_names(zero)} stands in the object's middle; correct its position")
+    if zero:
+        subject = "the light of" if len(zero) == 1 else "the lights of"
+        raise InputError(
+            f"{path}: {subject} {list_names(zero)} {'is' if len(zero) == 1 else 'are'} 0 0 0; give the direction, or "
+            "leave the picture out"
+        )
+
+
+def _describe(lengths: np.ndarray, near: Near | None) -> list[str]:
+    """Say how long vectors (L,) are, where that matters."""
+    if near is None:
+        if np.abs(lengths - 1).max() <= _LENGTH:
+            return []
+        return [f"light vectors had lengths from {lengths.min():.4g} to {lengths.max():.4g}; they were normalised"]
+    finite = lengths[lengths < ENDLESS / 2]
+    if not len(finite):
+        return ["its lamps are distant"]
+    low, high = f"{finite.min():.4g}", f"{finite.max():.4g}"
+    unit = "object sizes" if near.unit == "objects" else near.unit
+    return [f"its lamps stand {low if low == high else f'{low} to {high}'} {unit} from the object's middle"]
 
 
 def _intensities(path: Path, values: np.ndarray, files: Sequence[str]) -> np.ndarray | None:

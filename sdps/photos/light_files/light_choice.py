@@ -1,7 +1,7 @@
 """Which lights are known of a folder of photographs: directions, intensities, both or neither."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,8 @@ class KnownLights:
         name: Name of the file of the directions; empty without one.
         frame: The frame flag it was read with; empty where the file states its own frame.
         notes: Plain sentences about where they come from.
+        distances: (L,) float64, of the lamps from the object's middle, in `unit`; None where the file has none.
+        unit: mm, cm, m, pixels, or objects: sizes of the object.
     """
 
     directions: np.ndarray | None = None
@@ -32,6 +34,8 @@ class KnownLights:
     name: str = ""
     frame: str = ""
     notes: tuple[str, ...] = ("lights are unknown and will be estimated, where the method can",)
+    distances: np.ndarray | None = None
+    unit: str = ""
 
 
 def known_lights(
@@ -60,14 +64,17 @@ def known_lights(
     lying = next(filter(None, map(find_lights, folders)), lights) if str(lights) == "folder" else lights
     path = _resolve(folders, lying, _USUAL)
     directions = strengths = None
-    name, used, notes = "", "", KnownLights.notes
+    name, notes, found = "", KnownLights.notes, KnownLights()
     if path is not None:
         read = read_lights(path, files, frame, stops)
-        directions, strengths, notes = read.directions, read.intensities, read.notes
-        name, used = path.name, "" if read.own_frame else frame
+        directions, strengths, notes, name = read.directions, read.intensities, read.notes, path.name
+        found = KnownLights(
+            directions=directions, name=name, frame="" if read.own_frame else frame, distances=read.distances,
+            unit=read.unit,
+        )  # fmt: skip
     if intensities is not None and str(intensities) == EQUAL:
         strengths, notes = np.ones(len(files), np.float32), (*notes, "intensities are taken for equal, as asked")
-        return KnownLights(directions=directions, intensities=strengths, name=name, frame=used, notes=notes)
+        return replace(found, intensities=strengths, notes=notes)
     second = _resolve(folders, intensities, (_PARTNER,))
     partner = None if path is None else path.with_name(_PARTNER)
     if second is None and path is not None and path.name == _USUAL[1] and partner is not None and partner.is_file():
@@ -79,7 +86,7 @@ def known_lights(
         notes = (*notes, f"intensities are those of {second.name}")
     elif directions is not None and strengths is None:
         notes = (*notes, f"{name} has no intensities; a network finds them (--intensities {EQUAL} if all lights are)")
-    return KnownLights(directions=directions, intensities=strengths, name=name, frame=used, notes=notes)
+    return replace(found, intensities=strengths, notes=notes)
 
 
 def _resolve(folders: Sequence[Path], asked: str | Path | None, known: tuple[str, ...]) -> Path | None:

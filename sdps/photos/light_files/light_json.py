@@ -1,4 +1,4 @@
-"""Light files that are JSON: our own lights.json, Meshroom's, RelightLab's, and plain lists."""
+"""Light files that are JSON: our own lights.json, Meshroom's, RelightLab's, plain lists, and positions; or YAML."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,13 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from render.shared.config import parse_yaml
 from render.shared.errors import InputError
 from render.shared.files import parse_json, read_text
 from sdps.photos.light_files.light_names import base_name, numbers_of
+from sdps.photos.light_files.light_positions import own_position, read_near, read_positions
 from sdps.photos.light_files.light_table import Table, counts
 
 FRAME = "x right, y up, z to the camera"
 """What lights.json states; no other is read."""
+
+YAML = (".yaml", ".yml")
+"""Suffixes of files in YAML."""
 
 _MESHROOM = "x right, y down, z away"
 _COLUMNS = {3: ("x", "y", "z"), 4: ("x", "y", "z", "i"), 6: ("x", "y", "z", "r", "g", "b")}
@@ -39,7 +44,7 @@ def read_json_table(path: Path, text: str, files: Sequence[str]) -> tuple[Table,
         InputError: another layout, or values that are not lights.
     """
     try:
-        content = parse_json(text)
+        content = parse_yaml(text, str(path)) if path.suffix.lower() in YAML else parse_json(text)
         own = isinstance(content, dict) and "images" in content and ("frame" in content or not _is_relight(content))
         table = _own(path, content) if own else _foreign(path, content, files)
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
@@ -54,14 +59,19 @@ def read_json_table(path: Path, text: str, files: Sequence[str]) -> tuple[Table,
 def _own(path: Path, content: Any) -> Table:
     frame = content["frame"]
     names = tuple(str(image["file"]) for image in content["images"])
-    rows = [[*image["direction"], *np.atleast_1d(image.get("intensity", 1.0)).tolist()] for image in content["images"]]
+    near = read_near(path, content) if "kind" in content else None
+    places = [image["direction"] if near is None else own_position(image) for image in content["images"]]
+    strengths = [np.atleast_1d(image.get("intensity", 1.0)).tolist() for image in content["images"]]
+    rows = [[*place, *strength] for place, strength in zip(places, strengths, strict=True)]
     if frame != FRAME:
         raise InputError(f"{path}: its frame is {frame!r}; only {FRAME!r} is read, convert the directions")
-    return Table(np.array(rows, np.float64), names)
+    return Table(np.array(rows, np.float64), names, near=near)
 
 
 def _foreign(path: Path, content: Any, files: Sequence[str]) -> Table:
     """Read what other programs write."""
+    if isinstance(content, dict) and ("kind" in content or "positions" in content):
+        return read_positions(path, content)
     if isinstance(content, dict) and isinstance(content.get("lights"), dict | list):
         return _meshroom(path, content["lights"], files)
     if isinstance(content, dict) and "images" in content:
@@ -96,7 +106,10 @@ def _meshroom(path: Path, lights: Any, files: Sequence[str]) -> Table:
     items = list(lights.values() if isinstance(lights, dict) else lights)
     near = [item for item in items if "direction" not in item and "position" in item]
     if near:
-        raise InputError(f"{path}: {len(near)} of its lights are near ones, with a position; only directions are read")
+        raise InputError(
+            f"{path}: {len(near)} of its lights are near ones, with a position; write a file with "
+            "kind: near, unit and positions (docs/guides/capture.md)"
+        )
     rows = [_vector(item["direction"], (3, 9))[:3] for item in items]
     strengths = [_vector(item.get("intensity", [1.0, 1.0, 1.0])) for item in items]
     measured = strengths != [[1.0, 1.0, 1.0]] * len(items)

@@ -2,13 +2,15 @@
 
 import zipfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import parse_json, read_bytes
 from sdps.photos.light_files.light_arrays import read_mat, read_npy, read_npz
-from sdps.photos.light_files.light_json import read_json_table
+from sdps.photos.light_files.light_json import YAML, read_json_table
+from sdps.photos.light_files.light_positions import take_header
 from sdps.photos.light_files.light_table import Table, Want
 from sdps.photos.light_files.light_text import read_text_table
 
@@ -51,9 +53,10 @@ def read_table(path: Path, files: Sequence[str], want: Want) -> tuple[Table, boo
     if head.startswith(b"MATLAB 5.0") or path.suffix.lower() == ".mat":
         return read_mat(path, count, want), False
     text = _text(path)
-    if want.lights and (path.suffix.lower() in (".json", ".relight", ".dome") or _is_json(text)):
+    if want.lights and (path.suffix.lower() in (".json", ".relight", ".dome", *YAML) or _is_json(text)):
         return read_json_table(path, text, files)
-    return read_text_table(path, text, count, want), False
+    text, near = take_header(path, text) if want.lights else (text, None)
+    return replace(read_text_table(path, text, count, want), near=near), False
 
 
 def _is_json(text: str) -> bool:

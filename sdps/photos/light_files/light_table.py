@@ -25,6 +25,19 @@ LIGHTS = Want((3, 4, 6), "x y z, x y z i or x y z r g b", True)
 INTENSITIES = Want((1, 3), "i or r g b", False)
 
 
+@dataclass(frozen=True)
+class Near:
+    """What a file says of its positions.
+
+    Attributes:
+        unit: mm, cm, m, pixels, or objects: sizes of the object.
+        object: Where the object's middle lies, in the file's coordinates.
+    """
+
+    unit: str
+    object: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Table:
     """Rows as they are in a file.
@@ -40,6 +53,7 @@ class Table:
         strengths: (N, 1) or (N, 3) intensities that stand apart from the rows; None where there are none.
         doubt: Why the rows may not belong to the pictures; empty where nothing speaks against it.
         notes: Plain sentences about what was done.
+        near: The rows are positions of lamps, not directions; None of directions.
     """
 
     values: np.ndarray
@@ -51,6 +65,7 @@ class Table:
     strengths: np.ndarray | None = None
     doubt: str = ""
     notes: tuple[str, ...] = ()
+    near: Near | None = None
 
 
 def are_unit(vectors: np.ndarray) -> bool:
