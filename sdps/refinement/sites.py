@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sdps.core.geometry import Camera, Capture, reach
+from sdps.core.geometry import Camera, Capture, reach, turn_to_sight
 from sdps.core.integration import integrate
 
 
@@ -109,14 +109,6 @@ def select_grid(mask: np.ndarray, stride: int) -> np.ndarray:
     grid = np.zeros_like(mask)
     grid[::stride, ::stride] = mask[::stride, ::stride]
     return grid
-
-
-def turn_to_sight(sights: Tensor) -> Tensor:  # (P, 3, 3)
-    """Return the smallest rotations that bring vectors (P, 3) with z = 1 to the z axis."""
-    x, y, z = torch.nn.functional.normalize(sights, dim=-1).unbind(dim=-1)
-    share = 1.0 / (1.0 + z)
-    rows = [1.0 - x * x * share, -x * y * share, -x, -x * y * share, 1.0 - y * y * share, -y, x, y, z]
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
 def see(normals: Tensor, directions: Tensor, nearness: Tensor, sites: Sites | None) -> Seen:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from render.shared.errors import InputError
+from sdps.core.geometry import turn_to_sight
 from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
 from sdps.methods.parse import parse
@@ -16,7 +17,7 @@ from sdps.refinement.image_model import State, build_model, measure_differences
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.refined import Refined
 from sdps.refinement.reflectance import LOBES, MODES
-from sdps.refinement.sites import Sites, turn_to_sight
+from sdps.refinement.sites import Sites
 from sdps.refinement.trust import RefinedEstimate
 
 QUICK = RefineConfig(coarse_pixels=700, iterations=600, bounces=0, fine_iterations=0)  # nothing here shades itself
