@@ -101,7 +101,7 @@ def infer(
         _stop(photos, findings, anyway)
     found = runner.estimate(
         photos, photos.mask, photos.light_directions, intensities, saturation=photos.saturation,
-        nearness=photos.light_nearness, camera=photos.camera,
+        nearness=photos.light_nearness, each=photos.nearness_each, camera=photos.camera,
     )  # fmt: skip
     seconds = time.perf_counter() - began
     return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)

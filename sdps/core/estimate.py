@@ -60,6 +60,7 @@ class Estimate:
         expected_error: (H, W) float32, angle to the true normals to expect, in degrees, zero outside the mask; None
             where the method does not predict it.
         expected_light_error: (L,) float32, the same of the light directions.
+        nearness: (L,) float32, rho of the lamps (`sdps.core.geometry`), given or found; None: taken for distant.
         confidence: (L,) float32, probability of the two likeliest direction classes, multiplied; None where lights were
             not found as classes.
         precision: What networks computed in, `float32` or `bfloat16`; empty where there were none.
@@ -74,6 +75,7 @@ class Estimate:
     seconds: float = field(default=0.0, kw_only=True)
     expected_error: np.ndarray | None = field(default=None, kw_only=True)
     expected_light_error: np.ndarray | None = field(default=None, kw_only=True)
+    nearness: np.ndarray | None = field(default=None, kw_only=True)
     confidence: np.ndarray | None = field(default=None, kw_only=True)
     precision: str = field(default="", kw_only=True)
     stray_light: np.ndarray | None = field(default=None, kw_only=True)

@@ -18,7 +18,7 @@ from render.shared.progress import repeat, share, stage
 from sdps.core.symmetry import Symmetry
 from sdps.inference.image_source import View
 from sdps.inference.turned_views import AnyView, TurnedView, turn_lights
-from sdps.models.base import FusionNetwork, LightingNetwork, Lights, divide
+from sdps.models.base import FusionNetwork, LightingNetwork, Lights, Placement, divide
 from sdps.models.cnnps import predict_normals
 
 Autocast = Callable[[], AbstractContextManager[Any]]
@@ -85,13 +85,15 @@ def normal_map(
 def _feature(network: FusionNetwork, view: AnyView, lights: Lights | None, autocast: Autocast) -> Any:
     """Return the feature of all images."""
     brightness = _brightness(network, view, lights) if network.normalised else None
+    placed = view.placed if isinstance(view, View) and network.sees_places else None
+    placement = None if placed is None else Placement(*placed)
     mask = view.mask
     accumulated: Any = None
     read = _READ_SHARE if network.kept_bytes else _SEEN_SHARE
     with share(0.0, read):
         for part, images in view:
             some = None if lights is None else lights.select(part)
-            seen = network.observe(images, mask, some, brightness)
+            seen = network.observe(images, mask, some, brightness, placement)
             with autocast():
                 accumulated = network.accumulate(accumulated, seen)
             stage("normals", part.stop, len(view))

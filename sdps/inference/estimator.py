@@ -11,8 +11,10 @@ from torch import Tensor
 
 from render.shared.errors import InputError
 from render.shared.imaging.vectors import unit
-from render.shared.progress import repeat
+from render.shared.progress import repeat, share
 from sdps.core.estimate import Estimate
+from sdps.core.geometry import FAR, ORTHOGRAPHIC, Camera, Capture
+from sdps.core.integration import integrate
 from sdps.core.intensities import check_intensities, colour_balance, grey, scale_to_mean
 from sdps.core.precision import Arithmetic, arithmetic
 from sdps.core.symmetry import SYMMETRIES
@@ -26,6 +28,8 @@ from sdps.models.base import FusionNetwork, LightingNetwork, Lights, NormalNetwo
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
 
+_NEAR = 0.04
+"""Nearness below which a network's word is not worth the second look that near lamps need."""
 _ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels")}
 _CHUNK_PIXELS = {"cpu": 2**17}
 """On CPUs fewer images at once: their feature maps fit the caches, a quarter to a half faster with the same result."""
@@ -37,6 +41,8 @@ class _Known(NamedTuple):
     directions: np.ndarray | None  # (L, 3), unit
     intensities: np.ndarray | None  # (L,), with the mean of the range of training
     balance: np.ndarray | None  # (L, 3), colours with mean 1
+    nearness: np.ndarray | None = None  # (L,)
+    capture: Capture | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,6 +99,8 @@ class Estimator(InferenceConfig):
         intensities: np.ndarray | None = None,
         *,
         found: Estimate | None = None,
+        nearness: np.ndarray | None = None,
+        camera: Camera = ORTHOGRAPHIC,
     ) -> Estimate:
         """Estimate normals, and whichever of light directions and intensities are not given.
 
@@ -107,6 +115,9 @@ class Estimator(InferenceConfig):
             intensities: (L,) or (L, 3) known intensities, of any overall scale.
             found: What `estimate_lights` of an estimator with the same lighting networks and options gave for these
                 images and intensities; it saves estimating the lights again, and changes nothing else.
+            nearness: (L,) of the lamps (`sdps.core.geometry`), 0 of distant ones; None: what the lighting network
+                finds. Networks that do not see where pixels lie take lamps for distant, and cameras for orthographic.
+            camera: What the images were taken with.
 
         Returns:
             The estimate. Directions or intensities that nobody gave, estimated or assumed are empty, (0, 3) and (0,),
@@ -120,11 +131,15 @@ class Estimator(InferenceConfig):
             raise InputError("no lighting model was loaded, so light directions must be given")
         began = time.perf_counter() - (found.seconds if found is not None else 0.0)
         scene, known = self._prepare(images, mask, lights, intensities)
+        capture = Capture.of(scene.mask, camera.crop(mask.shape, scene.rows.start, scene.columns.start))
+        known = known._replace(nearness=nearness, capture=capture)
         if found is None:
             found = self._estimate_lights(scene, known)
         elif known.directions is not None or len(found.light_directions) != len(scene):
             raise InputError("found holds lights of other images, or of images whose lights are given")
-        normals, expected, exposure = self._box_normals(scene, known, self._lights(found, known))
+        if nearness is not None:
+            found = replace(found, nearness=nearness.astype(np.float32) if (nearness >= FAR).any() else None)
+        normals, expected, exposure = self._place_normals(scene, known, self._lights(found, known))
         return replace(
             found,
             normals=scene.in_frame(normals),
@@ -180,8 +195,8 @@ class Estimator(InferenceConfig):
         Directions or intensities that nobody knows are empty. Without a lighting model lights are equally strong for a
         normal model that needs them.
         """
-        directions, intensities, _ = known
-        exposure, confidence, errors = {}, None, None
+        directions, intensities = known.directions, known.intensities
+        exposure, confidence, errors, nearness = {}, None, None, None
         if self.lighting is not None and (directions is None or intensities is None):
             view = self._view(scene, self.lighting, None, resize_input, INPUT_SIZE**2)
             lights = self._run_lighting(cast(LightingNetwork, self.lighting.network), view)
@@ -190,6 +205,8 @@ class Estimator(InferenceConfig):
             intensities = _to_numpy(lights.intensities) if intensities is None else intensities
             confidence = None if lights.confidence is None else _to_numpy(lights.confidence)
             errors = None if lights.expected_error is None else _to_numpy(lights.expected_error)
+            if known.directions is None and lights.nearness is not None:
+                nearness = share_nearness(_to_numpy(lights.nearness))
         elif intensities is None and self.needs_lights:
             intensities = np.full(len(scene), self._mean_intensity(), np.float32)
         return Estimate(
@@ -198,6 +215,7 @@ class Estimator(InferenceConfig):
             np.zeros(0, np.float32) if intensities is None else intensities,
             expected_light_error=errors,
             confidence=confidence,
+            nearness=nearness,
             exposure=exposure,
         )
 
@@ -206,14 +224,38 @@ class Estimator(InferenceConfig):
         if not self.needs_lights:
             return None
         lights = Lights(self._tensor(found.light_directions), self._tensor(found.intensities))
+        if found.nearness is not None:
+            lights = lights._replace(nearness=self._tensor(found.nearness))
         if known.directions is not None or self.lighting is None:
             return lights
         errors = found.expected_light_error
         return lights._replace(expected_error=None if errors is None else self._tensor(errors)).with_errors()
 
-    def _box_normals(
+    def _place_normals(
         self, scene: ObjectImages, known: _Known, lights: Lights | None
     ) -> tuple[np.ndarray, np.ndarray | None, float]:
+        """Return `_box_normals`, of networks that see near lamps and perspective with the pixels in their places.
+
+        Near lamps reach each pixel from where it lies, which the normals tell: they are found once for that, all pixels
+        taken to lie at the object's mean depth.
+        """
+        capture, network = known.capture, self._normal_model().network
+        near = lights is not None and lights.nearness is not None
+        sees = isinstance(network, FusionNetwork) and network.sees_places
+        if capture is None or not sees or not (near or capture.camera.is_perspective):
+            return self._box_normals(scene, known, lights)
+        sights = capture.camera.sights(capture.shape)
+        if near:
+            with share(0.0, 0.4):
+                rough = replace(self, normal_views=1)._box_normals(scene, known, lights, (capture.places(), sights))[0]
+            heights = integrate(rough, scene.mask, discontinuities=True, camera=capture.camera).z
+        with share(0.4 if near else 0.0, 1.0):
+            return self._box_normals(scene, known, lights, (capture.places(heights if near else None), sights))
+
+    def _box_normals(
+        self, scene: ObjectImages, known: _Known, lights: Lights | None,
+        placement: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray | None, float]:  # fmt: skip
         """Return what is found in the object's box: normals (h, w, 3) float32, zero outside the mask, the errors to
         expect, (h, w) float32 where the network predicts them, and the factor of the exposure.
         """
@@ -224,7 +266,10 @@ class Estimator(InferenceConfig):
         box, errors = np.zeros((*scene.mask.shape, 3), np.float32), np.zeros(scene.mask.shape, np.float32)
         predicted = False
         for number, tile in enumerate(parts):
-            part = replace(view, images=scene.part(tile.outer_rows, tile.outer_columns))
+            window = tile.outer_rows, tile.outer_columns
+            part = replace(view, images=scene.part(*window))
+            if placement is not None:
+                part = replace(part, placement=tuple(np.ascontiguousarray(each[window]) for each in placement))
             with repeat(number, len(parts)):
                 normals, expected = self._normals(part, lights)  # padded
             inside = scene.mask[tile.inner]
@@ -302,6 +347,12 @@ def load_model(file: str | Path, device: torch.device) -> TrainedModel:
     # A third faster on CPUs. The stubs of torch lack `memory_format`.
     model.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model
+
+
+def share_nearness(found: np.ndarray) -> np.ndarray | None:
+    """Return one nearness for all lamps (L,) of what a network says of each; None where they are as good as distant."""
+    shared = float(np.median(found))
+    return np.full_like(found, shared) if shared >= _NEAR else None
 
 
 def _to_numpy(values: Tensor) -> np.ndarray:

@@ -139,6 +139,8 @@ class View:
         fit: Brings images (1, n, 3, h, w) and mask (1, 1, h, w) to the network's size.
         count: Images of a chunk.
         device: Where the tensors go.
+        placement: Where the pixels lie and how they are seen, (h, w, 3) each (`sdps.models.base.Placement`); None: it
+            does not matter.
     """
 
     images: ObjectImages
@@ -147,6 +149,7 @@ class View:
     fit: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
     count: int
     device: torch.device
+    placement: tuple[np.ndarray, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -155,6 +158,14 @@ class View:
     def mask(self) -> Tensor:
         """The mask at the network's size, (1, 1, h', w') float32; between 0 and 1 on the border if it was resized."""
         return self.fit(torch.zeros(1, 1, 3, *self.images.mask.shape, device=self.device), self._mask())[1]
+
+    @property
+    def placed(self) -> tuple[Tensor, ...] | None:
+        """The placement at the network's size, (1, 3, h', w') float32 each."""
+        if self.placement is None:
+            return None
+        pictures = (torch.from_numpy(each.astype(np.float32)).to(self.device) for each in self.placement)
+        return tuple(self.fit(each.permute(2, 0, 1)[None, None], self._mask())[0][:, 0] for each in pictures)
 
     def __iter__(self) -> Iterator[tuple[slice, Tensor]]:
         """Yield which images, and these, (1, n, 3, h', w') float32."""

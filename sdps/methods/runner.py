@@ -84,6 +84,7 @@ class Runner:
         saturation: float = float("inf"),
         *,
         nearness: np.ndarray | None = None,
+        each: bool = False,
         camera: Camera = ORTHOGRAPHIC,
     ) -> Estimate:
         """Run the method; of the lights it sees what it is to be given.
@@ -96,6 +97,7 @@ class Runner:
             found: Lights that methods found of these very images, by what they depend on; read, and added to.
             saturation: Radiance from which on a channel is clipped, which refinement then leaves out.
             nearness: (L,) of the lamps (`sdps.core.geometry`), 0 of distant ones; None where it is not known.
+            each: Where it is not known, each lamp may have a distance of its own.
             camera: What the images were taken with.
 
         Raises:
@@ -108,7 +110,10 @@ class Runner:
         if TRUE_LIGHTS in (method.lighting, method.intensities) and intensities is not None:
             given["intensities"] = intensities
         estimate = self._estimate(images, mask, given, found, nearness, camera)
-        return self._refine(images, mask, estimate, given, saturation) if method.refined else estimate
+        if not method.refined:
+            return estimate
+        geometry = {"nearness": nearness, "each": each, "camera": camera}
+        return self._refine(images, mask, estimate, given, saturation, geometry)
 
     def _estimate(
         self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None,
@@ -125,7 +130,7 @@ class Runner:
         if found is not None and method.lighting not in (NONE, TRUE_LIGHTS):
             given["found"] = self._lights(images, mask, given, found)
         assert self.estimator is not None  # the method has a normal model
-        return self.estimator.estimate(images, mask, **given)
+        return self.estimator.estimate(images, mask, **given, nearness=nearness, camera=camera)
 
     def _lights(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
         """Estimate the lights, or take what another method with the same lighting networks found."""
@@ -155,8 +160,9 @@ class Runner:
         return run_on_box(name, images, mask, arguments)
 
     def _refine(
-        self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any], saturation: float
-    ) -> Estimate:
+        self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any], saturation: float,
+        geometry: dict[str, Any],
+    ) -> Estimate:  # fmt: skip
         """Refine an estimate, or keep it where refinement cannot be trusted; light directions it was given stay."""
         from sdps.refinement.refine import refine
         from sdps.refinement.trust import choose, trust
@@ -171,7 +177,7 @@ class Runner:
         lit = given.get("lights") is not None
         refined = refine(
             images, mask, estimate.normals, estimate.light_directions, begun,
-            directions_given=lit, stray=self.config.stray_light, saturation=saturation,
+            directions_given=lit, stray=self.config.stray_light, saturation=saturation, **geometry,
         )  # fmt: skip
         expected = trust(refined, mask, estimate, given=lit)
         return choose(estimate, refined, expected)
