@@ -159,8 +159,6 @@ def calibrate(
     if near is None:
         return Calibrated(observations, profiles, directions, intensities)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    if np.shape(near.nearness) != (count,):
-        raise InputError(f"{count} images need {count} numbers for how near the lamps stand, got {near.nearness.shape}")
     near = near.at(observations.mask)
     for part in _split(*profiles.shape):
         profiles[part] /= near.at(part).reach(directions)[1]

@@ -107,6 +107,7 @@ class Runner:
         """
         method = self.method
         given: dict[str, Any] = {}
+        _check_nearness(nearness, len(images))
         if method.lighting == TRUE_LIGHTS:
             given["lights"] = lights
         if TRUE_LIGHTS in (method.lighting, method.intensities) and intensities is not None:
@@ -208,6 +209,24 @@ class Runner:
         if found and intensities is not None:
             truth["intensities"] = intensities
         return {item.name: item.value for item in score(estimate, mask, **truth)}
+
+
+def _check_nearness(nearness: np.ndarray | None, count: int) -> None:
+    """Refuse what cannot be the nearness of so many lamps.
+
+    Raises:
+        InputError: another number of values, or one that is not from 0 to below 1.
+    """
+    if nearness is None:
+        return
+    if np.shape(nearness) != (count,):
+        raise InputError(f"{count} images need {count} values of light_nearness, got {np.shape(nearness)}")
+    wrong = ~((np.asarray(nearness) >= 0.0) & (np.asarray(nearness) < 1.0))
+    if wrong.any():
+        raise InputError(
+            f"light_nearness {np.asarray(nearness)[wrong][0]:g}: must be the object's radius over the lamp's distance, "
+            "from 0 (distant) to below 1 (the lamp would stand inside the object)"
+        )
 
 
 def _fill_config(config: InferenceConfig, method: Method) -> InferenceConfig:

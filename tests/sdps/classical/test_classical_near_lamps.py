@@ -175,9 +175,14 @@ def test_a_flat_start_is_the_first_round() -> None:
     assert np.abs(places[-1] - scene.places)[scene.mask].max() < 0.02
 
 
-@pytest.mark.parametrize("shape", [(19,), ()])
-def test_nearness_of_another_number_of_lamps(shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    ("nearness", "said"),
+    [(np.full(19, 0.3), r"20 images need 20 values of light_nearness, got \(19,\)"), (0.3, r"got \(\)"),
+     (np.full(20, 1.0), "light_nearness 1: .* below 1"), (np.full(20, -0.1), "light_nearness -0.1"),
+     (np.full(20, np.nan), "light_nearness nan")],
+)  # fmt: skip
+def test_nearness_that_cannot_be(nearness: np.ndarray, said: str) -> None:
     scene = photograph(cap=0.5, size=32)
-    with pytest.raises(InputError, match="20 images need 20"):
+    with pytest.raises(InputError, match=said):
         api.estimate(scene.images, scene.mask, "least-squares", light_directions=scene.lights,
-                     intensities=np.ones(20), light_nearness=np.full(shape, 0.3))  # fmt: skip
+                     intensities=np.ones(20), light_nearness=nearness)  # fmt: skip
