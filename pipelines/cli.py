@@ -143,6 +143,7 @@ GROUPS = {
     "what goes in": {"preset", "set", "models", "data", "mask", "images", "gamma", "scale", "anyway", "self-test",
                      "objects"},
     "lights": {"lights", "light-set", "intensities", "frame", "light-distance"},
+    "the camera": {"focal", "principal", "pixel-size", "camera-distance"},
     "how it is solved": {"method", "methods", "refine", "discontinuities", "read-out", "light-views", "normal-views",
                          "keep-stray-light", "lighting", "normals"},
     "which scenes": {"ids", "split", "limit", "count", "skip-missing", "shard", "retry-failed", "shapes", "materials",

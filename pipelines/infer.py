@@ -18,7 +18,7 @@ from sdps.core.intensities import grey, scale_to_mean
 
 if TYPE_CHECKING:
     from sdps.api import Inference
-    from sdps.photos import Finding
+    from sdps.photos import Finding, Photographs
     from sdps.refinement.trust import RefinedEstimate
 
 _MARKS = {"error": "!!", "warning": "! ", "note": "- "}
@@ -57,6 +57,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="go on where a check of the photographs stops (the report says which)")  # fmt: skip
     parser.add_argument("--scale", type=float, default=1.0, metavar="F",
                         help="reduce pictures and mask as they are read; 0.5 halves the sides")  # fmt: skip
+    parser.add_argument("--focal", default=None, metavar="28mm|3772px",
+                        help="focal length: 35 mm equivalent, or pixels of the files; orthographic for none "
+                        "(default: as the files' EXIF data say, else orthographic)")  # fmt: skip
+    parser.add_argument("--principal", default=None, metavar="COLUMN,ROW",
+                        help="principal point, in pixels of the files (default: their middle)")  # fmt: skip
+    parser.add_argument("--pixel-size", type=float, default=None, metavar="MM",
+                        help="millimetres that a pixel of the files shows: the unit of depth and meshes")  # fmt: skip
     network_flags.add_arguments(parser)
     parser.add_argument("--self-test", action="store_true",
                         help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
@@ -95,12 +102,12 @@ def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:
     check_out(args.out, args.folder)
     photos = load(
         args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
-        gamma=args.gamma, names=args.images, anyway=args.anyway, scale=args.scale,
-        light_distance=args.light_distance,
+        gamma=args.gamma, names=args.images, anyway=args.anyway, scale=args.scale, focal=args.focal,
+        principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance,
     )  # fmt: skip
     findings = tuple(check(photos))
     height, width = photos.shape
-    sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is taken for orthographic\n")
+    sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is {_name_camera(photos)}\n")
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
     options = {"models": args.models, "config": config, "refine": args.refine, "discontinuities": args.discontinuities}
     if args.anyway or not any(finding.level == "error" for finding in findings):
@@ -112,6 +119,10 @@ def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:
 def describe(findings: "Sequence[Finding]") -> str:
     """Write the findings, one a line, the gravest first."""
     return "".join(f"{_MARKS[finding.level]}{finding.text}{_list_images(finding.images)}\n" for finding in findings)
+
+
+def _name_camera(photos: "Photographs") -> str:
+    return photos.camera_summary if photos.camera.is_perspective else "taken for orthographic"
 
 
 def _list_images(images: Sequence[str]) -> str:
@@ -142,7 +153,7 @@ def _section(result: "Inference") -> SectionWriter:
     text = (
         f"{len(photos)} photographs of {photos.shape[1]}x{photos.shape[0]} pixels, {photos.bits} bits, gamma "
         f"{photos.gamma}; mask: {photos.mask_origin}, {int(mask.sum())} pixels. Method: {result.method}. Frame: "
-        "x right, y up, z to the camera; lights from the surface to the light. The camera is taken for orthographic."
+        f"x right, y up, z to the camera; lights from the surface to the light. The camera is {_name_camera(photos)}."
     )
     section = Section(
         name="photographs",

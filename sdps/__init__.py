@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from render.shared.errors import InputError
     from sdps.api import available_methods, estimate, infer, plan, train
     from sdps.core.estimate import Estimate
+    from sdps.core.geometry import Camera
     from sdps.core.integration import integrate
     from sdps.core.metrics import score
     from sdps.inference.inference_config import InferenceConfig
@@ -29,6 +30,7 @@ else:
             "render.shared.errors": ("InputError",),
             "sdps.api": ("available_methods", "estimate", "infer", "plan", "train"),
             "sdps.core.estimate": ("Estimate",),
+            "sdps.core.geometry": ("Camera",),
             "sdps.core.metrics": ("score",),
             "sdps.inference.inference_config": ("InferenceConfig",),
             "sdps.surface.inferred": ("Inference",),
@@ -40,6 +42,7 @@ else:
     )
 
 __all__ = [
+    "Camera",
     "Estimate",
     "Inference",
     "InferenceConfig",

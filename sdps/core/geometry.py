@@ -20,6 +20,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from torch.nn.functional import normalize
 
 from render.shared.errors import InputError
 from sdps.core.lighting import library
@@ -66,6 +67,13 @@ class Camera:
             return self
         x, y = self.middle(shape)
         return Camera(self.focal, (x - column, y - row))
+
+    def thin(self, shape: tuple[int, int], step: int) -> "Camera":
+        """Return the camera of every `step`-th row and column of a picture (H, W)."""
+        if not self.is_perspective and self.principal is None:
+            return self
+        column, row = self.middle(shape)
+        return Camera(self.focal / step, (column / step, row / step))
 
     def scale(self, factor: float) -> "Camera":
         """Return the camera of the picture at `factor` times its size."""
@@ -154,3 +162,11 @@ def reach(places: Array, directions: Array, nearness: Array) -> tuple[Array, Arr
     off = directions - nearness[..., None] * places[:, None]  # (P, L, 3)
     squared = (off * off).sum(-1)
     return off / squared[..., None] ** 0.5, 1.0 / squared
+
+
+def turn_to_sight(sights: torch.Tensor) -> torch.Tensor:  # (P, 3, 3)
+    """Return the smallest rotations that bring vectors (P, 3) with z = 1 to the z axis."""
+    x, y, z = normalize(sights, dim=-1).unbind(dim=-1)
+    share = 1.0 / (1.0 + z)
+    rows = [1.0 - x * x * share, -x * y * share, -x, -x * y * share, 1.0 - y * y * share, -y, x, y, z]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))

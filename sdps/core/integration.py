@@ -109,8 +109,7 @@ def integrate(
 
     With `discontinuities` each pixel has a one-sided equation per neighbour, n_z (z' - z) + n_x = 0, and of the two
     neighbours left and right, or above and below, the one across the smaller step counts more. These are the bilateral
-    weights of Cao et al., Bilateral Normal Integration (ECCV 2022), for an orthographic camera, and w for log depth
-    for a pinhole:
+    weights of Cao et al., Bilateral Normal Integration (ECCV 2022):
     sigmoid(k ((n_z dz of the other side)^2 - (n_z dz of this side)^2)), found again until the energy settles.
 
     Args:
@@ -134,18 +133,15 @@ def integrate(
     if unit is None:
         return _integrate_large(np.asarray(normals), mask, camera, sharpness if discontinuities else 0.0, most, started)
     facing = _facing(unit, mask, camera)
-    graph = _graph(unit, facing, mask)
+    graph, below = _graph(unit, facing, mask), float((facing < STEEPEST).mean())
     z, weights, iterations = *_smooth(graph), 1
     if discontinuities and len(weights):
         z, weights, iterations = _bilateral(graph, z, sharpness, most)
     torn = (weights < 0.01 * (graph.facing**2).mean(axis=0)).mean() if discontinuities and len(weights) else 0.0
-    diagnostics: dict[str, Any] = {
-        "below": float((facing < STEEPEST).mean()),
-        "torn": float(torn),
-        "iterations": iterations,
-    }
-    laid = _lay_out(graph, mask, z, camera)
-    return Depth(mask=mask, **laid, **diagnostics, seconds=time.perf_counter() - started, camera=camera)
+    return Depth(
+        mask=mask, below=below, torn=float(torn), iterations=iterations, **_lay_out(graph, mask, z, camera),
+        seconds=time.perf_counter() - started, camera=camera,
+    )  # fmt: skip
 
 
 def check_normals(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -169,7 +165,9 @@ def _facing(unit: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:  
     """Return n . v' of unit normals (n, 3)."""
     if not camera.is_perspective:
         return unit[:, 2]
-    return np.einsum("nc,nc->n", unit, camera.sights(mask.shape)[mask])
+    rows, columns = np.nonzero(mask)  # of the mask alone: pictures are large
+    points = camera.place(mask.shape, rows, columns, np.zeros(len(unit)))
+    return unit[:, 2] - (unit * points).sum(axis=-1) / camera.focal
 
 
 def _graph(unit: np.ndarray, facing: np.ndarray, mask: np.ndarray) -> _Graph:

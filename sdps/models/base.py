@@ -133,6 +133,13 @@ class NormalNetwork(nn.Module):
         return 1.2e-6 * views * images * box
 
 
+class Placement(NamedTuple):
+    """Where the pixels of scenes lie (`sdps.core.geometry`), for networks that see near lamps and perspective."""
+
+    places: Tensor  # (B, 3, H, W), (X - C) / R
+    sights: Tensor  # (B, 3, H, W), v'
+
+
 class Observations(NamedTuple):
     """What a normal network sees of a scene; made by `FusionNetwork.observe`."""
 
@@ -140,6 +147,8 @@ class Observations(NamedTuple):
     directions: Tensor | None = None  # (B, Q, 3)
     mask: Tensor | None = None  # (B, 1, H, W)
     light_errors: Tensor | None = None  # (B, Q), degrees to expect of the directions; None: they are exact
+    nearness: Tensor | None = None  # (B, Q), rho of the lamps
+    placement: Placement | None = None  # None: lamps are distant, the camera is orthographic
 
 
 class Truth(NamedTuple):
@@ -161,11 +170,13 @@ class FusionNetwork(NormalNetwork, ABC):
     Attributes:
         normalised: Images are divided by each pixel's norm over all lights and channels, as in PS-FCN (Norm.) (Chen et
             al., TPAMI 2020), which takes albedo away and leaves shading.
+        sees_places: It sees near lamps and perspective; others take lamps for distant and cameras for orthographic.
     """
 
     size_multiple = 4
     reach = 32
     normalised: bool = False
+    sees_places: bool = False
 
     def observe(
         self,
@@ -173,6 +184,7 @@ class FusionNetwork(NormalNetwork, ABC):
         mask: Tensor,  # (B, 1, H, W)
         lights: Lights | None,
         brightness: Tensor | None = None,  # (B, 1, 1, H, W)
+        placement: Placement | None = None,
     ) -> Observations:
         """Prepare images for `encode`.
 
@@ -181,17 +193,19 @@ class FusionNetwork(NormalNetwork, ABC):
             mask: 0 or 1.
             lights: May be None for networks that are not given them. Those without errors count as exact.
             brightness: `brightness(...)` of all images of the scene where `images` are only some; see `normalised`.
+            placement: Where pixels lie; None: lamps are distant, the camera is orthographic.
         """
-        directions = light_errors = None
+        directions = light_errors = nearness = None
         if self.needs_lights:
             assert lights is not None
             images, directions = divide(images, lights.intensities), lights.directions
-            light_errors = lights.expected_error
+            light_errors, nearness = lights.expected_error, lights.nearness
         if self.normalised:
             found = brightness if brightness is not None else self.brightness(images)
             # The published norm is that of 32 images of 3 channels, whatever the number of images here.
             images = images / ((32 * 3 * found).sqrt() + _SCALE_FLOOR)
-        return Observations(images, directions, mask if self.needs_mask else None, light_errors)
+        seen = Observations(images, directions, mask if self.needs_mask else None, light_errors)
+        return seen._replace(nearness=nearness, placement=placement) if self.sees_places else seen
 
     @staticmethod
     def brightness(images: Tensor) -> Tensor:

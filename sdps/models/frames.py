@@ -8,6 +8,9 @@ Zaheer et al., NeurIPS 2017), a few times over, without convolutions; convolutio
 and not once for an image. The network is given the error to expect of each light: it may trust lights that were
 measured, and know better than lights that were estimated badly.
 
+Near lamps light every pixel from a direction of its own, and a perspective camera sees it along a line of its own.
+Where pixels lie is given (`Placement`), and all is turned until the line of sight is z, for the convolutions too.
+
 Legend: B scenes, Q images of a scene, H and W the sides, N pixels of all objects, C channels.
 """
 
@@ -20,9 +23,10 @@ from torch.nn import functional
 from render.shared.errors import InputError, unknown
 from render.shared.progress import stage
 from sdps.core.first_normals import first_normals, frames
+from sdps.core.geometry import turn_to_sight
 from sdps.core.losses import NormalCriterion, expected_error_loss
 from sdps.core.symmetry import Symmetry
-from sdps.models.base import FusionNetwork, Observations, Truth
+from sdps.models.base import FusionNetwork, Observations, Placement, Truth
 from sdps.models.blocks import LOG_USUAL, SLOPE, chord_degrees, conv, deconv
 
 FRAMES = ("normal", "camera")
@@ -32,6 +36,8 @@ _DARK = 1e-3
 """Radiance below which nothing is seen; full scale is 1."""
 _ERROR_SCALE = 10.0
 """Degrees to expect of a light that count as 1."""
+_NEAREST = 0.04
+"""Squared distance, in a lamp's own, below which pixels are not lit more strongly."""
 _MAP = 32
 """Channels of the fused map, without the normals."""
 _STRIP = 2**13
@@ -66,9 +72,17 @@ class Pixels(NamedTuple):
 class FusedMap(NamedTuple):
     """What is known of every pixel once all lights were seen."""
 
-    normals: Tensor  # (B, 3, H, W) float32, unit on the object
+    normals: Tensor  # (B, 3, H, W) float32, unit on the object, as each line of sight sees them
     feature: Tensor  # (B, 32, H, W)
     mask: Tensor  # (B, 1, H, W)
+    sights: Tensor | None = None  # (B, 3, H, W) v' of a perspective camera; None: orthographic
+
+    def face(self, normals: Tensor) -> Tensor:
+        """Return normals (B, 3, H, W) that lines of sight see in the camera's frame."""
+        if self.sights is None:
+            return normals
+        turns = turn_to_sight(self.sights.permute(0, 2, 3, 1))  # (B, H, W, 3, 3)
+        return (normals.permute(0, 2, 3, 1)[..., None, :] @ turns)[..., 0, :].permute(0, 3, 1, 2)
 
 
 class StagedNormals(NamedTuple):
@@ -91,6 +105,7 @@ class FrameNet(FusionNetwork):
     needs_mask = True
     kept_bytes = 6
     equivariant = True
+    sees_places = True
 
     def __init__(self, *, width: int = 64, blocks: int = 4, frame: str = "normal") -> None:
         super().__init__()
@@ -117,7 +132,8 @@ class FrameNet(FusionNetwork):
     def predict_stages(self, seen: Observations) -> StagedNormals:
         """Return what is learned: the normals of pixels alone, the corrected ones, and the error to expect of these."""
         fused = self.encode(seen)
-        return StagedNormals(fused.normals, *self.correct(fused))
+        normals, expected = self.correct(fused)
+        return StagedNormals(fused.face(fused.normals), normals, expected)
 
     def loss(self, seen: Observations, truth: Truth, criterion: NormalCriterion) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the losses of the normals at both stages plus, weighted, that of the expected error."""
@@ -139,7 +155,7 @@ class FrameNet(FusionNetwork):
             self._per_pixel(Pixels(*(part.float() for part in some)))
             for some in zip(*(each.split(count) for each in pixels), strict=True)
         ]
-        return self._to_map(torch.cat(found), inside)
+        return self._to_map(torch.cat(found), inside, seen.placement)
 
     def regress(self, feature: FusedMap) -> Tensor:
         return self.correct(feature)[0]
@@ -150,17 +166,19 @@ class FrameNet(FusionNetwork):
 
     def correct(self, feature: FusedMap) -> tuple[Tensor, Tensor]:
         """Return unit normals (B, 3, H, W), float32, and the expected distance (B, 1, H, W) to the true ones."""
-        normals, fused, mask = feature
+        normals, fused, mask, _ = feature
         entered = self.enter(torch.cat([normals.to(fused.dtype), fused, mask.to(fused.dtype)], dim=1))
         half = self.smaller(entered)
         back = self.back(torch.cat([self.quarter(half), half], dim=1))
         change = self.leave(torch.cat([back, entered], dim=1)).float()
-        return functional.normalize(normals + change[:, :3], dim=1), (change[:, 3:] + LOG_USUAL).exp()
+        corrected = functional.normalize(normals + change[:, :3], dim=1)
+        return feature.face(corrected), (change[:, 3:] + LOG_USUAL).exp()
 
     def turn(self, feature: FusedMap, symmetry: Symmetry) -> FusedMap:
         """Return the fused map of the turned scene: its pixels see their lights in frames that turn with them."""
-        normals, fused, mask = (symmetry.images(each) for each in feature)
-        return FusedMap(symmetry.vectors(normals, dim=1), fused, mask)
+        normals, fused, mask, *sights = (symmetry.images(each) for each in feature if each is not None)
+        normals, *sights = (symmetry.vectors(each, dim=1) for each in (normals, *sights))
+        return FusedMap(normals, fused, mask, *sights)
 
     def accumulate(self, so_far: list[Observations] | None, seen: Observations) -> list[Observations]:
         """Keep the images of a scene, in 16 bits."""
@@ -170,7 +188,8 @@ class FrameNet(FusionNetwork):
         """Return the fused map of all of a scene's images, which are never copied as a whole."""
         assert accumulated[0].mask is not None  # the network asks for it
         inside = accumulated[0].mask[:, 0] > 0.5  # (1, H, W)
-        directions, errors = _all_lights(accumulated)
+        directions, errors, nearness = _all_lights(accumulated)
+        placement = accumulated[0].placement
         found = torch.zeros(inside.numel(), 3 + _MAP, device=inside.device)
         places = inside.flatten().nonzero()[:, 0]
         strips = places.split(max(1, _STRIP // directions.shape[1]))
@@ -179,10 +198,15 @@ class FrameNet(FusionNetwork):
             with torch.autocast(inside.device.type, enabled=False):
                 values = torch.cat([part.images[0].flatten(2)[..., some] for part in accumulated])  # (Q, 3, n)
             lights = (each.expand(len(some), *each.shape[1:]) for each in (directions, errors))
-            found[some] = self._per_pixel(Pixels(values.permute(2, 0, 1).float(), *lights)).float()
+            pixels = Pixels(values.permute(2, 0, 1).float(), *lights)
+            if placement is not None:
+                own = Placement(*(each[0].flatten(1)[:, some].T for each in placement))
+                pixels = see_lamps(pixels, nearness.expand(len(some), -1), own)
+            found[some] = self._per_pixel(pixels).float()
             stage("normals", number + 1, len(strips))
         places_of_all = found.unflatten(0, inside.shape).permute(0, 3, 1, 2)
-        return FusedMap(places_of_all[:, :3], places_of_all[:, 3:], inside[:, None].float())
+        sights = None if placement is None else placement.sights
+        return FusedMap(places_of_all[:, :3], places_of_all[:, 3:], inside[:, None].float(), sights)
 
     def _per_pixel(self, pixels: Pixels) -> Tensor:
         """Return normals and features of pixels, (N, 3 + 32)."""
@@ -200,21 +224,24 @@ class FrameNet(FusionNetwork):
             normals = (local[:, None] @ axes)[:, 0]
             return torch.cat([normals, self.feature(fused.float())], dim=1)
 
-    def _to_map(self, found: Tensor, inside: Tensor) -> FusedMap:
+    def _to_map(self, found: Tensor, inside: Tensor, placement: Placement | None) -> FusedMap:
         """Return what was found of the object's pixels, (N, 3 + 32), in its place; `inside` (B, H, W) bool."""
         places = found.new_zeros(*inside.shape, found.shape[1])
         places[inside] = found
         places = places.permute(0, 3, 1, 2)
-        return FusedMap(places[:, :3], places[:, 3:], inside[:, None].float())
+        sights = None if placement is None else placement.sights
+        return FusedMap(places[:, :3], places[:, 3:], inside[:, None].float(), sights)
 
 
-def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor]:
-    """Return directions (1, Q, 3) and the errors to expect of them (1, Q), as exact as the images are kept."""
+def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return directions (1, Q, 3), the errors to expect of them and nearness (1, Q), as exact as images are kept."""
     directions = torch.cat([part.directions for part in parts if part.directions is not None], dim=1)
     errors = [part.light_errors for part in parts if part.light_errors is not None]
     expected = torch.cat(errors, dim=1) if errors else torch.zeros_like(directions[..., 0])
+    near = [part.nearness for part in parts if part.nearness is not None]
+    nearness = torch.cat(near, dim=1) if near else torch.zeros_like(expected)
     kept = parts[0].images.dtype
-    return directions.to(kept).float(), expected.to(kept).float()
+    return directions.to(kept).float(), expected.to(kept).float(), nearness.float()
 
 
 def pool(tokens: Tensor) -> Tensor:
@@ -229,7 +256,20 @@ def object_pixels(seen: Observations) -> tuple[Tensor, Pixels]:
     values = seen.images.permute(0, 3, 4, 1, 2)[inside]  # (N, Q, 3)
     which = torch.arange(len(inside), device=inside.device).repeat_interleave(inside.flatten(1).sum(1))
     errors = torch.zeros_like(seen.directions[..., 0]) if seen.light_errors is None else seen.light_errors
-    return inside, Pixels(values, seen.directions[which].to(values.dtype), errors[which].to(values.dtype))
+    pixels = Pixels(values, seen.directions[which].to(values.dtype), errors[which].to(values.dtype))
+    if seen.placement is None:
+        return inside, pixels
+    own = Placement(*(each.permute(0, 2, 3, 1)[inside] for each in seen.placement))
+    nearness = torch.zeros_like(errors) if seen.nearness is None else seen.nearness
+    return inside, see_lamps(pixels, nearness[which], own)
+
+
+def see_lamps(pixels: Pixels, nearness: Tensor, own: Placement) -> Pixels:
+    """Return pixels under lamps of nearness (N, Q) as their lines of sight see them; `own` holds (N, 3) each."""
+    off = pixels.directions - nearness[..., None] * own.places[:, None]  # (N, Q, 3)
+    squared = off.square().sum(dim=-1).clamp(min=_NEAREST)
+    towards = (off / squared.sqrt()[..., None]) @ turn_to_sight(own.sights).transpose(1, 2)
+    return pixels._replace(values=pixels.values * squared[..., None], directions=towards)
 
 
 def pixel_inputs(pixels: Pixels, axes: Tensor, start: Tensor, scale: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ from sdps.refinement.fused import data_term
 from sdps.refinement.image_model import DATA_FLOOR, Model, State, build_model
 from sdps.refinement.modes import evaluate_modes, fit_modes
 from sdps.refinement.priors import Neighbours, find_neighbours, measure_curl, measure_drift, measure_roughness
+from sdps.refinement.sites import Sites
 
 RATES = {
     "normals": 0.01,
@@ -23,12 +24,15 @@ RATES = {
     "log_sharpness": 0.01,
     "directions": 0.003,
     "log_intensities": 0.003,
+    "log_nearness": 0.01,
+    "uneven": 0.01,
 }
 """Learning rates of Adam, by part of the state, before `boost`."""
 _LEAST_RATE = 0.02
 _SEARCH_EVERY, _WHITENESS_STEP, _WHITEST = 20, 0.05, 0.95
 """The albedo of the brightest parts is searched every so many iterations, in such steps, up to such a value."""
 _PART = 4096  # pixels worked on at once
+_NEARNESS = math.log(1e-3), math.log(0.6)
 _FITS, _MISFITS = 0.01, 0.03
 """Data terms of a model that fits and of one that does not: between them, the pull towards the start grows."""
 
@@ -48,6 +52,7 @@ class Weights(NamedTuple):
         near: Of how far the normals are from the start, by how badly the model fits: a model that does not describe
             the object's reflectance would explain it by wrong normals.
         dark: The same for pixels that are dark in all images, which say little, however well the model fits.
+        uneven: Of how differently far the lamps stand, where each has a distance of its own: mean square of logarithms.
     """
 
     smooth: float = 0.005
@@ -59,6 +64,7 @@ class Weights(NamedTuple):
     shift: tuple[float, float] = (10.0, 0.03)
     near: float = 0.15
     dark: float = 0.1
+    uneven: float = 0.1
 
 
 class Problem(NamedTuple):
@@ -73,6 +79,8 @@ class Problem(NamedTuple):
             lights of intensity 1 if the brightest parts reflected everything; None where it is left out.
         twice: How much brighter further bounces would make it.
         corrected: The images are without bounced light, and divided by G.
+        sites: Where the pixels lie; None: lamps are distant, the camera is orthographic.
+        heights: (H, W) z of the surface that light was traced on, in pixels of the grid; None before that.
     """
 
     mask: np.ndarray
@@ -82,6 +90,8 @@ class Problem(NamedTuple):
     bounced: Tensor | None = None
     twice: float = 0.0
     corrected: bool = False
+    sites: Sites | None = None
+    heights: np.ndarray | None = None
 
     def remove_bounced(self, model: Model, whiteness: float) -> Tensor:  # (P, 3, L)
         """Return the images without bounced light, if the brightest parts have this albedo."""
@@ -95,7 +105,7 @@ class Problem(NamedTuple):
         """Return the images as `data_term` takes them: without bounced light, over G."""
         if self.corrected:
             return self.images
-        bent = evaluate_modes(model.normals.detach(), model.directions.detach(), state.modes)
+        bent = evaluate_modes(model, state.modes, self.sites)
         return self.remove_bounced(model, float(state.whiteness)) / bent[:, None]
 
 
@@ -136,12 +146,14 @@ def solve(
         model = build_model(state)
         if number % _SEARCH_EVERY == 0:
             images = _search_globals(problem, state, model, free)
-        loss = data_term(model, images, problem.usable)
+        loss = data_term(model, images, problem.usable, problem.sites)
         pull = weights.near * _measure_misfit(float(loss.detach())) + weights.dark * faintness  # (P,)
         loss = loss + (pull * (1.0 - (model.normals * start.normals).sum(dim=1))).mean()
-        loss = loss + _sum_priors(state, model, near, weights, part)
+        loss = loss + _sum_priors(state, model, near, weights, part, problem.sites)
         if "directions" in free:
             loss = loss + _penalise_drift(state.directions, start.directions, weights, part)
+        if "uneven" in free:
+            loss = loss + weights.uneven * state.uneven.square().mean()
         loss.backward()
         adam.step()
         _project(state, free)
@@ -158,10 +170,11 @@ def _search_globals(problem: Problem, state: State, model: Model, free: frozense
         now = float(state.whiteness)
         tried = sorted({min(max(now + step, 0.0), _WHITEST) for step in (-_WHITENESS_STEP, 0.0, _WHITENESS_STEP)})
         states = [state._replace(whiteness=torch.tensor(white)) for white in tried]
-        terms = [float(data_term(model, problem.correct(model, one), problem.usable)) for one in states]
+        terms = [float(data_term(model, problem.correct(model, one), problem.usable, problem.sites)) for one in states]
         state.whiteness.fill_(tried[int(np.argmin(terms))])
     if "modes" in free:
-        state.modes.copy_(fit_modes(model, problem.remove_bounced(model, float(state.whiteness)), problem.usable))
+        bare = problem.remove_bounced(model, float(state.whiteness))
+        state.modes.copy_(fit_modes(model, bare, problem.usable, problem.sites))
     return problem.correct(model, state)
 
 
@@ -180,10 +193,11 @@ def _measure_faintness(images: Tensor) -> Tensor:  # (P,)
 
 
 def _sum_priors(
-    state: State, model: Model, near: Neighbours, weights: Weights, part: float
+    state: State, model: Model, near: Neighbours, weights: Weights, part: float, sites: Sites | None
 ) -> Tensor:  # fmt: skip
     loss = weights.smooth * measure_roughness(model.normals, near)
-    loss = loss + _interpolate(weights.curl, part) * measure_curl(model.normals, near)
+    sights = None if sites is None else sites.sights
+    loss = loss + _interpolate(weights.curl, part) * measure_curl(model.normals, near, sights)
     loss = loss + weights.albedo * measure_roughness(state.log_albedo, near)
     loss = loss + weights.body * (state.body.pow(2).sum() + 0.01).sqrt()
     gloss = state.log_strength
@@ -202,7 +216,9 @@ def _interpolate(weight: tuple[float, float], part: float) -> float:
 
 @torch.no_grad()
 def _project(state: State, free: frozenset[str]) -> None:
-    """Keep vectors at length 1, with normals and lights on the camera's side."""
+    """Keep vectors at length 1, with normals and lights on the camera's side, and lamps out of the object."""
+    if "log_nearness" in free:
+        state.log_nearness.clamp_(*_NEARNESS)
     for name in ("normals", "directions"):
         if name in free:
             vectors = getattr(state, name)

@@ -12,6 +12,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from sdps.core.geometry import Capture
 from sdps.inference.image_source import ObjectImages
 from sdps.inference.tiles import Tile
 from sdps.refinement.descent import Problem
@@ -19,11 +20,13 @@ from sdps.refinement.image_model import State, build_model, measure_differences
 from sdps.refinement.modes import evaluate_modes
 from sdps.refinement.problems import build_problem, estimate_log_albedo, split_pixels
 from sdps.refinement.refined import Refined
+from sdps.refinement.sites import place_sites
 
 
 def upsample(
-    values: np.ndarray, scene: ObjectImages, tile: Tile, coarse: Problem, stride: int, state: State, full: np.ndarray
-) -> tuple[Problem, State]:
+    values: np.ndarray, scene: ObjectImages, tile: Tile, coarse: Problem, stride: int, state: State, full: np.ndarray,
+    capture: Capture,
+) -> tuple[Problem, State]:  # fmt: skip
     """Return the problem of every pixel and the state there: interpolated between coarse pixels, but for the albedo.
 
     Args:
@@ -33,6 +36,7 @@ def upsample(
         coarse: The coarse grid, of every `stride`-th pixel.
         state: On the coarse grid.
         full: (3, L), radiance at which a channel is clipped.
+        capture: The whole object before its camera.
     """
     model, mask = build_model(state), scene.mask[tile.outer_rows, tile.outer_columns]
     mean = None if mask.shape == scene.mask.shape else coarse.mean  # the same for all tiles
@@ -40,13 +44,22 @@ def upsample(
     up = _make_interpolator(coarse.mask, mask, stride, (tile.outer_rows.start, tile.outer_columns.start))
     normals = up(state.normals.numpy())
     normals /= normals.norm(dim=1, keepdim=True)
+    own = model._replace(normals=normals)
+    if coarse.heights is not None:
+        heights = np.zeros(scene.mask.shape)
+        heights[tile.outer_rows, tile.outer_columns][mask] = stride * up(coarse.heights[coarse.mask][:, None])[:, 0]
+        part = np.zeros_like(scene.mask)
+        part[tile.outer_rows, tile.outer_columns] = mask
+        problem = problem._replace(sites=place_sites(capture, part, heights))
     share = (coarse.images - coarse.remove_bounced(model, float(state.whiteness))) * (coarse.mean / problem.mean)
     for number in range(values.shape[2]):
         if coarse.bounced is not None:
             problem.images[:, :, number].sub_(up(share[:, :, number].numpy())).clamp_min_(0.0)
             lit = up(coarse.usable[:, number : number + 1].numpy())[:, 0] > 0.5
             problem.usable[:, number].mul_(lit)
-        problem.images[:, :, number].div_(evaluate_modes(normals, model.directions[number : number + 1], state.modes))
+        lamp = slice(number, number + 1)
+        one = own._replace(directions=model.directions[lamp], nearness=model.nearness[lamp])
+        problem.images[:, :, number].div_(evaluate_modes(one, state.modes, problem.sites))
     problem = problem._replace(corrected=True)
     state = state._replace(normals=normals, log_strength=up(state.log_strength.numpy()[:, None])[:, 0])
     return problem, state._replace(log_albedo=estimate_log_albedo(problem, state))
@@ -99,6 +112,7 @@ def collect(scene: ObjectImages, parts: Iterable[tuple[Tile, Problem, State]], s
         body=model.body.numpy(),
         amplitudes=model.amplitudes.numpy(),
         sharpness=model.sharpness.numpy(),
+        nearness=model.nearness.numpy(),
         pixel_residual=residual,
         image_residual=(by_image / int(scene.mask.sum())).numpy(),
     )
@@ -112,8 +126,8 @@ def _evaluate_tile(tile: Tile, problem: Problem, state: State, inside: np.ndarra
     by_pixel, by_image = torch.empty(len(problem.images)), torch.zeros(problem.images.shape[2])
     images = problem.correct(model, state)
     for part in split_pixels(len(by_pixel)):
-        some = model._replace(normals=model.normals[part], albedo=model.albedo[part], strength=model.strength[part])
-        gaps = measure_differences(some, images[part], problem.usable[part] == 0.0)
+        sites = None if problem.sites is None else problem.sites.select(part)
+        gaps = measure_differences(model.select(part), images[part], problem.usable[part] == 0.0, sites)
         by_pixel[part] = gaps.mean(dim=(1, 2))
         by_image += gaps[chosen[part]].mean(dim=1).sum(dim=0)
     found = (model.normals, model.albedo, model.strength, by_pixel)

@@ -4,7 +4,7 @@ Tests compare it with `image_model.measure_differences`, whose reflectance is th
 """
 
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -22,6 +22,7 @@ from sdps.refinement.image_model import (
     Model,
 )  # fmt: skip
 from sdps.refinement.reflectance import LEAST_COSINE, LOBES, SHAPES
+from sdps.refinement.sites import Sites
 
 # Waiting threads must sleep: if they spin, two of them take up to thirty times as long next to busy processes.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -31,6 +32,7 @@ BLOCKS = 64
 _FLOOR, _ROBUST, _SHADE = np.float32(DATA_FLOOR), np.float32(ROBUST), np.float32(SHADE_FLOOR)
 _EXCESS, _WEIGHT = np.float32(SHADOW_EXCESS), np.float32(SHADOW_WEIGHT)
 _LEAST = np.float32(LEAST_COSINE)
+_NEAREST, _BEHIND = np.float32(1e-4), np.float32(-0.98)  # |off|^2 and l.v are held above these
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
 
@@ -134,6 +136,98 @@ def _matte_gradient(
     return gx, gy, gz
 
 
+class _Scratch(NamedTuple):
+    """Room for what is worked out of one pixel; (L,) unless said otherwise."""
+
+    lag: np.ndarray  # n.h - 1
+    bright: np.ndarray  # the lobes over (l.h)^2, added up
+    slope: np.ndarray  # its derivative by n.h
+    pull: np.ndarray
+    matte: np.ndarray  # D
+    change: np.ndarray
+    lobes: np.ndarray  # (K, L)
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _make_scratch(lamps: int) -> _Scratch:
+    return _Scratch(
+        np.empty(lamps, np.float32), np.empty(lamps, np.float32), np.empty(lamps, np.float32),
+        np.empty(lamps, np.float32), np.empty(lamps, np.float32), np.empty(lamps, np.float32),
+        np.empty((LOBES, lamps), np.float32),
+    )  # fmt: skip
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _one_pixel(
+    n: Any, r: Any, scale: Any, body: np.ndarray, amplitudes: np.ndarray, sharpness: np.ndarray, lights: np.ndarray,
+    half: np.ndarray, shares: np.ndarray, image: np.ndarray, usable: np.ndarray, scratch: _Scratch, own: np.ndarray,
+    lobe: np.ndarray, shape: np.ndarray,
+) -> Any:  # fmt: skip
+    """Return the term of a pixel and its gradient by normal, albedo and strength; add up the others.
+
+    Args: n and r three numbers each, scale the strength, lights (3, L) and half (3, L) as the pixel sees them, shares
+    (3, L), image (3, L), usable (L,). Added to: own (9, L) for directions, half vectors and log intensities, lobe
+    (2, K), shape (4,).
+    """
+    lag, bright, slope, pull, matte, change, lobes = scratch
+    (nx, ny, nz), (r0, r1, r2) = n, r
+    _highlights(n, lights, half, amplitudes, sharpness, lag, lobes, bright, slope)
+    _matte(n, body, lights, matte)
+    term = gx = gy = gz = g0 = g1 = g2 = gs = _ZERO
+    for i in range(len(lag)):
+        cosine = nx * lights[0, i] + ny * lights[1, i] + nz * lights[2, i]
+        lit = _ONE if cosine > _ZERO else _ZERO
+        shade, floor = max(cosine, _ZERO), max(cosine, _SHADE)
+        gloss = scale * bright[i]
+        # One channel at a time, written out: a loop of three is not merged with the loop over images.
+        y0 = image[0, i] * shares[0, i]
+        y1 = image[1, i] * shares[1, i]
+        y2 = image[2, i] * shares[2, i]
+        value = matte[i]
+        o0, o1, o2 = r0 * value, r1 * value, r2 * value
+        f0, f1, f2 = o0 + gloss, o1 + gloss, o2 + gloss
+        s0, s1, s2 = f0 * floor, f1 * floor, f2 * floor
+        d0, d1, d2 = f0 * shade - y0, f1 * shade - y1, f2 * shade - y2
+        a0, a1, a2 = _ONE / (s0 * s0 + _FLOOR), _ONE / (s1 * s1 + _FLOOR), _ONE / (s2 * s2 + _FLOOR)
+        e0, e1, e2 = (np.sqrt(d0 * d0 * a0 + _ROBUST), np.sqrt(d1 * d1 * a1 + _ROBUST),
+                      np.sqrt(d2 * d2 * a2 + _ROBUST))  # fmt: skip
+        w0 = usable[i] * (_WEIGHT if d0 > _EXCESS * s0 else _ONE)
+        w1 = usable[i] * (_WEIGHT if d1 > _EXCESS * s1 else _ONE)
+        w2 = usable[i] * (_WEIGHT if d2 > _EXCESS * s2 else _ONE)
+        term += w0 * e0 + w1 * e1 + w2 * e2
+        q0, q1, q2 = w0 * d0 * a0 / e0, w1 * d1 * a1 / e1, w2 * d2 * a2 / e2
+        g0 += q0 * shade * value
+        g1 += q1 * shade * value
+        g2 += q2 * shade * value
+        change[i] = (q0 * o0 + q1 * o1 + q2 * o2) * shade
+        glossy = (q0 + q1 + q2) * shade
+        gs += glossy * bright[i]
+        pull[i] = glossy * scale
+        by_cosine = lit * (q0 * f0 + q1 * f1 + q2 * f2)
+        by_lag = pull[i] * slope[i]
+        gx += by_cosine * lights[0, i] + by_lag * half[0, i]
+        gy += by_cosine * lights[1, i] + by_lag * half[1, i]
+        gz += by_cosine * lights[2, i] + by_lag * half[2, i]
+        own[0, i] += by_cosine * nx
+        own[1, i] += by_cosine * ny
+        own[2, i] += by_cosine * nz - pull[i] * bright[i] / (_ONE + lights[2, i])
+        own[3, i] += by_lag * nx
+        own[4, i] += by_lag * ny
+        own[5, i] += by_lag * nz
+        own[6, i] += q0 * y0
+        own[7, i] += q1 * y1
+        own[8, i] += q2 * y2
+    mx, my, mz = _matte_gradient(n, body, lights, change, own, shape)
+    for k in range(LOBES):
+        by_height = by_sharp = _ZERO
+        for i in range(len(lag)):
+            by_height += pull[i] * lobes[k, i]
+            by_sharp += pull[i] * lobes[k, i] * lag[i]
+        lobe[0, k] += by_height
+        lobe[1, k] += by_sharp * amplitudes[k]
+    return term, gx + mx, gy + my, gz + mz, g0, g1, g2, gs
+
+
 @numba.njit(parallel=True, fastmath=True, cache=True, error_model="numpy")
 def _pass(
     normals: np.ndarray, albedo: np.ndarray, strength: np.ndarray, body: np.ndarray, amplitudes: np.ndarray,
@@ -149,73 +243,107 @@ def _pass(
     """
     count, lamps = images.shape[0], images.shape[2]
     for block in numba.prange(BLOCKS):
-        lobes = np.empty((LOBES, lamps), np.float32)
-        lag, bright, slope = np.empty(lamps, np.float32), np.empty(lamps, np.float32), np.empty(lamps, np.float32)
-        pull, matte, change = (np.empty(lamps, np.float32), np.empty(lamps, np.float32), np.empty(lamps, np.float32))
-        own = light[block]
-        summed = 0.0
+        scratch, summed = _make_scratch(lamps), 0.0
         for p in range(block * count // BLOCKS, (block + 1) * count // BLOCKS):
-            nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
-            n, scale = (nx, ny, nz), strength[p]
-            _highlights(n, lights, half, amplitudes, sharpness, lag, lobes, bright, slope)
-            _matte(n, body, lights, matte)
-            r0, r1, r2 = albedo[p, 0], albedo[p, 1], albedo[p, 2]
-            term = gx = gy = gz = g0 = g1 = g2 = gs = _ZERO
-            for i in range(lamps):
-                cosine = nx * lights[0, i] + ny * lights[1, i] + nz * lights[2, i]
-                lit = _ONE if cosine > _ZERO else _ZERO
-                shade, floor = max(cosine, _ZERO), max(cosine, _SHADE)
-                gloss = scale * bright[i]
-                # One channel at a time, written out: a loop of three is not merged with the loop over images.
-                y0 = images[p, 0, i] * shares[0, i]
-                y1 = images[p, 1, i] * shares[1, i]
-                y2 = images[p, 2, i] * shares[2, i]
-                value = matte[i]
-                o0, o1, o2 = r0 * value, r1 * value, r2 * value
-                f0, f1, f2 = o0 + gloss, o1 + gloss, o2 + gloss
-                s0, s1, s2 = f0 * floor, f1 * floor, f2 * floor
-                d0, d1, d2 = f0 * shade - y0, f1 * shade - y1, f2 * shade - y2
-                a0, a1, a2 = _ONE / (s0 * s0 + _FLOOR), _ONE / (s1 * s1 + _FLOOR), _ONE / (s2 * s2 + _FLOOR)
-                e0, e1, e2 = (np.sqrt(d0 * d0 * a0 + _ROBUST), np.sqrt(d1 * d1 * a1 + _ROBUST),
-                              np.sqrt(d2 * d2 * a2 + _ROBUST))  # fmt: skip
-                w0 = usable[p, i] * (_WEIGHT if d0 > _EXCESS * s0 else _ONE)
-                w1 = usable[p, i] * (_WEIGHT if d1 > _EXCESS * s1 else _ONE)
-                w2 = usable[p, i] * (_WEIGHT if d2 > _EXCESS * s2 else _ONE)
-                term += w0 * e0 + w1 * e1 + w2 * e2
-                q0, q1, q2 = w0 * d0 * a0 / e0, w1 * d1 * a1 / e1, w2 * d2 * a2 / e2
-                g0 += q0 * shade * value
-                g1 += q1 * shade * value
-                g2 += q2 * shade * value
-                change[i] = (q0 * o0 + q1 * o1 + q2 * o2) * shade
-                glossy = (q0 + q1 + q2) * shade
-                gs += glossy * bright[i]
-                pull[i] = glossy * scale
-                by_cosine = lit * (q0 * f0 + q1 * f1 + q2 * f2)
-                by_lag = pull[i] * slope[i]
-                gx += by_cosine * lights[0, i] + by_lag * half[0, i]
-                gy += by_cosine * lights[1, i] + by_lag * half[1, i]
-                gz += by_cosine * lights[2, i] + by_lag * half[2, i]
-                own[0, i] += by_cosine * nx
-                own[1, i] += by_cosine * ny
-                own[2, i] += by_cosine * nz - pull[i] * bright[i] / (_ONE + lights[2, i])
-                own[3, i] += by_lag * nx
-                own[4, i] += by_lag * ny
-                own[5, i] += by_lag * nz
-                own[6, i] += q0 * y0
-                own[7, i] += q1 * y1
-                own[8, i] += q2 * y2
-            mx, my, mz = _matte_gradient(n, body, lights, change, own, shape[block])
+            found = _one_pixel(
+                (normals[p, 0], normals[p, 1], normals[p, 2]), (albedo[p, 0], albedo[p, 1], albedo[p, 2]), strength[p],
+                body, amplitudes, sharpness, lights, half, shares, images[p], usable[p], scratch, light[block],
+                lobe[block], shape[block],
+            )  # fmt: skip
+            summed += float(found[0])
+            for k in range(7):
+                pixel[p, k] = found[k + 1]
+        total[block] = summed
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _see_lamps(
+    x: Any, turn: np.ndarray, directions: np.ndarray, nearness: np.ndarray, shares: np.ndarray, lights: np.ndarray,
+    half: np.ndarray, stretched: np.ndarray, length: np.ndarray,
+) -> None:  # fmt: skip
+    """Write lamps as a pixel at x sees them: l and h (3, L), shares over falloff (3, L), and 1 / |off| (L,)."""
+    for i in range(len(length)):
+        rho = nearness[i]
+        ox, oy, oz = directions[0, i] - rho * x[0], directions[1, i] - rho * x[1], directions[2, i] - rho * x[2]
+        squared = max(ox * ox + oy * oy + oz * oz, _NEAREST)
+        inverse = _ONE / np.sqrt(squared)
+        ux, uy, uz = ox * inverse, oy * inverse, oz * inverse
+        lx = turn[0, 0] * ux + turn[0, 1] * uy + turn[0, 2] * uz
+        ly = turn[1, 0] * ux + turn[1, 1] * uy + turn[1, 2] * uz
+        lz = max(turn[2, 0] * ux + turn[2, 1] * uy + turn[2, 2] * uz, _BEHIND)
+        to_half = _ONE / np.sqrt(lx * lx + ly * ly + (lz + _ONE) * (lz + _ONE))
+        lights[0, i], lights[1, i], lights[2, i] = lx, ly, lz
+        half[0, i], half[1, i], half[2, i] = lx * to_half, ly * to_half, (lz + _ONE) * to_half
+        stretched[0, i], stretched[1, i] = shares[0, i] * squared, shares[1, i] * squared
+        stretched[2, i], length[i] = shares[2, i] * squared, inverse
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _give_back(
+    x: Any, turn: np.ndarray, lights: np.ndarray, half: np.ndarray, nearness: np.ndarray, length: np.ndarray,
+    own: np.ndarray, light: np.ndarray,
+) -> None:  # fmt: skip
+    """Add the gradient of a pixel's lamps, own (9, L), to that of all: light (7, L), directions, log e, nearness."""
+    for i in range(len(length)):
+        hx, hy, hz, lx, ly, lz = half[0, i], half[1, i], half[2, i], lights[0, i], lights[1, i], lights[2, i]
+        along = own[3, i] * hx + own[4, i] * hy + own[5, i] * hz
+        to_half = _ONE / np.sqrt(lx * lx + ly * ly + (lz + _ONE) * (lz + _ONE))
+        ax = own[0, i] + (own[3, i] - along * hx) * to_half
+        ay = own[1, i] + (own[4, i] - along * hy) * to_half
+        az = own[2, i] + (own[5, i] - along * hz) * to_half
+        # Observations grow with |off|^2, as if intensities fell.
+        stronger = _TWO * (own[6, i] + own[7, i] + own[8, i]) * length[i]
+        along = ax * lx + ay * ly + az * lz
+        tx = (ax - along * lx) * length[i] - stronger * lx
+        ty = (ay - along * ly) * length[i] - stronger * ly
+        tz = (az - along * lz) * length[i] - stronger * lz
+        bx = turn[0, 0] * tx + turn[1, 0] * ty + turn[2, 0] * tz
+        by = turn[0, 1] * tx + turn[1, 1] * ty + turn[2, 1] * tz
+        bz = turn[0, 2] * tx + turn[1, 2] * ty + turn[2, 2] * tz
+        light[0, i] += bx
+        light[1, i] += by
+        light[2, i] += bz
+        light[3, i] += own[6, i]
+        light[4, i] += own[7, i]
+        light[5, i] += own[8, i]
+        light[6, i] -= bx * x[0] + by * x[1] + bz * x[2]
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True, error_model="numpy")
+def _near_pass(
+    normals: np.ndarray, albedo: np.ndarray, strength: np.ndarray, body: np.ndarray, amplitudes: np.ndarray,
+    sharpness: np.ndarray, directions: np.ndarray, nearness: np.ndarray, places: np.ndarray, turns: np.ndarray,
+    shares: np.ndarray, images: np.ndarray, usable: np.ndarray, total: np.ndarray, pixel: np.ndarray,
+    light: np.ndarray, lobe: np.ndarray, shape: np.ndarray,
+) -> None:  # fmt: skip
+    """Do what `_pass` does where each pixel sees lamps of its own.
+
+    Args: as there, and directions (3, L) and nearness (L,) of the lamps, places (P, 3) and turns (P, 3, 3) of `Sites`.
+    Written: as there, but light (B, 7, L) for directions, log intensities and nearness.
+    """
+    count, lamps = images.shape[0], images.shape[2]
+    for block in numba.prange(BLOCKS):
+        scratch, summed, own = _make_scratch(lamps), 0.0, np.empty((9, lamps), np.float32)
+        lights, half = np.empty((3, lamps), np.float32), np.empty((3, lamps), np.float32)
+        stretched, length = np.empty((3, lamps), np.float32), np.empty(lamps, np.float32)
+        for p in range(block * count // BLOCKS, (block + 1) * count // BLOCKS):
+            x, turn = (places[p, 0], places[p, 1], places[p, 2]), turns[p]
+            _see_lamps(x, turn, directions, nearness, shares, lights, half, stretched, length)
+            n = (
+                turn[0, 0] * normals[p, 0] + turn[0, 1] * normals[p, 1] + turn[0, 2] * normals[p, 2],
+                turn[1, 0] * normals[p, 0] + turn[1, 1] * normals[p, 1] + turn[1, 2] * normals[p, 2],
+                turn[2, 0] * normals[p, 0] + turn[2, 1] * normals[p, 1] + turn[2, 2] * normals[p, 2],
+            )  # fmt: skip
+            own[:] = _ZERO
+            term, gx, gy, gz, g0, g1, g2, gs = _one_pixel(
+                n, (albedo[p, 0], albedo[p, 1], albedo[p, 2]), strength[p], body, amplitudes, sharpness, lights, half,
+                stretched, images[p], usable[p], scratch, own, lobe[block], shape[block],
+            )  # fmt: skip
+            _give_back(x, turn, lights, half, nearness, length, own, light[block])
             summed += float(term)
-            pixel[p, 0], pixel[p, 1], pixel[p, 2] = gx + mx, gy + my, gz + mz
-            pixel[p, 3], pixel[p, 4], pixel[p, 5] = g0, g1, g2
-            pixel[p, 6] = gs
-            for k in range(LOBES):
-                by_height = by_sharp = _ZERO
-                for i in range(lamps):
-                    by_height += pull[i] * lobes[k, i]
-                    by_sharp += pull[i] * lobes[k, i] * lag[i]
-                lobe[block, 0, k] += by_height
-                lobe[block, 1, k] += by_sharp * amplitudes[k]
+            for k in range(3):
+                pixel[p, k] = turn[0, k] * gx + turn[1, k] * gy + turn[2, k] * gz
+            pixel[p, 3], pixel[p, 4], pixel[p, 5], pixel[p, 6] = g0, g1, g2, gs
         total[block] = summed
 
 
@@ -223,39 +351,45 @@ class _DataTerm(torch.autograd.Function):
     """The mean of the robust differences, and its gradient found on the way."""
 
     @staticmethod
-    def forward(context: Any, images: Tensor, usable: Tensor, *parts: Tensor) -> Tensor:
+    def forward(context: Any, images: Tensor, usable: Tensor, sites: Sites | None, *parts: Tensor) -> Tensor:
         arrays = (part.detach().numpy() for part in parts)
-        normals, albedo, strength, body, amplitudes, sharpness, directions, half, logs = arrays
+        normals, albedo, strength, body, amplitudes, sharpness, directions, half, logs, nearness = arrays
         count, lamps = images.shape[0], images.shape[2]
         total, pixel = np.zeros(BLOCKS), np.empty((count, 7), np.float32)
-        light, lobe = np.zeros((BLOCKS, 9, lamps), np.float32), np.zeros((BLOCKS, 2, LOBES), np.float32)
-        shape = np.zeros((BLOCKS, SHAPES), np.float32)
-        _pass(
-            normals, albedo, strength, body, amplitudes, sharpness, np.ascontiguousarray(directions.T),
-            np.ascontiguousarray(half.T), np.ascontiguousarray(np.exp(-logs.T)), images.numpy(), usable.numpy(), total,
-            pixel, light, lobe, shape,
-        )  # fmt: skip
+        lobe, shape = np.zeros((BLOCKS, 2, LOBES), np.float32), np.zeros((BLOCKS, SHAPES), np.float32)
+        surface = normals, albedo, strength, body, amplitudes, sharpness, np.ascontiguousarray(directions.T)
+        seen = np.ascontiguousarray(np.exp(-logs.T)), images.numpy(), usable.numpy(), total, pixel
         scale = 1.0 / images.numel()
-        lights = light.sum(axis=0, dtype=np.float64) * scale  # (9, L)
+        if sites is None:
+            light = np.zeros((BLOCKS, 9, lamps), np.float32)
+            _pass(*surface, np.ascontiguousarray(half.T), *seen, light, lobe, shape)
+            lights = light.sum(axis=0, dtype=np.float64) * scale  # (9, L)
+            of_lights = [lights[:3].T, lights[3:6].T, lights[6:].T, np.zeros(lamps)]
+        else:
+            light = np.zeros((BLOCKS, 7, lamps), np.float32)
+            _near_pass(*surface, nearness, sites.places.numpy(), sites.turns.numpy(), *seen, light, lobe, shape)
+            lights = light.sum(axis=0, dtype=np.float64) * scale  # (7, L)
+            of_lights = [lights[:3].T, np.zeros((lamps, 3)), lights[3:6].T, lights[6]]
         heights, sharps = lobe.sum(axis=0, dtype=np.float64) * scale
         pixel *= scale
         of_pixels = pixel[:, :3], pixel[:, 3:6], pixel[:, 6]
         shapes = shape.sum(axis=0, dtype=np.float64) * scale
-        found = (*of_pixels, shapes, heights, sharps, lights[:3].T, lights[3:6].T, lights[6:].T)
+        found = (*of_pixels, shapes, heights, sharps, *of_lights)
         context.save_for_backward(*(torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in found))
         return torch.tensor(total.sum() * scale)
 
     @staticmethod
     def backward(context: Any, incoming: Tensor) -> tuple[Tensor | None, ...]:
-        return (None, None, *(part * incoming.float() for part in context.saved_tensors))
+        return (None, None, None, *(part * incoming.float() for part in context.saved_tensors))
 
 
-def data_term(model: Model, images: Tensor, usable: Tensor) -> Tensor:
+def data_term(model: Model, images: Tensor, usable: Tensor, sites: Sites | None = None) -> Tensor:
     """Return the mean of r (`sdps.refinement.image_model`) over pixels, channels and images; differentiable.
 
     Args:
         model: The model; float32 on the CPU.
         images: (P, 3, L) float32, I / G, contiguous.
         usable: (P, L) float32, 0 where an observation is ignored, else 1.
+        sites: Where the pixels lie; None: lamps are distant, the camera is orthographic.
     """
-    return _DataTerm.apply(images, usable, *(part.contiguous() for part in model))
+    return _DataTerm.apply(images, usable, sites, *(part.contiguous() for part in model))

@@ -1,14 +1,15 @@
-"""The image-formation model: an object's reflectance (`reflectance`), directional lights, robust differences.
+"""The image-formation model: an object's reflectance (`reflectance`), lamps far or near, robust differences.
 
 Pixel p, image i, channel c; f without G is rho D + S of `reflectance`:
 
     q_pic = (rho_pc D_pi + S_pi) max(n_p . l_i, 0)                                      predicted radiance
-    y_pic = I_pic / (e_ic G_pi)                                                         radiance under equal lights
+    y_pic = I_pic / (e_ic G_pi falloff_pi)                                              radiance under equal lights
     r_pic = w_pic sqrt((q_pic - y_pic)^2 / (sigma_pic^2 + 0.05) + 1e-4)                 robust difference
     sigma_pic = (rho_pc D_pi + S_pi) max(n_p . l_i, 0.05)                               constant in the gradient
 
-with I divided by its mean over the object, after light that bounced off other parts of it is subtracted, and e by its
-own mean. G is constant in the gradient; functions here take I / G. w is 0 where a pixel is black although it is lit
+with n and l turned until the line of sight is z, and l and falloff those of each pixel where lamps are near (`sites`).
+I is divided by its mean over the object, after light that bounced off other parts of it is subtracted, and e by its own
+mean. G is constant in the gradient; functions here take I / G. w is 0 where a pixel is black although it is lit
 elsewhere (`find_shadows`) or a cast shadow was traced (`transport`), 0.15 where it is darker than the model explains
 by half of sigma (perhaps another shadow), else 1.
 """
@@ -21,6 +22,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, softplus
 
 from sdps.refinement.reflectance import half_vectors, measure_angles, reflect
+from sdps.refinement.sites import Seen, Sites, see
 
 DATA_FLOOR = 0.05
 """Added to the squared scale of a difference, so that dark pixels do not outweigh bright ones."""
@@ -44,6 +46,8 @@ class State(NamedTuple):
         log_intensities: (L, 3).
         whiteness: () albedo of the brightest parts, which decides how much light bounces.
         modes: (M,) m of `sdps.refinement.reflectance`.
+        log_nearness: () logarithm of rho (`sdps.core.geometry`), which all lamps share; -inf: distant.
+        uneven: (L,) what is added to it for each lamp.
     """
 
     normals: Tensor
@@ -56,6 +60,8 @@ class State(NamedTuple):
     log_intensities: Tensor
     whiteness: Tensor
     modes: Tensor
+    log_nearness: Tensor
+    uneven: Tensor
 
 
 class Model(NamedTuple):
@@ -71,6 +77,7 @@ class Model(NamedTuple):
         directions: (L, 3) unit.
         half: (L, 3) unit half vectors.
         log_intensities: (L, 3), the mean of their exponentials 1.
+        nearness: (L,) rho.
     """
 
     normals: Tensor
@@ -82,6 +89,16 @@ class Model(NamedTuple):
     directions: Tensor
     half: Tensor
     log_intensities: Tensor
+    nearness: Tensor
+
+    def see(self, sites: Sites | None, part: slice = slice(None)) -> Seen:
+        """Return the normals and lamps of some pixels as they see them; `sites` are those of all."""
+        own = None if sites is None else sites.select(part)
+        return see(self.normals[part], self.directions, self.nearness, own)
+
+    def select(self, part: slice) -> "Model":
+        """Return the model of some pixels."""
+        return self._replace(normals=self.normals[part], albedo=self.albedo[part], strength=self.strength[part])
 
 
 def build_model(state: State) -> Model:
@@ -98,6 +115,7 @@ def build_model(state: State) -> Model:
         directions=directions,
         half=half_vectors(directions),
         log_intensities=logs - logs.logsumexp((0, 1)) + np.log(logs.numel()),
+        nearness=(state.log_nearness + state.uneven).exp(),
     )
 
 
@@ -113,17 +131,19 @@ def find_shadows(radiance: Tensor) -> Tensor:  # (P, L) bool
     return grey < _BLACK * darker
 
 
-def measure_differences(model: Model, images: Tensor, dark: Tensor) -> Tensor:  # (P, 3, L)
+def measure_differences(model: Model, images: Tensor, dark: Tensor, sites: Sites | None = None) -> Tensor:  # (P, 3, L)
     """Return r of the module's text, whose mean is `fused.data_term`; differentiable.
 
     Args:
         model: The model.
         images: (P, 3, L), I / G.
         dark: (P, L) bool, observations that are ignored.
+        sites: Where the pixels lie; None: lamps are distant, the camera is orthographic.
     """
-    cosine = model.normals @ model.directions.T  # (P, L)
-    reflected = reflect(measure_angles(model.normals, model.directions), model)
-    observed = images / model.log_intensities.exp().T  # (P, 3, L)
+    seen = model.see(sites)
+    cosine = seen.cosines  # (P, L)
+    reflected = reflect(measure_angles(seen.normals, seen.directions), model)
+    observed = seen.even_out(images / model.log_intensities.exp().T)  # (P, 3, L)
     sigma = (reflected * cosine.clamp_min(SHADE_FLOOR)[:, None]).detach()
     gap = reflected * cosine.clamp_min(0.0)[:, None] - observed
     weight = torch.where(gap > SHADOW_EXCESS * sigma, SHADOW_WEIGHT, 1.0) * ~dark[:, None]

@@ -16,6 +16,7 @@ from torch import Tensor
 from render.shared.config import read_yaml
 from sdps.refinement.image_model import Model
 from sdps.refinement.reflectance import MODES, MOST_LOG_FACTOR, evaluate_factor, measure_angles, mode_terms, reflect
+from sdps.refinement.sites import Seen, Sites
 
 _OBSERVATIONS = 100.0
 """What all observations of an object count as together: errors of neighbouring pixels and lights correlate."""
@@ -27,33 +28,38 @@ _PART = 4096
 ASSET = Path(str(resources.files("assets"))) / "reflectance_modes.yaml"
 
 
-def evaluate_modes(normals: Tensor, directions: Tensor, modes: Tensor) -> Tensor:  # (P, L)
-    """Return G of normals (P, 3) and lights (L, 3), both unit, some pixels at a time."""
-    return torch.cat([evaluate_factor(measure_angles(part, directions), modes) for part in normals.split(_PART)])
+def evaluate_modes(model: Model, modes: Tensor, sites: Sites | None = None) -> Tensor:  # (P, L)
+    """Return G, some pixels at a time; without gradients."""
+    model = Model(*(part.detach() for part in model))
+    parts = (slice(start, start + _PART) for start in range(0, len(model.normals), _PART))
+    seen = (model.see(sites, part) for part in parts)
+    return torch.cat([evaluate_factor(measure_angles(some.normals, some.directions), modes) for some in seen])
 
 
-def fit_modes(model: Model, images: Tensor, usable: Tensor) -> Tensor:  # (MODES,)
+def fit_modes(model: Model, images: Tensor, usable: Tensor, sites: Sites | None = None) -> Tensor:  # (MODES,)
     """Return m.
 
     Args:
         model: The model.
         images: (P, 3, L), without bounced light.
         usable: (P, L), 0 for observations that are ignored.
+        sites: Where the pixels lie; None: lamps are distant, the camera is orthographic.
     """
-    left, weights = compare_logs(model, images, usable)
-    terms = mode_terms(measure_angles(model.normals, model.directions))
+    seen = model.see(sites)
+    left, weights = compare_logs(model, images, usable, seen)
+    terms = mode_terms(measure_angles(seen.normals, seen.directions))
     shapes = torch.stack([torch.ones_like(left), *terms], dim=-1).flatten(0, 1)  # (P L, 1 + MODES)
     weighted = shapes.T * (weights.flatten() * (_OBSERVATIONS / _SPREAD**2))
     normal = (weighted @ shapes).double() + _load_precision()
     return torch.linalg.solve(normal, (weighted @ left.flatten()).double())[1:].float()
 
 
-def compare_logs(model: Model, images: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
+def compare_logs(model: Model, images: Tensor, usable: Tensor, seen: Seen) -> tuple[Tensor, Tensor]:
     """Return the logarithm of observed over predicted radiance (P, L), and its weights, which add up to 1."""
-    cosine = model.normals @ model.directions.T  # (P, L)
-    reflected = reflect(measure_angles(model.normals, model.directions), model)
+    cosine = seen.cosines  # (P, L)
+    reflected = reflect(measure_angles(seen.normals, seen.directions), model)
     predicted = (reflected * cosine.clamp_min(0.0)[:, None]).mean(dim=1)
-    observed = (images * torch.exp(-model.log_intensities).T).mean(dim=1)
+    observed = seen.even_out(images * torch.exp(-model.log_intensities).T).mean(dim=1)
     left = torch.log((observed + _LEAST_RADIANCE) / (predicted + _LEAST_RADIANCE))
     weights = cosine * ((cosine > _LEAST_LIT) & (usable > 0.0) & (predicted > _LEAST_RADIANCE))
     return left.clamp(-MOST_LOG_FACTOR, MOST_LOG_FACTOR), weights / weights.sum().clamp_min(1e-9)

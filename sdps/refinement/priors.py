@@ -45,16 +45,18 @@ def measure_roughness(values: Tensor, near: Neighbours) -> Tensor:
     return (gap**2).reshape(len(gap), -1).sum(dim=1).add(_ROUND).sqrt().mean()
 
 
-def measure_curl(normals: Tensor, near: Neighbours) -> Tensor:
+def measure_curl(normals: Tensor, near: Neighbours, sights: Tensor | None = None) -> Tensor:
     """Return how far normals are from being those of a surface: the mean of |curl of the slopes| n_z^2 over cells.
 
     Args:
         normals: (P, 3) unit.
         near: Neighbours among the pixels.
+        sights: (P, 3) v' of a perspective camera, n . v' taking the place of n_z; None: orthographic.
     """
     if not len(near.cells):
         return normals.new_zeros(())
-    depth = normals[:, 2].clamp_min(_STEEPEST)
+    facing = normals[:, 2] if sights is None else (normals * sights).sum(dim=1)
+    depth = facing.clamp_min(_STEEPEST)
     slopes = -normals[:, :2] / depth[:, None]  # dz/dx, dz/dy
     above_left, above_right, below_left, below_right = slopes[near.cells].unbind(dim=1)
     # Rows run down and y runs up.

@@ -10,6 +10,7 @@ from render.shared.errors import InputError
 from sdps.inference.image_source import ObjectImages
 from sdps.refinement.descent import Problem
 from sdps.refinement.image_model import State, build_model, find_shadows
+from sdps.refinement.sites import select_grid
 
 _LIT_SHARE = 0.1
 _LEAST_ALBEDO = 1e-3
@@ -24,13 +25,6 @@ def gather_pixels(scene: ObjectImages, which: np.ndarray) -> np.ndarray:  # (P, 
     for number in range(len(scene)):
         values[:, :, number] = scene.read(number, number + 1)[0][which]
     return values
-
-
-def select_grid(mask: np.ndarray, stride: int) -> np.ndarray:
-    """Return which pixels of a mask (h, w) are on the grid of every `stride`-th row and column."""
-    grid = np.zeros_like(mask)
-    grid[::stride, ::stride] = mask[::stride, ::stride]
-    return grid
 
 
 def build_problem(
@@ -85,8 +79,9 @@ def estimate_log_albedo(problem: Problem, state: State) -> Tensor:  # (P, 3)
     found = torch.empty(len(problem.images), 3)
     shares = torch.exp(-model.log_intensities).T  # (3, L)
     for part in split_pixels(len(found)):
-        shade = (model.normals[part] @ model.directions.T).clamp_min(0.0)  # (p, L)
+        seen = model.see(problem.sites, part)
+        shade = seen.cosines.clamp_min(0.0)  # (p, L)
         lit = shade > _LIT_SHARE * shade.mean(dim=1, keepdim=True)
-        ratio = problem.images[part] * shares / shade.clamp_min(1e-6)[:, None]
+        ratio = seen.even_out(problem.images[part] * shares) / shade.clamp_min(1e-6)[:, None]
         found[part] = ratio.masked_fill(~lit[:, None], torch.nan).nanmedian(dim=2).values
     return found.nan_to_num(_LEAST_ALBEDO).clamp_min(_LEAST_ALBEDO).log()

@@ -14,22 +14,25 @@ import torch
 from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
-from sdps.core.integration import integrate
+from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture, reach
 from sdps.core.intensities import per_channel
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.inference.tiles import Tile, release_memory, tiles
 from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.fine import collect, upsample
-from sdps.refinement.image_model import State, build_model
-from sdps.refinement.problems import build_problem, estimate_log_albedo, gather_pixels, select_grid
+from sdps.refinement.image_model import Model, State, build_model
+from sdps.refinement.problems import build_problem, estimate_log_albedo, gather_pixels
 from sdps.refinement.refined import Refined
 from sdps.refinement.reflectance import LOBES, MODES, SHAPES
+from sdps.refinement.sites import Grid, Sites, select_grid
 from sdps.refinement.transport import trace
 
 _FEWEST = 4
 _OF_PIXELS = frozenset({"normals", "log_albedo", "log_strength"})
 _SHARPEST, _BROADEST = 300.0, 10.0
 _START_HEIGHT = -4.0
+START_NEARNESS = 0.03
+"""What nearness that is to be found begins with."""
 _BRIGHTEST, _WHITENESS = 0.95, 0.3  # quantile of the brightest parts, and the albedo they start with
 TILE_BYTES = 3 * 2**29
 """Memory for the pixels that are refined at once; objects whose box fits are one tile."""
@@ -74,6 +77,9 @@ def refine(
     intensities: np.ndarray,
     *,
     directions_given: bool = False,
+    nearness: np.ndarray | None = None,
+    each: bool = False,
+    camera: Camera = ORTHOGRAPHIC,
     config: RefineConfig | None = None,
     stray: bool = True,
     saturation: float = np.inf,
@@ -87,6 +93,9 @@ def refine(
         lights: (L, 3) unit directions from the surface to the light.
         intensities: (L,) or (L, 3).
         directions_given: Leave directions as they are. Intensities always move: they also absorb what the model misses.
+        nearness: (L,) rho of the lamps (`sdps.core.geometry`), which stays: zeros for distant lamps; None: found.
+        each: Each lamp has a distance of its own; otherwise those that are found are one.
+        camera: The camera.
         config: Iterations and rates.
         stray: Subtract stray light from the images.
         saturation: Radiance at which a channel is clipped; such observations are ignored.
@@ -101,33 +110,43 @@ def refine(
     parts = tiles(scene.mask, most, _HALO)
     values = gather_pixels(scene, scene.mask if len(parts) == 1 else select_grid(scene.mask, stride))
     problem = build_problem(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
+    capture = Capture.of(scene.mask, camera.crop(mask.shape, scene.rows.start, scene.columns.start))
+    grid = Grid(capture, scene.mask, stride)
+    if nearness is None or nearness.any() or camera.is_perspective:
+        problem = problem._replace(sites=grid.sites())
     start_normals = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
-    free = frozenset(State._fields) - ({"directions"} if directions_given else set())
+    given = {"directions": directions_given, "log_nearness": nearness is not None, "uneven": not each}
+    free = frozenset(State._fields) - {name for name, fixed in given.items() if fixed}
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
     with progress_bar(None, total=before + config.iterations + fine * len(parts), desc="refine") as bar:
         move = partial(solve, free=free, boost=config.boost, weights=Weights(), on_step=_advance(bar))
-        start = build_start(problem, start_normals, lights, gains)
+        start = build_start(problem, start_normals, lights, gains, nearness)
         if before:
-            problem = _trace_light(problem, move(problem, start, iterations=before), config.bounces)
+            found = move(problem, start, iterations=before)
+            problem = _trace_light(problem, found, config.bounces, grid)
+            start = start._replace(log_nearness=found.log_nearness, uneven=found.uneven)
             start = start._replace(log_albedo=estimate_log_albedo(problem, start))
         state = move(problem, start, iterations=config.iterations)
         if stride == 1:
             return collect(scene, [(parts[0], problem, state)], state)
+        if problem.sites is not None:
+            problem = problem._replace(heights=grid.integrate(build_model(state).normals))
         weights = Weights(curl=(config.fine_curl, config.fine_curl))
         settle = partial(move, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
-        return collect(scene, _refine_tiles(scene, parts, values, problem, stride, state, full, settle), state)
+        fit = partial(upsample, coarse=problem, stride=stride, state=state, full=full, capture=capture)
+        return collect(scene, _refine_tiles(scene, parts, values, fit, settle), state)
 
 
 def _refine_tiles(
-    scene: ObjectImages, parts: list[Tile], values: np.ndarray, coarse: Problem, stride: int, state: State,
-    full: np.ndarray, settle: Callable[[Problem, State], State],
+    scene: ObjectImages, parts: list[Tile], values: np.ndarray, fit: Callable[..., tuple[Problem, State]],
+    settle: Callable[[Problem, State], State],
 ) -> Iterator[tuple[Tile, Problem, State]]:  # fmt: skip
     """Yield the tiles with their refined pixels; `values` are those of all pixels if there is one tile."""
 
     def refine_tile(tile: Tile) -> tuple[Tile, Problem, State]:  # holds nothing of one tile while the next is made
         part = scene.part(tile.outer_rows, tile.outer_columns)
         own = values if len(parts) == 1 else gather_pixels(part, part.mask)
-        problem, start = upsample(own, scene, tile, coarse, stride, state, full)
+        problem, start = fit(own, scene, tile)
         return tile, problem, settle(problem, start)
 
     for tile in parts:
@@ -161,9 +180,12 @@ def _check(
     return per_channel(intensities)
 
 
-def build_start(problem: Problem, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray) -> State:
-    """Return the state that refinement starts from, given a method's normals and lights."""
-    count = len(problem.images)
+def build_start(
+    problem: Problem, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray,
+    nearness: np.ndarray | None = None,
+) -> State:  # fmt: skip
+    """Return the state that refinement starts from, given a method's normals and lights, and known nearness (L,)."""
+    count, rho = len(problem.images), np.ones(len(lights)) if nearness is None else nearness
     state = State(
         normals=torch.from_numpy(np.array(normals, np.float32)),
         log_albedo=torch.zeros(count, 3),
@@ -175,22 +197,34 @@ def build_start(problem: Problem, normals: np.ndarray, lights: np.ndarray, inten
         log_intensities=torch.from_numpy(np.log(np.maximum(intensities, 1e-6)).astype(np.float32)),
         whiteness=torch.tensor(_WHITENESS),
         modes=torch.zeros(MODES),
+        log_nearness=torch.tensor(np.log(START_NEARNESS) if nearness is None else 0.0, dtype=torch.float32),
+        uneven=torch.from_numpy(rho.astype(np.float32)).log(),
     )
     state.normals[:, 2].clamp_min_(1e-3)
     return state._replace(log_albedo=estimate_log_albedo(problem, state))
 
 
-def _trace_light(problem: Problem, state: State, bounces: int) -> Problem:
-    """Return the problem without observations in cast shadows, and with bounced light."""
+def _trace_light(problem: Problem, state: State, bounces: int, grid: Grid) -> Problem:
+    """Return the problem without observations in cast shadows, with bounced light, and with pixels in their places."""
     model = build_model(state)
-    normals, lights, albedo = (part.numpy() for part in (model.normals, model.directions, model.albedo))
-    laid = np.zeros((*problem.mask.shape, 3))
-    laid[problem.mask] = normals
-    heights = integrate(laid, problem.mask, discontinuities=True).z
-    found = trace(heights, problem.mask, normals, lights)
+    heights = grid.integrate(model.normals)
+    if problem.sites is not None:
+        problem = problem._replace(sites=grid.sites(heights))
+    shade, ways = _shade_grid(model, problem.sites)
+    normals, albedo = model.normals.numpy(), model.albedo.numpy()
+    found = trace(heights, problem.mask, normals, ways, grid.camera)
     brightest = float(np.quantile(albedo, _BRIGHTEST))
-    first, more = (found.bounce(normals, albedo / brightest, lights, count) for count in (1, bounces))
+    first, more = (found.bounce(shade, albedo / brightest, count) for count in (1, bounces))
     twice = float(more.sum() / max(first.sum(), 1e-9)) - 1.0
     first *= brightest
     usable = problem.usable * torch.from_numpy(found.lit)
     return problem._replace(usable=usable, bounced=torch.from_numpy(first), twice=twice)
+
+
+def _shade_grid(model: Model, sites: Sites | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return n . l falloff (P, L), and the directions of light: (L, 3), or (P, L, 3) where each pixel has its own."""
+    normals, lights = model.normals.numpy(), model.directions.numpy()
+    if sites is None:
+        return normals @ lights.T, lights
+    ways, falloff = reach(sites.places.numpy(), lights, model.nearness.numpy())
+    return (ways @ normals[..., None])[..., 0] * falloff, ways

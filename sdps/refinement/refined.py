@@ -19,6 +19,7 @@ class Refined:
         amplitudes: (K,) of the lobes.
         sharpness: (K,) of the lobes.
         modes: (M,) numbers m of the modes; 0 adds nothing.
+        nearness: (L,) float32, rho of the lamps (`sdps.core.geometry`); 0 where they are taken for distant.
         pixel_residual: (H, W) float32, mean robust difference, zero outside the mask.
         image_residual: (L,) float32, the same of each image.
     """
@@ -32,6 +33,7 @@ class Refined:
     amplitudes: np.ndarray
     sharpness: np.ndarray
     modes: np.ndarray
+    nearness: np.ndarray
     pixel_residual: np.ndarray
     image_residual: np.ndarray
 

@@ -61,10 +61,16 @@ SHAPES, MODES = (len(terms(Angles(0.0, 0.0, 0.0, 0.0, 0.0))) for terms in (body_
 
 
 def measure_angles(normals: Array, directions: Array) -> Angles:
-    """Return the angles of unit normals (P, 3) and lights (L, 3); y is (P, 1), l . v (L,), the others (P, L)."""
-    xp = _library(normals)
-    tilt = xp.clip(1.0 - normals @ half_vectors(directions).T, 0.0, None)
-    return combine_cosines(normals @ directions.T, normals[:, 2:], directions[:, 2], tilt)
+    """Return the angles of unit normals (P, 3) and lights (L, 3); y is (P, 1), l . v (L,), the others (P, L).
+
+    Lights (P, L, 3) are those of each pixel; l . v is then (P, L).
+    """
+    xp, half = _library(normals), half_vectors(directions)
+    if directions.ndim == 2:
+        tilt, light = normals @ half.T, normals @ directions.T
+    else:
+        tilt, light = ((vectors @ normals[..., None])[..., 0] for vectors in (half, directions))
+    return combine_cosines(light, normals[:, 2:], directions[..., 2], xp.clip(1.0 - tilt, 0.0, None))
 
 
 def combine_cosines(light: Array, view: Array, across: Array, tilt: Array) -> Angles:
@@ -76,10 +82,10 @@ def combine_cosines(light: Array, view: Array, across: Array, tilt: Array) -> An
     return Angles(1.0 - light, 1.0 - view, opposed, tilt, across)
 
 
-def half_vectors(directions: Array) -> Array:  # (L, 3)
-    """Return the unit vectors half way between lights (L, 3) and the camera."""
+def half_vectors(directions: Array) -> Array:  # (..., 3)
+    """Return the unit vectors half way between lights (..., 3) and the camera."""
     xp = _library(directions)
-    summed = xp.stack([directions[:, 0], directions[:, 1], directions[:, 2] + 1.0], -1)
+    summed = xp.stack([directions[..., 0], directions[..., 1], directions[..., 2] + 1.0], -1)
     return summed / xp.clip(xp.linalg.norm(summed, None, -1, True), 1e-12, None)
 
 

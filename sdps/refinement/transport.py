@@ -1,12 +1,13 @@
 """Shadows and light between the parts of an object, traced over the surface that its normals integrate to.
 
-The surface is a height field z(x, y) over the pixels, seen from above; everything under it is solid. Pixel
-p, image i; n unit normal, l unit direction to the light, V whether two points see each other, A a pixel's area on the
-surface:
+The surface is a height field z(x, y) over the pixels, seen from above; everything under it is solid. What a pinhole
+sees is one as well, of s = z / (1 - z / f), which keeps straight lines straight: a ray that leaves X in the direction l
+goes along l + (x, y, s) l_z / f there. Pixel p, image i; n unit normal, l unit direction to the light, V whether two
+points see each other, A a pixel's area on the surface:
 
-    lit_pi  = 1 where the ray from p towards l_i stays above the surface
+    lit_pi  = 1 where the ray from p towards l_pi stays above the surface
     F_pq    = V_pq max(n_p . w, 0) max(-n_q . w, 0) A_q / (pi r^2)          w, r direction and distance from p to q
-    B       = rho E + rho F (rho E) + ...,   E_pi = lit_pi max(n_p . l_i, 0)   radiosity, Lambertian; light pi
+    B       = rho E + rho F (rho E) + ...,   E_pi = lit_pi max(n_p . l_pi, 0) falloff_pi   radiosity; light pi
     bounced = B - rho E
 
 (Goral et al., Modeling the interaction of light between diffuse surfaces, SIGGRAPH 1984). The renderer traces the same
@@ -17,6 +18,8 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+
+from sdps.core.geometry import ORTHOGRAPHIC, Camera
 
 _OFFSET = 0.3
 """Rays start this many pixels above the surface, since its slopes are not exact."""
@@ -38,17 +41,16 @@ class Transport(NamedTuple):
     lit: np.ndarray
     factors: np.ndarray
 
-    def bounce(self, normals: np.ndarray, albedo: np.ndarray, lights: np.ndarray, bounces: int = 2) -> np.ndarray:
+    def bounce(self, shade: np.ndarray, albedo: np.ndarray, bounces: int = 2) -> np.ndarray:
         """Return the radiance (P, 3, L) float32 of bounced light.
 
         Args:
-            normals: (P, 3) unit.
+            shade: (P, L) n . l falloff.
             albedo: (P, 3), 1 for a white Lambertian surface.
-            lights: (L, 3) unit directions.
             bounces: How often light is reflected after its first reflection.
         """
-        direct = np.where(self.lit, np.maximum(normals @ lights.T, 0.0), 0.0).astype(np.float32)  # (P, L)
-        found = np.empty((len(normals), 3, len(lights)), np.float32)
+        direct = np.where(self.lit, np.maximum(shade, 0.0), 0.0).astype(np.float32)  # (P, L)
+        found = np.empty((len(shade), 3, shade.shape[1]), np.float32)
         for channel in range(3):
             rho = albedo[:, channel : channel + 1].astype(np.float32)
             leaving = rho * direct
@@ -60,27 +62,53 @@ class Transport(NamedTuple):
         return found
 
 
-def trace(heights: np.ndarray, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> Transport:
+def trace(
+    heights: np.ndarray, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, camera: Camera = ORTHOGRAPHIC
+) -> Transport:
     """Trace cast shadows and which pixels see each other.
 
     Args:
         heights: (H, W), towards the camera, in pixels; not read outside the mask.
         mask: (H, W) bool, P true.
         normals: (P, 3) unit.
-        lights: (L, 3) unit directions from the surface to the light.
+        lights: (L, 3) unit directions from the surface to the light, or (P, L, 3), those of each pixel.
+        camera: Of this picture.
     """
+    lights, unit = np.asarray(lights, np.float32), np.ascontiguousarray(normals, np.float32)
     field = np.where(mask, heights, -np.inf).astype(np.float32)
     rows, columns = (places.astype(np.float32) for places in np.nonzero(mask))
     points = np.stack([columns, -rows, field[mask]], axis=1)
-    unit = np.ascontiguousarray(normals, np.float32)
+    ways = np.broadcast_to(lights, (len(points), *lights.shape[-2:]))
     above = points + np.float32(_OFFSET) * unit
-    lit = np.ones((len(points), len(lights)), np.bool_)
-    _shadows(field, above, np.ascontiguousarray(lights, np.float32), lit)
+    if camera.is_perspective:
+        points = camera.positions(np.where(mask, heights, 0.0))[mask].astype(np.float32)
+        field, above, ways = _straighten(field, mask, points + np.float32(_OFFSET) * unit, ways, camera)
+    lit = np.ones(ways.shape[:2], np.bool_)
+    _shadows(field, above, np.ascontiguousarray(ways), lit)
     factors = np.zeros((len(points), len(points)), np.float32)
     area = (1.0 / np.maximum(unit[:, 2], _STEEPEST)).astype(np.float32)
     _form_factors(field, points, above, unit, area, factors)
     factors /= np.maximum(factors.sum(axis=1, keepdims=True), 1.0)
     return Transport(lit, factors)
+
+
+def _straighten(
+    field: np.ndarray, mask: np.ndarray, above: np.ndarray, ways: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return heights s, points above the surface and ways of rays where what a pinhole sees is a height field.
+
+    Args:
+        field: (H, W) z, -inf outside the mask.
+        mask: (H, W) bool.
+        above: (P, 3) positions.
+        ways: (P, L, 3) directions.
+        camera: The pinhole.
+    """
+    focal, (column, row) = np.float32(camera.focal), camera.middle(mask.shape)
+    nearer = np.where(mask, field / (1 - field / focal), -np.inf).astype(np.float32)
+    seen = above / (1 - above[:, 2:] / focal)
+    straight = ways + seen[:, None] * (ways[..., 2:] / focal)
+    return nearer, (seen + np.array([column, -row, 0.0])).astype(np.float32), straight.astype(np.float32)
 
 
 @numba.njit(cache=True)
@@ -111,9 +139,10 @@ def _shadows(field: np.ndarray, points: np.ndarray, lights: np.ndarray, lit: np.
     top = field.max()
     for p in numba.prange(len(points)):
         start = (points[p, 0], points[p, 1], points[p, 2])
-        for i in range(len(lights)):
-            pace = max(abs(lights[i, 0]), abs(lights[i, 1]), _LEAST_PACE)  # so that a step is a pixel long
-            way = (lights[i, 0] / pace, lights[i, 1] / pace, lights[i, 2] / pace)
+        for i in range(lights.shape[1]):
+            x, y, z = lights[p, i]
+            pace = max(abs(x), abs(y), _LEAST_PACE)  # so that a step is a pixel long
+            way = (x / pace, y / pace, z / pace)
             steps = field.shape[0] + field.shape[1]
             if way[2] > 0:
                 steps = min(steps, int((top - start[2]) / way[2]) + 2)

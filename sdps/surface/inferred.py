@@ -79,7 +79,8 @@ class Inference:
     @cached_property
     def depth(self) -> Depth:
         """The surface the normals belong to, by least squares."""
-        return integrate(self.normals, self.photos.mask, discontinuities=self.discontinuities)
+        photos = self.photos
+        return integrate(self.normals, photos.mask, camera=photos.camera, discontinuities=self.discontinuities)
 
     @cached_property
     def albedo(self) -> np.ndarray | None:  # (H, W, 3)
@@ -145,7 +146,7 @@ class Inference:
     def summary(self) -> dict[str, Any]:
         """Return what a reader needs to judge the result, JSON ready."""
         photos = self.photos
-        facts = {
+        facts: dict[str, Any] = {
             "verdict": self.verdict,
             "method": self.method,
             "weights": {name: str(path) for name, path in self.files.items()},
@@ -159,11 +160,12 @@ class Inference:
             "mask_pixels": int(photos.mask.sum()),
             "light_directions": "found" if photos.light_directions is None else "given",
             "light_intensities": "found" if photos.intensities is None else "given",
-            "camera": "orthographic, looking along -z",
+            "camera": photos.camera_summary,
+            **({"pixel_size": photos.pixel_size} if photos.pixel_size else {}),
             "frame": "x right, y up, z to the camera; lights from the surface to the light",
-            "depth": {"unit": "pixels towards the camera", "components": self.depth.components,
+            "depth": {"unit": f"{_unit(photos)} towards the camera", "components": self.depth.components,
                       "residual_degrees": round(self.depth.residual, 3)},
-            "mesh": {"every": step_of(photos.mask)},
+            "mesh": {"every": step_of(photos.mask)} | ({"unit": _unit(photos)} if photos.pixel_size else {}),
             "seconds": round(self.seconds, 2),
             "notes": list(photos.notes),
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
@@ -228,13 +230,14 @@ class Inference:
             _save_array(folder / "residual.npy", refined.pixel_residual)
         if self.expected_error is not None:
             _save_array(folder / "expected-error.npy", self.expected_error)
-        _save_array(folder / "depth.npy", self.depth.z)
+        size, every = self.photos.pixel_size, step_of(mask)
+        _save_array(folder / "depth.npy", self.depth.z * np.float32(size) if size else self.depth.z)
         colour = None
         if self.albedo is not None:  # for a screen, the brightest percent at white
             colour = np.concatenate([display(self.albedo[rows] / self._brightest) for rows in _bands(mask)])
         stage("meshes")
         release_memory()
-        surface = mesh(self.depth, colour=colour, normals=normals, every=step_of(mask))
+        surface = mesh(self.depth, millimetres=size, colour=colour, normals=normals, every=every)
         for number, suffix in enumerate(("ply", "obj", "glb"), start=1):
             write_mesh(surface, folder / f"mesh.{suffix}")
             stage("meshes", number, 3)
@@ -256,6 +259,11 @@ def check_out(out: Path, photographs: Path) -> None:
     """
     if out.resolve() == photographs.resolve():
         raise InputError(f"--out {out}: holds the photographs; choose another folder")
+
+
+def _unit(photos: Photographs) -> str:
+    """Return the unit of the files' depth."""
+    return "millimetres" if photos.pixel_size else "pixels"
 
 
 def _by_file(photos: Photographs, values: np.ndarray, digits: int) -> dict[str, float]:

@@ -72,12 +72,9 @@ def mesh(
     """
     camera = camera or (depth.camera if isinstance(depth, Depth) else ORTHOGRAPHIC)
     z, mask = _check(depth, mask, colour, normals)
-    height, width = mask.shape
-    few = slice(None, None, every), slice(None, None, every)
+    shape, few = mask.shape, (slice(None, None, every),) * 2
     z, mask = z[few] / np.float32(every), mask[few]
-    index = np.full(mask.shape, -1, np.int64)
-    index[mask] = np.arange(mask.sum())
-    faces = _triangles(z, index)
+    faces = _triangles(z, _number(mask))
     rows, columns = np.nonzero(mask)
     if steepest is not None:
         faces = _no_walls(faces, np.stack([columns, rows, z[mask]], axis=-1).astype(np.float64), steepest)
@@ -85,14 +82,19 @@ def mesh(
         raise InputError("no three neighbouring mask pixels make a triangle; mark a larger object, or raise steepest")
     used, faces = np.unique(faces, return_inverse=True)
     rows, columns = rows[used], columns[used]
-    places = camera.place((height, width), every * rows, every * columns, every * z[rows, columns])
+    places = camera.place(shape, every * rows, every * columns, every * z[rows, columns])
     return trimesh.Trimesh(
-        vertices=places * (millimetres or unit_scale((height, width))),
-        faces=faces.reshape(-1, 3),
+        vertices=places * (millimetres or unit_scale(shape)), faces=faces.reshape(-1, 3),
         vertex_normals=None if normals is None else np.asarray(normals[few][rows, columns], np.float64),
-        vertex_colors=None if colour is None else colour[few][rows, columns],
-        process=False,
-    )
+        vertex_colors=None if colour is None else colour[few][rows, columns], process=False,
+    )  # fmt: skip
+
+
+def _number(mask: np.ndarray) -> np.ndarray:  # (H, W) int64
+    """Return the numbers of a mask's pixels, -1 outside."""
+    index = np.full(mask.shape, -1, np.int64)
+    index[mask] = np.arange(mask.sum())
+    return index
 
 
 def _no_walls(faces: np.ndarray, corners: np.ndarray, steepest: float) -> np.ndarray:

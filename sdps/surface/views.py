@@ -38,9 +38,10 @@ def depth_normals(depth: Depth) -> np.ndarray:
 def turned(depth: Depth, degrees: float, height: int, *, colour: np.ndarray | None = None) -> np.ndarray:
     """Draw the surface as seen by a viewer who has walked `degrees` to the right around it.
 
-    The picture is orthographic, shaded by the normals of the depth itself, so that it shows what was integrated. Since
-    the turn is about the vertical axis, every image row stays a row: its pixels' polyline is drawn segment by segment,
-    the nearest wins, and what faces away is left out. There is no surface behind the visible one.
+    The picture is orthographic, and so is the surface in it, every pixel at its place in the photograph. It is shaded
+    by the normals of the depth itself, so that it shows what was integrated. Since the turn is about the vertical axis,
+    every image row stays a row: its pixels' polyline is drawn segment by segment, the nearest wins, and what faces away
+    is left out. There is no surface behind the visible one.
 
     Args:
         depth: Of `integrate`.
@@ -79,7 +80,8 @@ def _of_the_box(depth: Depth, colour: np.ndarray | None, side: int) -> tuple[Dep
     every = max(1, int(max(np.ptp(rows), np.ptp(columns))) // side)
     few = slice(rows[0], rows[-1] + 1, every), slice(columns[0], columns[-1] + 1, every)
     z = depth.z[few] if every == 1 else depth.z[few] / np.float32(every)
-    return replace(depth, z=z, mask=depth.mask[few]), None if colour is None else colour[few]
+    camera = depth.camera.crop(depth.mask.shape, int(rows[0]), int(columns[0])).scale(1.0 / every)
+    return replace(depth, z=z, mask=depth.mask[few], camera=camera), None if colour is None else colour[few]
 
 
 def strip(

@@ -19,7 +19,7 @@ from sdps.core.losses import NormalCriterion, masked_normal_loss
 from sdps.core.metrics import angle_degrees, direction_mae, intensity_error
 from sdps.data.dataset import Batch, SampleOptions
 from sdps.models import registry
-from sdps.models.base import FusionNetwork, LightingNetwork, Lights, Truth
+from sdps.models.base import FusionNetwork, LightingNetwork, Lights, Placement, Truth
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.lcnet import resize_input
 from sdps.models.registry import TRUE_LIGHTS
@@ -183,7 +183,8 @@ class NormalStage(Stage):
         lights, config = self.training_lights(batch), self.config
         side = config.crop or config.size
         images, mask, normals = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
-        seen = self.network.observe(images, mask, lights)
+        placement = Placement(*(crop(part, batch.corner, side) for part in flatten_some(placed(batch), batch.seed)))
+        seen = self.network.observe(images, mask, lights, placement=placement)
         weights = config.gradient_weight, config.lighting_weight, config.expected_weight
         truth = Truth(normals, mask, batch.directions, batch.intensities)
         return self.network.loss(seen, truth, NormalCriterion(config.loss, *weights))
@@ -191,14 +192,14 @@ class NormalStage(Stage):
     def metrics(self, batch: Batch) -> dict[str, float]:
         """Return the normal MAE on whole images, and the errors of lights that a model found or that were drawn."""
         lights = self.lights(batch)
-        normals = self.network(self.network.observe(batch.images, batch.mask, lights))
+        normals = self.network(self.network.observe(batch.images, batch.mask, lights, placement=placed(batch)))
         values = {
             "loss": float(masked_normal_loss(normals, batch.normals, batch.mask)),
             "normal_mae": normal_error(normals, batch),
         }
         if lights is not None and self.config.light_error:
             drawn = disturb(lights, batch.seed.tolist(), self.config.light_error)
-            seen = self.network.observe(batch.images, batch.mask, drawn)
+            seen = self.network.observe(batch.images, batch.mask, drawn, placement=placed(batch))
             values |= light_errors(drawn, batch, "_drawn")
             values["normal_mae_drawn"] = normal_error(self.network(seen), batch)
         return values | self.light_scores(lights, batch)
@@ -208,6 +209,8 @@ class NormalStage(Stage):
         return {} if lights is None or self.lighting is None else light_errors(lights, batch, "")
 
 
+_FLAT = 0.3
+"""Share of the training samples whose depth is not known."""
 _BENT, _SCATTERED, _UNEVEN = 0.10, 0.06, 0.08
 """How far `disturb` moves lights: all alike, each by itself, and in intensity."""
 _STRAYED = math.degrees(math.sqrt(math.pi / 2 * (_BENT**2 + _SCATTERED**2)))
@@ -237,6 +240,18 @@ def disturb(lights: Lights, seeds: list[int], limit: float) -> Lights:
     errors = torch.from_numpy(np.stack(expected)).to(lights.intensities)
     directions = functional.normalize(moved, dim=-1)
     return lights._replace(directions=directions, intensities=lights.intensities * factors, expected_error=errors)
+
+
+def placed(batch: Batch) -> Placement:
+    """Return where the pixels of a batch's scenes lie."""
+    return Placement(batch.places, batch.sights)
+
+
+def flatten_some(placement: Placement, seeds: Tensor) -> Placement:
+    """Return where pixels are taken to lie: of some scenes nothing is known of their depth yet, as at first in use."""
+    drawn = [float(generator(seed, "flat").random() >= _FLAT) for seed in seeds.tolist()]
+    known = torch.tensor([[1.0, 1.0, share] for share in drawn]).to(placement.places)  # (B, 3)
+    return placement._replace(places=placement.places * known[..., None, None])
 
 
 def true_lights(batch: Batch) -> Lights:

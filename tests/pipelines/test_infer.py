@@ -284,6 +284,49 @@ def test_a_scale_takes_less_of_everything(hills: tuple, tmp_path: Path, capsys) 
     assert json.loads((tmp_path / "half" / "result.json").read_text())["scale"] == 0.5
 
 
+def test_a_focal_length_bends_the_surface_and_a_pixel_size_measures_it(hills: tuple, tmp_path: Path, capsys) -> None:
+    folder, _, mask = hills
+    flags = ["--lights", folder / "known.txt", "--frame", "y-down", "--method", "least-squares", "--no-refine", "--out"]
+
+    def run(name: str, *more: str) -> tuple[str, dict, np.ndarray, np.ndarray]:
+        assert main(["infer", str(folder), *map(str, flags), str(tmp_path / name), *more]) == 0
+        surface = trimesh.load(tmp_path / name / "mesh.ply", process=False)
+        facts = json.loads((tmp_path / name / "result.json").read_text())
+        return capsys.readouterr().out, facts, np.load(tmp_path / name / "depth.npy"), np.asarray(surface.vertices)
+
+    text, facts, depth, _ = run("plain")
+    assert "64x64; the camera is taken for orthographic" in text and "pixel_size" not in facts
+    assert facts["camera"] == "orthographic, looking along -z" and facts["mesh"] == {"every": 1}
+    text, facts, near, points = run("near", "--focal", "80px", "--pixel-size", "0.5")
+    assert "64x64; the camera is perspective, focal length 80 px (--focal)" in text
+    assert facts["camera"] == "perspective, focal length 80 px (--focal)" and facts["pixel_size"] == 0.5
+    assert facts["depth"]["unit"] == "millimetres towards the camera" and facts["mesh"]["unit"] == "millimetres"
+    assert "The camera is perspective, focal length 80 px" in (tmp_path / "near" / "report.html").read_text()
+    assert np.abs(near[mask] / 0.5 - depth[mask]).max() > 0.5
+    rows, columns = np.nonzero(mask)
+    assert points[:, 2] == pytest.approx(near[rows, columns], abs=1e-4)
+    assert points[:, 0] == pytest.approx((columns - 31.5) * 0.5 * (1 - near[rows, columns] / 40.0), abs=1e-4)
+    assert np.array_equal(np.load(tmp_path / "near" / "normal.npy"), np.load(tmp_path / "plain" / "normal.npy"))
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        ("--focal=0", "--focal 0: must be above 0"),
+        ("--focal=28", "28 pixels are too few"),
+        ("--focal=28inch", "unknown unit of --focal 'inch'; known: mm, px"),
+        ("--principal=5", "--principal 5: must be two numbers"),
+        ("--pixel-size=0", "--pixel-size 0: must be above 0"),
+    ],
+)
+def test_a_camera_that_is_none_is_one_line(hills: tuple, tmp_path: Path, capsys, flags: str, said: str) -> None:
+    folder = hills[0] if flags != "--focal=28" else tmp_path / "wide"
+    if flags == "--focal=28":
+        folders.write_folder(folder, folders.plate(LIGHTS[:3], shape=(64, 160))[0])
+    assert said in fails(capsys, folder, flags, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("scale", ["0", "1.5", "-1", "nan", "half", "0,5", ""])
 def test_a_scale_that_is_none_is_one_line(hills: tuple, tmp_path: Path, capsys, scale: str) -> None:
     assert "scale" in fails(capsys, hills[0], f"--scale={scale}", "--out", tmp_path / "out")

@@ -67,7 +67,7 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
         "intensities": grey(result.gains).round(4).tolist() if found else [],
         "confidence": [confidence[name] for name in result.photos.files] if confidence else [],
         "components": result.depth.components, "integrability": facts["depth"]["residual_degrees"],
-        "residual": facts.get("lambertian_residual"),
+        "residual": facts.get("lambertian_residual"), "camera": facts["camera"],
     }  # fmt: skip
 
 

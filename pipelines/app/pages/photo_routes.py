@@ -126,6 +126,7 @@ async def start_task(request: Request) -> Response:
         arguments |= {"number": latest, "method": str(asked.get("method", "auto"))[:80]}
         arguments |= {key: asked.get(key) is True for key in ("refine", "anyway", "discontinuities")}
         arguments["scale"] = float(_read_choice(asked, "scale", _SCALES))
+        arguments["focal"] = str(asked.get("focal") or "")[:40]
     try:
         return queue_task(request, task, **arguments)
     except Refused:

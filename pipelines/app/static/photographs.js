@@ -119,6 +119,7 @@ async function infer(event) {
   const asked = { ...options(), method: $("method").value };
   for (const name of ["refine", "discontinuities", "anyway"]) asked[name] = $(name).checked;
   asked.scale = $("scale").value;
+  asked.focal = $("focal").value;
   try {
     if (!$("mask-use").disabled) await ask(inSet("mask"), { method: "PUT", body: await painter.blob() });
     const found = await follow(await post(inSet("start/infer"), asked), $("run-status"), "Surface");
@@ -140,6 +141,7 @@ async function show(run) {
     return button;
   }));
   const facts = [`method: ${run.method}`, `${seconds(run.seconds)}`, `${run.components} part${run.components > 1 ? "s" : ""}`, `integrability: ${run.integrability}°`];
+  if (run.camera?.startsWith("perspective")) facts.push(`camera: ${run.camera}`);
   if (run.residual !== null) facts.push(`deviation from Lambert's law: ${run.residual}`);
   if (run.error !== null) facts.push(`error of the normals: ${run.error}°`);
   $("verdict").hidden = !run.verdict;

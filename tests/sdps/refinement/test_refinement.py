@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from render.shared.errors import InputError
+from sdps.core.geometry import turn_to_sight
 from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
 from sdps.methods.parse import parse
@@ -16,6 +17,7 @@ from sdps.refinement.image_model import State, build_model, measure_differences
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.refined import Refined
 from sdps.refinement.reflectance import LOBES, MODES
+from sdps.refinement.sites import Sites
 from sdps.refinement.trust import RefinedEstimate
 
 QUICK = RefineConfig(coarse_pixels=700, iterations=600, bounces=0, fine_iterations=0)  # nothing here shades itself
@@ -81,22 +83,35 @@ def random_state(pixels: int, lights: int, seed: int = 0) -> tuple[State, torch.
         torch.randn(pixels, 3) * 0.5 + front, torch.randn(pixels, 3) * 0.3 - 1.0, torch.randn(pixels) * 0.3,
         torch.tensor([-0.8, 0.6, -0.5, -1.2]), torch.randn(LOBES), torch.linspace(5.7, 2.3, LOBES),
         torch.randn(lights, 3) * 0.5 + front, torch.randn(lights, 3) * 0.2, torch.tensor(0.3),
-        torch.zeros(MODES),
+        torch.zeros(MODES), torch.tensor(-1.2), torch.randn(lights) * 0.1,
     )  # fmt: skip
     return state, torch.rand(pixels, 3, lights), (torch.rand(pixels, lights) > 0.1).float()
 
 
-def test_the_fused_term_and_its_gradient_are_those_of_the_plain_one() -> None:
+def random_sites(pixels: int, seed: int = 1) -> Sites:
+    """Return pixels that a camera of 40 degrees sees."""
+    torch.manual_seed(seed)
+    sights = torch.cat([torch.rand(pixels, 2) * 0.7 - 0.35, torch.ones(pixels, 1)], dim=1)
+    return Sites(torch.rand(pixels, 3) * 1.6 - 0.8, sights, turn_to_sight(sights))
+
+
+@pytest.mark.parametrize("near", [False, True], ids=["distant", "near"])
+def test_the_fused_term_and_its_gradient_are_those_of_the_plain_one(near: bool) -> None:
     state, images, usable = random_state(200, 13)
     plain = State(*(part.double().requires_grad_() for part in state))
     fused = State(*(part.clone().requires_grad_() for part in state))
-    slow = measure_differences(build_model(plain), images.double(), usable == 0.0).mean()
-    fast = data_term(build_model(fused), images, usable)
+    sites = random_sites(200) if near else None
+    exact = None if sites is None else Sites(*(part.double() for part in sites))
+    slow = measure_differences(build_model(plain), images.double(), usable == 0.0, exact).mean()
+    fast = data_term(build_model(fused), images, usable, sites)
     slow.backward()
     fast.backward()
     assert float(fast.detach()) == pytest.approx(float(slow.detach()), rel=1e-5)
     for name, one, other in zip(State._fields, plain, fused, strict=True):
         if name in ("whiteness", "modes"):  # not in the term: they are searched, not descended
+            continue
+        if name in ("log_nearness", "uneven") and not near:
+            assert one.grad is None and not other.grad.any()
             continue
         scale = float(one.grad.abs().max())
         assert float((one.grad - other.grad).abs().max()) < 1e-4 * scale, name

@@ -8,7 +8,7 @@ from sdps.core.metrics import angle_degrees
 from sdps.refinement.image_model import State, build_model
 from sdps.refinement.modes import ASSET, evaluate_modes, fit_modes
 from sdps.refinement.refine import RefineConfig, refine
-from sdps.refinement.reflectance import LOBES, MODES, SHAPES
+from sdps.refinement.reflectance import LOBES, MODES, SHAPES, evaluate_factor, measure_angles
 
 FABRIC = torch.tensor([0.1, -0.5, 0.3, 0.1, -0.6, 0.2])
 """Of the size that fitted materials have."""
@@ -31,13 +31,13 @@ def test_modes_that_images_were_made_with_are_found() -> None:
         normals=normals, log_albedo=torch.zeros(len(normals), 3), log_strength=torch.full((len(normals),), -20.0),
         body=torch.zeros(SHAPES), lobes=torch.full((LOBES,), -20.0), log_sharpness=torch.ones(LOBES),
         directions=lights, log_intensities=torch.zeros(len(lights), 3), whiteness=torch.tensor(0.0),
-        modes=torch.zeros(MODES),
+        modes=torch.zeros(MODES), log_nearness=torch.tensor(-torch.inf), uneven=torch.zeros(len(lights)),
     )  # fmt: skip
     model = build_model(state)
     shade = (normals @ lights.T).clamp_min(0.0)
-    images = (shade * evaluate_modes(normals, lights, FABRIC))[:, None].repeat(1, 3, 1)
-    found = evaluate_modes(normals, lights, fit_modes(model, images, torch.ones_like(shade)))
-    expected = evaluate_modes(normals, lights, FABRIC)
+    expected = evaluate_modes(model, FABRIC)
+    images = (shade * expected)[:, None].repeat(1, 3, 1)
+    found = evaluate_modes(model, fit_modes(model, images, torch.ones_like(shade)))
     ratio = torch.log(found / expected)[shade > 0.1]
     # A constant is the albedo's; what is left of the logarithms' spread:
     assert float(ratio.std()) < 0.3 * float(expected.log()[shade > 0.1].std())
@@ -45,7 +45,7 @@ def test_modes_that_images_were_made_with_are_found() -> None:
 
 def test_a_sphere_that_is_neither_matte_nor_glossy_keeps_its_shape(monkeypatch: pytest.MonkeyPatch) -> None:
     mask, normals, lights = sphere()
-    bent = evaluate_modes(torch.from_numpy(normals), torch.from_numpy(lights), FABRIC).numpy()
+    bent = evaluate_factor(measure_angles(normals, lights), FABRIC.numpy())
     images = np.zeros((len(lights), *mask.shape, 3), np.float32)
     images[:, mask] = (np.maximum(normals @ lights.T, 0.0) * bent).T[..., None] * [0.5, 0.4, 0.3]
     truth = np.zeros((*mask.shape, 3), np.float32)
@@ -53,7 +53,7 @@ def test_a_sphere_that_is_neither_matte_nor_glossy_keeps_its_shape(monkeypatch: 
     off = []
     for known in (False, True):
         if not known:
-            monkeypatch.setattr("sdps.refinement.descent.fit_modes", lambda *_: torch.zeros(MODES))
+            monkeypatch.setattr("sdps.refinement.descent.fit_modes", lambda *_, **__: torch.zeros(MODES))
         config = RefineConfig(coarse_pixels=800, iterations=200, iterations_before=0, fine_iterations=0)
         found = refine(images, mask, truth, lights, np.ones(len(lights)), config=config)
         off.append(float(angle_degrees(found.normals[mask], normals).mean()))

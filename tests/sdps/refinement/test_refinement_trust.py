@@ -44,7 +44,8 @@ def found(residual: float, lights: np.ndarray) -> Refined:
     return Refined(
         normals=normals, light_directions=lights, intensities=np.ones((len(lights), 3)), albedo=normals,
         strength=mask.astype(np.float32), body=np.zeros(4), amplitudes=np.zeros(8), sharpness=np.ones(8),
-        modes=np.zeros(6), pixel_residual=np.where(mask, residual, 0.0).astype(np.float32), image_residual=images,
+        modes=np.zeros(6), nearness=np.zeros(len(lights)), image_residual=images,
+        pixel_residual=np.where(mask, residual, 0.0).astype(np.float32),
     )  # fmt: skip
 
 

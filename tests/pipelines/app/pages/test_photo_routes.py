@@ -70,6 +70,21 @@ def test_from_files_to_a_zip(address: str, hills: Path) -> None:
         assert {"normal.npy", "mesh.ply", "report.html", "result.json", "relit/grazing.png"} <= set(opened.namelist())
 
 
+def test_a_focal_length_is_used(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+
+    def infer(focal: object) -> dict:
+        return client.wait(client.post(f"{path}/start/infer", {"method": "factorisation", "focal": focal}))
+
+    assert infer("50")["result"]["camera"] == "perspective, focal length 118 px (--focal)"  # of 72 x 72 pixels
+    assert infer("")["result"]["camera"] == "orthographic, looking along -z"
+    assert infer("400px")["result"]["camera"] == "perspective, focal length 400 px (--focal)"
+    for focal, said in (("0", "--focal 0mm: must be above 0"), (-3, "must be above 0"), ("wide", "unknown --focal")):
+        job = infer(focal)
+        assert job["state"] == "failed" and said in job["message"]
+
+
 def test_a_painted_mask_is_used(address: str, hills: Path) -> None:
     client = Client(address)
     path = client.new_set(hills)
