@@ -146,7 +146,7 @@ def _light_files(folder: Path) -> None:
     (folder / "meshroom.json").write_text(json.dumps({"lights": meshroom}))
     near = {"kind": "near", "unit": "mm", "object": [0, 0, -1], "positions": {name: row for name, *row in rows}}
     (folder / "near.yaml").write_text(json.dumps(near | {"intensities": dict.fromkeys(names, 1.0)}))
-    (folder / "near.txt").write_text(
+    (folder / "near.lp").write_text(
         "# near, unit cm, object 0 0 -2\n" + "".join("{} {} {}\n".format(*row) for row in 9 * vectors)
     )
     write_lights(folder / "near.json", names, vectors, np.ones(6), np.linspace(0.0, 0.5, 6))
