@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from render.shared.errors import InputError
+from sdps.classical.common.near_lamps import NearLamps
 from sdps.classical.common.observations import REC601, Observations, observe
 from sdps.classical.common.outlines import MIN_CONDITION, unit_normals
 from sdps.classical.common.weighted import solve_weighted
@@ -22,6 +23,7 @@ def least_squares(
     light_directions: np.ndarray,
     intensities: np.ndarray | None = None,
     *,
+    near: NearLamps | None = None,
     shadow_threshold: float = 0.0,
 ) -> Estimate:
     """Solve i_k = rho max(n . l_k, 0) in the least-squares sense for every pixel of the mask.
@@ -31,6 +33,8 @@ def least_squares(
         mask: (H, W) bool.
         light_directions: (L, 3), unit, from the surface to the light.
         intensities: (L,) or (L, 3) known intensities; equal ones when absent.
+        near: How near the lamps stand, with the pixels' places (H, W, 3); None: they are distant. Directions and
+            intensities are then those at the object's middle.
         shadow_threshold: Observations below this share of the pixel's brightest are taken for shadows and
             dropped, as long as three remain (0: keep all; 0.05 to 0.1 is usual).
 
@@ -44,16 +48,20 @@ def least_squares(
     """
     if not 0.0 <= shadow_threshold < 1.0:
         raise InputError(f"shadow_threshold must be in [0, 1), got {shadow_threshold}")
-    known = calibrate(images, mask, light_directions, intensities)
-    vectors = solve_plain(known.directions, known.profiles)
+    known = calibrate(images, mask, light_directions, intensities, near=near)
+    vectors = known.solve_plain(known.profiles)
     if shadow_threshold > 0.0:
         vectors = known.in_chunks(
-            lambda profiles, start: solve_weighted(
-                known.directions, profiles, profiles >= shadow_threshold * profiles.max(1, keepdims=True), start
+            lambda directions, profiles, start: solve_weighted(
+                directions, profiles, profiles >= shadow_threshold * profiles.max(1, keepdims=True), start
             ),
             vectors,
         )
     return known.conclude(vectors)
+
+
+Solver = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""Vectors (n, 3) of directions (L, 3) or (n, L, 3), profiles (n, L) and where to start (n, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,22 +70,41 @@ class Calibrated:
 
     Attributes:
         observations: The images at the object's pixels.
-        profiles: (P, L) float64, grey under lights of intensity 1.
+        profiles: (P, L) float64, grey under lights of intensity 1, at the pixel.
         directions: (L, 3) float64, unit.
         intensities: (L, 1) or (L, 3) float64.
+        near: How near the lamps stand, with the pixels' places (P, 3); None: they are distant.
     """
 
     observations: Observations
     profiles: np.ndarray
     directions: np.ndarray
     intensities: np.ndarray
+    near: NearLamps | None = None
 
-    def in_chunks(self, solve: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.ndarray) -> np.ndarray:
-        """Return `solve(profiles, start)` of all pixels in flat memory; `start` and the result are (P, 3)."""
-        pixels, count = self.profiles.shape
-        step = max(_CHUNK_VALUES // count, 1)
-        parts = (slice(begin, begin + step) for begin in range(0, pixels, step))
-        return np.concatenate([solve(self.profiles[part], start[part]) for part in parts])
+    def in_chunks(self, solve: Solver, start: np.ndarray) -> np.ndarray:
+        """Return `solve(directions, profiles, start)` of all pixels in flat memory; directions are (L, 3), or (n, L, 3)
+        of near lamps, `start` and the result (P, 3).
+        """
+        parts = _split(*self.profiles.shape)
+        return np.concatenate([solve(self._directions_at(part), self.profiles[part], start[part]) for part in parts])
+
+    def solve_plain(self, profiles: np.ndarray, pixels: np.ndarray | None = None) -> np.ndarray:  # (n, 3)
+        """Return the least-squares vectors of profiles (n, L) with all observations.
+
+        Args:
+            profiles: Of all pixels, or of `pixels`.
+            pixels: (n,) their numbers.
+        """
+        if self.near is None:
+            return profiles @ np.linalg.pinv(self.directions).T
+        pixels = np.arange(len(profiles)) if pixels is None else pixels
+        parts = _split(*profiles.shape)
+        return np.concatenate([_solve_near(self._directions_at(pixels[part]), profiles[part]) for part in parts])
+
+    def _directions_at(self, pixels: np.ndarray | slice) -> np.ndarray:
+        """Return directions (L, 3), or (n, L, 3) of near lamps at some pixels."""
+        return self.directions if self.near is None else self.near.at(pixels).reach(self.directions)[0]
 
     def conclude(self, vectors: np.ndarray, notes: Notes = NO_NOTES) -> Estimate:
         """Turn vectors (P, 3), albedo times normal, into an estimate with the given lights."""
@@ -97,13 +124,14 @@ def calibrate(
     light_directions: np.ndarray,
     intensities: np.ndarray | None = None,
     *,
+    near: NearLamps | None = None,
     weights: tuple[float, float, float] = REC601,
     minimum: int = 3,
 ) -> Calibrated:
     """Check images and lights, and divide out the intensities; errors as in `least_squares`.
 
     Args:
-        images, mask, light_directions, intensities: As for `least_squares`.
+        images, mask, light_directions, intensities, near: As for `least_squares`.
         weights: What R, G and B contribute to grey.
         minimum: Fewest images the method can work with.
     """
@@ -127,9 +155,22 @@ def calibrate(
         raise InputError("the light directions are coplanar; three that are not are needed")
     shares = np.array(weights if channels == 3 else (1.0,)) / intensities  # (L, C)
     profiles = np.einsum("lpc,lc->pl", observations.values, shares, optimize=True)
-    return Calibrated(observations, np.ascontiguousarray(profiles), directions, intensities)
+    profiles = np.ascontiguousarray(profiles)
+    if near is None:
+        return Calibrated(observations, profiles, directions, intensities)
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    near = near.at(observations.mask)
+    for part in _split(*profiles.shape):
+        profiles[part] /= near.at(part).reach(directions)[1]
+    return Calibrated(observations, profiles, directions, intensities, near)
 
 
-def solve_plain(directions: np.ndarray, profiles: np.ndarray) -> np.ndarray:  # (P, 3)
-    """Return the least-squares vectors of profiles (P, L) with all observations."""
-    return profiles @ np.linalg.pinv(directions).T
+def _split(pixels: int, count: int) -> list[slice]:
+    """Return parts of the pixels whose observations fit into flat memory."""
+    step = max(_CHUNK_VALUES // count, 1)
+    return [slice(begin, begin + step) for begin in range(0, pixels, step)]
+
+
+def _solve_near(directions: np.ndarray, profiles: np.ndarray) -> np.ndarray:  # (n, 3)
+    """Return the least-squares vectors of profiles (n, L) under directions (n, L, 3); zero where these are coplanar."""
+    return solve_weighted(directions, profiles, np.ones(profiles.shape), np.zeros((len(profiles), 3)))

@@ -11,6 +11,7 @@ import numpy as np
 
 from render.shared.config import build, read_yaml
 from render.shared.errors import InputError, unknown
+from sdps.classical.common.near_lamps import NearLamps
 from sdps.core.estimate import Estimate
 
 
@@ -66,6 +67,7 @@ def run(
     mask: np.ndarray,
     lights: np.ndarray | None = None,
     intensities: np.ndarray | None = None,
+    near: NearLamps | None = None,
     **options: Any,
 ) -> Estimate:
     """Run a method.
@@ -76,6 +78,7 @@ def run(
         mask: (H, W) bool.
         lights: (L, 3) directions from the surface to the light, for calibrated methods; others ignore them.
         intensities: (L,) or (L, 3) intensities, for calibrated methods; equal ones when absent.
+        near: How near the lamps stand, for calibrated methods; None: they are distant.
         options: Options of the method's function.
 
     Returns:
@@ -88,6 +91,8 @@ def run(
     if entry.calibrated and lights is None:
         raise InputError(f"{name} needs the light directions; give them, or choose an uncalibrated method")
     given = (lights, intensities) if entry.calibrated else ()
+    if entry.calibrated and near is not None:
+        options = {"near": near} | options
     start = time.perf_counter()
     estimate = entry.load()(images, mask, *given, **(entry.options | options))
     return replace(estimate, seconds=time.perf_counter() - start)

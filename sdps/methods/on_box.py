@@ -11,6 +11,7 @@ import numpy as np
 
 from render.shared.progress import repeat, stage
 from sdps.classical import registry as classical
+from sdps.classical.common.near_lamps import NearLamps
 from sdps.core.estimate import Estimate
 from sdps.inference.image_source import ImageSource, survey
 
@@ -29,20 +30,52 @@ def estimate_bytes(name: str, images: int, box: float) -> float:
 
 def run_on_box(name: str, images: ImageSource, mask: np.ndarray, given: tuple[Any, ...]) -> Estimate:
     """Run a classical method on the object's box; arguments as of `sdps.classical.registry.run`."""
-    scene = survey(images, mask, _MARGIN)
-    count = 1
-    if classical.METHODS[name].by_pixel:
-        count = min(ceil(_BYTES * len(images) * scene.mask.size / PART_BYTES), len(scene.mask))
-    normals, estimate = np.zeros((*mask.shape, 3), np.float32), None
-    for number in range(count):
-        rows = slice(number, None, count)
-        inside = scene.mask[rows]
-        if not inside.any():
-            continue
-        part = replace(scene, rows=slice(scene.rows.start + number, scene.rows.stop, count), mask=inside)
-        with repeat(number, count):
-            estimate = classical.run(name, part.read(0, len(images)), inside, *given)
-            stage("normals", 1, 1)
-        normals[scene.rows, scene.columns][rows] = estimate.normals
-    assert estimate is not None  # the mask is not empty
-    return replace(estimate, normals=normals)
+    return Box(name, images, mask).run(given)
+
+
+class Box:
+    """Images of an object's box, for one run of a classical method or several; read once where they fit into memory.
+
+    Args:
+        name: The method.
+        images: (L, H, W, 3).
+        mask: (H, W) bool.
+    """
+
+    def __init__(self, name: str, images: ImageSource, mask: np.ndarray) -> None:
+        self.name, self.mask, self.scene = name, mask, survey(images, mask, _MARGIN)
+        self.count = 1
+        self.kept: np.ndarray | None = None
+        if classical.METHODS[name].by_pixel:
+            pixels = self.scene.mask.size
+            self.count = min(ceil(_BYTES * len(images) * pixels / PART_BYTES), len(self.scene.mask))
+
+    def run(self, given: tuple[Any, ...], near: NearLamps | None = None) -> Estimate:
+        """Run the method; arguments as of `sdps.classical.registry.run`, `near` with the places of all pixels."""
+        scene, mask = self.scene, self.mask
+        lights, intensities = given or (None, None)
+        boxed = None if near is None else near.at((scene.rows, scene.columns))
+        normals, estimate = np.zeros((*mask.shape, 3), np.float32), None
+        for number in range(self.count):
+            rows = slice(number, None, self.count)
+            inside = scene.mask[rows]
+            if not inside.any():
+                continue
+            with repeat(number, self.count):
+                images, lamps = self._read(number, inside), None if boxed is None else boxed.at(rows)
+                estimate = classical.run(self.name, images, inside, lights, intensities, lamps)
+                stage("normals", 1, 1)
+            normals[scene.rows, scene.columns][rows] = estimate.normals
+        assert estimate is not None  # the mask is not empty
+        return replace(estimate, normals=normals)
+
+    def _read(self, number: int, inside: np.ndarray) -> np.ndarray:
+        """Read every `count`-th row of the box, from a number on; of all rows, once."""
+        if self.kept is not None:
+            return self.kept
+        scene = self.scene
+        part = replace(scene, rows=slice(scene.rows.start + number, scene.rows.stop, self.count), mask=inside)
+        images = part.read(0, len(scene))
+        if self.count == 1:
+            self.kept = images
+        return images

@@ -1,9 +1,11 @@
 """A method with its networks loaded: images in, normals and lights out."""
 
 import hashlib
+import logging
+import time
 from collections.abc import Callable, Hashable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +14,7 @@ import numpy as np
 from render.records.shards import file_hash
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
+from sdps.classical.common.near_lamps import are_near, settle
 from sdps.core.estimate import Estimate, constant_estimate
 from sdps.core.geometry import ORTHOGRAPHIC, Camera
 from sdps.core.metrics import score
@@ -19,13 +22,14 @@ from sdps.inference.estimator import Estimator, default_device, load_model
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.method import CONSTANT, NONE, VIEWS, Method
-from sdps.methods.on_box import run_on_box
+from sdps.methods.on_box import Box
 from sdps.models.registry import TRUE_LIGHTS
 
 if TYPE_CHECKING:
     from sdps.models.checkpoint import TrainedModel
 
 _digest = cache(file_hash)
+_log = logging.getLogger(__name__)
 _PLACES = ("lighting", "normals")
 Found = dict[tuple[Hashable, ...], Estimate]
 """Estimated lights by what they depend on."""
@@ -105,6 +109,7 @@ class Runner:
         """
         method = self.method
         given: dict[str, Any] = {}
+        _check_nearness(nearness, len(images))
         if method.lighting == TRUE_LIGHTS:
             given["lights"] = lights
         if TRUE_LIGHTS in (method.lighting, method.intensities) and intensities is not None:
@@ -146,7 +151,7 @@ class Runner:
         self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None,
         nearness: np.ndarray | None, camera: Camera,
     ) -> Estimate:  # fmt: skip
-        """Run a classical method, which holds the object's box of all images at once."""
+        """Run a classical method, which holds the object's box of all images at once; of near lamps, several times."""
         name = self.method.normals
         arguments: tuple[Any, ...] = ()
         if classical.METHODS[name].calibrated:
@@ -155,9 +160,19 @@ class Runner:
             else:
                 lit = self._lights(images, mask, given, found)
                 arguments = lit.light_directions, lit.intensities
+
+        began = time.perf_counter()
         if isinstance(images, np.ndarray):
-            return classical.run(name, images, mask, *arguments)
-        return run_on_box(name, images, mask, arguments)
+            run = partial(classical.run, name, images, mask, *arguments)
+        else:
+            run = partial(Box(name, images, mask).run, arguments)
+
+        if nearness is None or not are_near(nearness):
+            return run()
+        if not classical.METHODS[name].calibrated:
+            _log.warning("%s takes the lamps for distant; how near they stand is not used", name)
+            return run()
+        return replace(settle(lambda near: run(near=near), mask, nearness, camera), seconds=time.perf_counter() - began)
 
     def _refine(
         self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any], saturation: float,
@@ -200,6 +215,24 @@ class Runner:
         if found and intensities is not None:
             truth["intensities"] = intensities
         return {item.name: item.value for item in score(estimate, mask, **truth)}
+
+
+def _check_nearness(nearness: np.ndarray | None, count: int) -> None:
+    """Refuse what cannot be the nearness of so many lamps.
+
+    Raises:
+        InputError: another number of values, or one that is not from 0 to below 1.
+    """
+    if nearness is None:
+        return
+    if np.shape(nearness) != (count,):
+        raise InputError(f"{count} images need {count} values of light_nearness, got {np.shape(nearness)}")
+    wrong = ~((np.asarray(nearness) >= 0.0) & (np.asarray(nearness) < 1.0))
+    if wrong.any():
+        raise InputError(
+            f"light_nearness {np.asarray(nearness)[wrong][0]:g}: must be the object's radius over the lamp's distance, "
+            "from 0 (distant) to below 1 (the lamp would stand inside the object)"
+        )
 
 
 def _fill_config(config: InferenceConfig, method: Method) -> InferenceConfig:

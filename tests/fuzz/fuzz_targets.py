@@ -144,6 +144,12 @@ def _light_files(folder: Path) -> None:
                  "direction": [str(value) for value in (*(row[1:] * np.array([1, -1, -1])), *[0.1] * 6)]}
                 for number, row in enumerate(map(np.array, [(0.0, *row[1:]) for row in rows]))]  # fmt: skip
     (folder / "meshroom.json").write_text(json.dumps({"lights": meshroom}))
+    near = {"kind": "near", "unit": "mm", "object": [0, 0, -1], "positions": {name: row for name, *row in rows}}
+    (folder / "near.yaml").write_text(json.dumps(near | {"intensities": dict.fromkeys(names, 1.0)}))
+    (folder / "near.lp").write_text(
+        "# near, unit cm, object 0 0 -2\n" + "".join("{} {} {}\n".format(*row) for row in 9 * vectors)
+    )
+    write_lights(folder / "near.json", names, vectors, np.ones(6), np.linspace(0.0, 0.5, 6))
     images = [{"filename": name, "direction": dict(zip("xyz", vector, strict=True))} for name, *vector in rows]
     (folder / "project.relight").write_text(json.dumps({"images": images}))
 

@@ -91,6 +91,32 @@ def test_known_lights_with_y_down_give_the_normals(hills: tuple, tmp_path: Path,
     assert not list(tmp_path.glob(".infer-*"))
 
 
+def test_near_lamps_with_positions(hills: tuple, tmp_path: Path, capsys) -> None:
+    """The lamps of a file come out as they went in, and each mistake has its line."""
+    folder, _, _ = hills
+    places = [[round(float(value), 6) for value in 3.0 * light] for light in LIGHTS]
+    path, out = tmp_path / "near.yaml", tmp_path / "out"
+    path.write_text(json.dumps({"kind": "near", "unit": "objects", "positions": places}))
+    flags = ["--lights", path, "--intensities", "equal", "--method", "least-squares", "--anyway", "--out", out]
+    assert main(["infer", str(folder), *map(str, flags)]) == 0, capsys.readouterr().err
+    assert "its lamps stand 3 object sizes from the object's middle" in capsys.readouterr().out
+    stored = json.loads((out / "lights.json").read_text())
+    assert (stored["kind"], stored["unit"]) == ("near", "objects")
+    again, given = load(folder, lights=out / "lights.json"), load(folder, lights=path)
+    np.testing.assert_allclose(again.light_nearness, given.light_nearness, atol=1e-5)
+    np.testing.assert_allclose(again.light_nearness, 1 / 6, atol=1e-5)
+    np.testing.assert_allclose(again.light_directions, given.light_directions, atol=1e-5)
+    near = np.load(out / "normal.npy")
+    assert main(["infer", str(folder), *map(str, flags), "--light-distance", "far"]) == 0
+    assert list(json.loads((out / "lights.json").read_text())) == ["frame", "images"]
+    assert np.abs(np.load(out / "normal.npy") - near).max() > 0.01
+    capsys.readouterr()
+    assert "--pixel-size" in fails(capsys, folder, *flags, "--light-distance", "3m", "--lights", folder / "known.txt")
+    assert "inside the object" in fails(capsys, folder, "--light-distance", "0.4", "--out", out)
+    path.write_text(path.read_text().replace("objects", "inch"))
+    assert "unknown unit 'inch'" in fails(capsys, folder, *flags)
+
+
 def test_all_files_say_the_same(hills: tuple, tmp_path: Path, capsys) -> None:
     folder, _, mask = hills
     assert main(["infer", str(folder), "--method", "factorisation", "--out", str(tmp_path)]) == 0

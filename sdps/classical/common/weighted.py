@@ -13,10 +13,13 @@ def normal_equations(
     A batch of 3x3 systems instead of a loop over ragged ones; float64, but summed in the precision of the arguments.
 
     Args:
-        basis: (L, 3), the b_k, the same for all rows.
+        basis: (L, 3), the b_k, the same for all rows; or (P, L, 3), those of each row.
         values: (P, L).
         weights: (P, L), not negative; floating point.
     """
+    if basis.ndim == 3:
+        weighted = np.swapaxes(basis * weights[..., None], 1, 2)  # (P, 3, L)
+        return weighted @ basis, (weighted @ values[..., None])[..., 0].astype(np.float64)
     first, second = np.triu_indices(3)  # A is symmetric
     moments = weights @ (basis[:, first] * basis[:, second])  # (P, 6)
     matrices = np.empty((len(values), 3, 3))
@@ -30,7 +33,7 @@ def solve_weighted(
     """Return argmin_b sum_k w_k (i_k - b . l_k)^2 for every pixel, from its normal equations.
 
     Args:
-        directions: (L, 3).
+        directions: (L, 3), or (P, L, 3) of near lamps.
         profiles: (P, L).
         weights: (P, L), not negative.
         fallback: (P, 3), for pixels where fewer than three observations, or coplanar ones, have weight.
