@@ -105,7 +105,8 @@ def _straighten(
         camera: The pinhole.
     """
     focal, (column, row) = np.float32(camera.focal), camera.middle(mask.shape)
-    nearer = np.where(mask, field / (1 - field / focal), -np.inf).astype(np.float32)
+    finite = np.where(mask, field, 0.0)
+    nearer = np.where(mask, finite / (1 - finite / focal), -np.inf).astype(np.float32)
     seen = above / (1 - above[:, 2:] / focal)
     straight = ways + seen[:, None] * (ways[..., 2:] / focal)
     return nearer, (seen + np.array([column, -row, 0.0])).astype(np.float32), straight.astype(np.float32)
