@@ -26,7 +26,7 @@ from tqdm import tqdm
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.core.estimate import Estimate
-from sdps.core.geometry import ORTHOGRAPHIC, Camera
+from sdps.core.geometry import ORTHOGRAPHIC, Camera, Rig
 from sdps.inference.estimator import check_lights
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
@@ -101,7 +101,7 @@ def infer(
         _stop(photos, findings, anyway)
     found = runner.estimate(
         photos, photos.mask, photos.light_directions, intensities, saturation=photos.saturation,
-        nearness=photos.light_nearness, each=photos.nearness_each, camera=photos.camera,
+        rig=Rig(photos.camera, photos.light_nearness, photos.nearness_each),
     )  # fmt: skip
     seconds = time.perf_counter() - began
     return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
@@ -161,7 +161,7 @@ def estimate(
         seen = see_lights(images, mask, _finder(models), config)
         intensities, _ = question_lights(images, mask, light_directions, None, seen)
     return runner.estimate(
-        images, mask, light_directions, intensities, saturation=saturation, nearness=light_nearness, camera=camera
+        images, mask, light_directions, intensities, saturation=saturation, rig=Rig(camera, light_nearness)
     )
 
 

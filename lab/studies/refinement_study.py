@@ -33,8 +33,8 @@ from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.parse import parse
 from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
+from sdps.refinement.image_model import Refined
 from sdps.refinement.refine import refine
-from sdps.refinement.refined import Refined
 from sdps.refinement.trust import NORMAL, Trust, features, trust
 
 _PRESET = Path(__file__).with_suffix(".yaml")

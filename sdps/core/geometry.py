@@ -122,6 +122,47 @@ ORTHOGRAPHIC = Camera()
 
 
 @dataclass(frozen=True, eq=False)
+class Rig:
+    """What is known of the camera and the lamps.
+
+    Attributes:
+        camera: The camera.
+        nearness: (L,) rho of the lamps, zeros for distant ones; None where it is not known.
+        each: Where it is not known, each lamp may have a distance of its own.
+    """
+
+    camera: Camera = ORTHOGRAPHIC
+    nearness: np.ndarray | None = None
+    each: bool = False
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether all lamps are known to be distant, and lines of sight are parallel."""
+        return self.nearness is not None and not np.any(self.nearness) and not self.camera.is_perspective
+
+    def check(self, count: int) -> None:
+        """Refuse what cannot be the nearness of so many lamps.
+
+        Raises:
+            InputError: another number of values, or one that is not from 0 to below 1.
+        """
+        if self.nearness is None:
+            return
+        if np.shape(self.nearness) != (count,):
+            raise InputError(f"{count} images need {count} values of light_nearness, got {np.shape(self.nearness)}")
+        values = np.asarray(self.nearness)
+        wrong = ~((values >= 0.0) & (values < 1.0))
+        if wrong.any():
+            raise InputError(
+                f"light_nearness {values[wrong][0]:g}: must be the object's radius over the lamp's distance, from 0 "
+                "(distant) to below 1 (the lamp would stand inside the object)"
+            )
+
+
+UNKNOWN = Rig()
+
+
+@dataclass(frozen=True, eq=False)
 class Capture:
     """An object before its camera.
 

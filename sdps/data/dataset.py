@@ -166,14 +166,7 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     """
     # A child of the stream, so that the number does not depend on how much the sample draws.
     seed = int(rng.spawn(1)[0].integers(2**63))
-    directions = scene.light_directions()
-    if len(stored.images) != len(directions):
-        raise InputError(f"scene {scene.id}: {len(stored.images)} images for {len(directions)} lights; render it again")
-    chosen = None if options.augmentation.mixed is not None else choose_images(directions, options, rng)
-    if chosen is not None:
-        images, directions = stored.images[chosen].astype(np.float32), directions[chosen]  # (Q, H, W, 3)
-    else:
-        images, directions = _mix(scene, stored.images, options, rng)
+    images, directions, chosen = _draw_images(scene, stored.images, options, rng)
     normals, mask = stored.normals, stored.mask
     layout = lay_out(scene, stored.depth, mask, chosen)
     if options.augmentation.symmetries:
@@ -205,6 +198,19 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
 def _channels_first(pictures: np.ndarray) -> Tensor:  # (..., 3, H, W) float32
     """Return pictures (..., H, W, 3) as networks take them."""
     return torch.from_numpy(np.ascontiguousarray(np.moveaxis(pictures, -1, -3), dtype=np.float32))
+
+
+def _draw_images(
+    scene: SceneSpec, images: np.ndarray | PackedImages, options: SampleOptions, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return images (Q, H, W, 3) float32, directions (Q, 3), and which of a scene's they are; None: mixtures of all."""
+    directions = scene.light_directions()
+    if len(images) != len(directions):
+        raise InputError(f"scene {scene.id}: {len(images)} images for {len(directions)} lights; render it again")
+    if options.augmentation.mixed is not None:
+        return *_mix(scene, images, options, rng), None
+    chosen = choose_images(directions, options, rng)
+    return images[chosen].astype(np.float32), directions[chosen], chosen
 
 
 def _mix(

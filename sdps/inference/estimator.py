@@ -13,7 +13,7 @@ from render.shared.errors import InputError
 from render.shared.imaging.vectors import unit
 from render.shared.progress import repeat, share
 from sdps.core.estimate import Estimate
-from sdps.core.geometry import FAR, ORTHOGRAPHIC, Camera, Capture
+from sdps.core.geometry import FAR, UNKNOWN, Capture, Rig
 from sdps.core.integration import integrate
 from sdps.core.intensities import check_intensities, colour_balance, grey, scale_to_mean
 from sdps.core.precision import Arithmetic, arithmetic
@@ -41,7 +41,6 @@ class _Known(NamedTuple):
     directions: np.ndarray | None  # (L, 3), unit
     intensities: np.ndarray | None  # (L,), with the mean of the range of training
     balance: np.ndarray | None  # (L, 3), colours with mean 1
-    nearness: np.ndarray | None = None  # (L,)
     capture: Capture | None = None
 
 
@@ -99,8 +98,7 @@ class Estimator(InferenceConfig):
         intensities: np.ndarray | None = None,
         *,
         found: Estimate | None = None,
-        nearness: np.ndarray | None = None,
-        camera: Camera = ORTHOGRAPHIC,
+        rig: Rig = UNKNOWN,
     ) -> Estimate:
         """Estimate normals, and whichever of light directions and intensities are not given.
 
@@ -115,9 +113,8 @@ class Estimator(InferenceConfig):
             intensities: (L,) or (L, 3) known intensities, of any overall scale.
             found: What `estimate_lights` of an estimator with the same lighting networks and options gave for these
                 images and intensities; it saves estimating the lights again, and changes nothing else.
-            nearness: (L,) of the lamps (`sdps.core.geometry`), 0 of distant ones; None: what the lighting network
-                finds. Networks that do not see where pixels lie take lamps for distant, and cameras for orthographic.
-            camera: What the images were taken with.
+            rig: The camera, and the lamps' nearness where it is known; else it is what the lighting network finds.
+                Networks that do not see where pixels lie take lamps for distant, and cameras for orthographic.
 
         Returns:
             The estimate. Directions or intensities that nobody gave, estimated or assumed are empty, (0, 3) and (0,),
@@ -131,14 +128,15 @@ class Estimator(InferenceConfig):
             raise InputError("no lighting model was loaded, so light directions must be given")
         began = time.perf_counter() - (found.seconds if found is not None else 0.0)
         scene, known = self._prepare(images, mask, lights, intensities)
-        capture = Capture.of(scene.mask, camera.crop(mask.shape, scene.rows.start, scene.columns.start))
-        known = known._replace(nearness=nearness, capture=capture)
+        camera = rig.camera.crop(mask.shape, scene.rows.start, scene.columns.start)
+        known = known._replace(capture=Capture.of(scene.mask, camera))
         if found is None:
             found = self._estimate_lights(scene, known)
         elif known.directions is not None or len(found.light_directions) != len(scene):
             raise InputError("found holds lights of other images, or of images whose lights are given")
-        if nearness is not None:
-            found = replace(found, nearness=nearness.astype(np.float32) if (nearness >= FAR).any() else None)
+        if rig.nearness is not None:
+            near = np.asarray(rig.nearness, np.float32)
+            found = replace(found, nearness=near if (near >= FAR).any() else None)
         normals, expected, exposure = self._place_normals(scene, known, self._lights(found, known))
         return replace(
             found,

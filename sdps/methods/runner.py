@@ -16,7 +16,7 @@ from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.classical.common.near_lamps import are_near, settle
 from sdps.core.estimate import Estimate, constant_estimate
-from sdps.core.geometry import ORTHOGRAPHIC, Camera
+from sdps.core.geometry import UNKNOWN, Rig
 from sdps.core.metrics import score
 from sdps.inference.estimator import Estimator, default_device, load_model
 from sdps.inference.image_source import ImageSource
@@ -87,9 +87,7 @@ class Runner:
         found: Found | None = None,
         saturation: float = float("inf"),
         *,
-        nearness: np.ndarray | None = None,
-        each: bool = False,
-        camera: Camera = ORTHOGRAPHIC,
+        rig: Rig = UNKNOWN,
     ) -> Estimate:
         """Run the method; of the lights it sees what it is to be given.
 
@@ -100,42 +98,36 @@ class Runner:
             intensities: (L,) or (L, 3), or None where they are not known.
             found: Lights that methods found of these very images, by what they depend on; read, and added to.
             saturation: Radiance from which on a channel is clipped, which refinement then leaves out.
-            nearness: (L,) of the lamps (`sdps.core.geometry`), 0 of distant ones; None where it is not known.
-            each: Where it is not known, each lamp may have a distance of its own.
-            camera: What the images were taken with.
+            rig: What is known of the camera and the lamps' distance.
 
         Raises:
             InputError: images or lights the method cannot work with, in one line.
         """
         method = self.method
         given: dict[str, Any] = {}
-        _check_nearness(nearness, len(images))
+        rig.check(len(images))
         if method.lighting == TRUE_LIGHTS:
             given["lights"] = lights
         if TRUE_LIGHTS in (method.lighting, method.intensities) and intensities is not None:
             given["intensities"] = intensities
-        estimate = self._estimate(images, mask, given, found, nearness, camera)
-        if not method.refined:
-            return estimate
-        geometry = {"nearness": nearness, "each": each, "camera": camera}
-        return self._refine(images, mask, estimate, given, saturation, geometry)
+        estimate = self._estimate(images, mask, given, found, rig)
+        return self._refine(images, mask, estimate, given, saturation, rig) if method.refined else estimate
 
     def _estimate(
-        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None,
-        nearness: np.ndarray | None, camera: Camera,
-    ) -> Estimate:  # fmt: skip
+        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None, rig: Rig
+    ) -> Estimate:
         """Run the method proper on what it is given."""
         method = self.method
         if method.normals == CONSTANT:
             return constant_estimate(len(images), mask)
         if method.normals in classical.METHODS:
-            return self._classical(images, mask, given, found, nearness, camera)
+            return self._classical(images, mask, given, found, rig)
         if not method.normals:
             return self._lights(images, mask, given, found)
         if found is not None and method.lighting not in (NONE, TRUE_LIGHTS):
             given["found"] = self._lights(images, mask, given, found)
         assert self.estimator is not None  # the method has a normal model
-        return self.estimator.estimate(images, mask, **given, nearness=nearness, camera=camera)
+        return self.estimator.estimate(images, mask, **given, rig=rig)
 
     def _lights(self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None) -> Estimate:
         """Estimate the lights, or take what another method with the same lighting networks found."""
@@ -148,9 +140,8 @@ class Runner:
         return found[key]
 
     def _classical(
-        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None,
-        nearness: np.ndarray | None, camera: Camera,
-    ) -> Estimate:  # fmt: skip
+        self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None, rig: Rig
+    ) -> Estimate:
         """Run a classical method, which holds the object's box of all images at once; of near lamps, several times."""
         name = self.method.normals
         arguments: tuple[Any, ...] = ()
@@ -167,16 +158,17 @@ class Runner:
         else:
             run = partial(Box(name, images, mask).run, arguments)
 
-        if nearness is None or not are_near(nearness):
+        if rig.nearness is None or not are_near(rig.nearness):
             return run()
         if not classical.METHODS[name].calibrated:
             _log.warning("%s takes the lamps for distant; how near they stand is not used", name)
             return run()
-        return replace(settle(lambda near: run(near=near), mask, nearness, camera), seconds=time.perf_counter() - began)
+        found_near = settle(lambda near: run(near=near), mask, rig.nearness, rig.camera)
+        return replace(found_near, seconds=time.perf_counter() - began)
 
     def _refine(
         self, images: ImageSource, mask: np.ndarray, estimate: Estimate, given: dict[str, Any], saturation: float,
-        geometry: dict[str, Any],
+        rig: Rig,
     ) -> Estimate:  # fmt: skip
         """Refine an estimate, or keep it where refinement cannot be trusted; light directions it was given stay."""
         from sdps.refinement.refine import refine
@@ -192,7 +184,7 @@ class Runner:
         lit = given.get("lights") is not None
         refined = refine(
             images, mask, estimate.normals, estimate.light_directions, begun,
-            directions_given=lit, stray=self.config.stray_light, saturation=saturation, **geometry,
+            directions_given=lit, stray=self.config.stray_light, saturation=saturation, rig=rig,
         )  # fmt: skip
         expected = trust(refined, mask, estimate, given=lit)
         return choose(estimate, refined, expected)
@@ -215,24 +207,6 @@ class Runner:
         if found and intensities is not None:
             truth["intensities"] = intensities
         return {item.name: item.value for item in score(estimate, mask, **truth)}
-
-
-def _check_nearness(nearness: np.ndarray | None, count: int) -> None:
-    """Refuse what cannot be the nearness of so many lamps.
-
-    Raises:
-        InputError: another number of values, or one that is not from 0 to below 1.
-    """
-    if nearness is None:
-        return
-    if np.shape(nearness) != (count,):
-        raise InputError(f"{count} images need {count} values of light_nearness, got {np.shape(nearness)}")
-    wrong = ~((np.asarray(nearness) >= 0.0) & (np.asarray(nearness) < 1.0))
-    if wrong.any():
-        raise InputError(
-            f"light_nearness {np.asarray(nearness)[wrong][0]:g}: must be the object's radius over the lamp's distance, "
-            "from 0 (distant) to below 1 (the lamp would stand inside the object)"
-        )
 
 
 def _fill_config(config: InferenceConfig, method: Method) -> InferenceConfig:

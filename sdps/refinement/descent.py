@@ -150,10 +150,7 @@ def solve(
         pull = weights.near * _measure_misfit(float(loss.detach())) + weights.dark * faintness  # (P,)
         loss = loss + (pull * (1.0 - (model.normals * start.normals).sum(dim=1))).mean()
         loss = loss + _sum_priors(state, model, near, weights, part, problem.sites)
-        if "directions" in free:
-            loss = loss + _penalise_drift(state.directions, start.directions, weights, part)
-        if "uneven" in free:
-            loss = loss + weights.uneven * state.uneven.square().mean()
+        loss = loss + _hold_lamps(state, start.directions, free, weights, part)
         loss.backward()
         adam.step()
         _project(state, free)
@@ -204,9 +201,15 @@ def _sum_priors(
     return loss + weights.gloss * (measure_roughness(gloss, near) + weights.gloss_size * (gloss**2).mean())
 
 
-def _penalise_drift(directions: Tensor, start: Tensor, weights: Weights, part: float) -> Tensor:
-    stretch, shift = measure_drift(directions, start)
-    return stretch + _interpolate(weights.shift, part) * shift
+def _hold_lamps(state: State, start: Tensor, free: frozenset[str], weights: Weights, part: float) -> Tensor:
+    """Return the priors of what moves of the lamps; `start` holds their first directions."""
+    loss = start.new_zeros(())
+    if "directions" in free:
+        stretch, shift = measure_drift(state.directions, start)
+        loss = loss + stretch + _interpolate(weights.shift, part) * shift
+    if "uneven" in free:
+        loss = loss + weights.uneven * state.uneven.square().mean()
+    return loss
 
 
 def _interpolate(weight: tuple[float, float], part: float) -> float:

@@ -16,10 +16,9 @@ from sdps.core.geometry import Capture
 from sdps.inference.image_source import ObjectImages
 from sdps.inference.tiles import Tile
 from sdps.refinement.descent import Problem
-from sdps.refinement.image_model import State, build_model, measure_differences
+from sdps.refinement.image_model import Refined, State, build_model, measure_differences
 from sdps.refinement.modes import evaluate_modes
 from sdps.refinement.problems import build_problem, estimate_log_albedo, split_pixels
-from sdps.refinement.refined import Refined
 from sdps.refinement.sites import place_sites
 
 

@@ -14,15 +14,14 @@ import torch
 from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
-from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture, reach
+from sdps.core.geometry import UNKNOWN, Capture, Rig, reach
 from sdps.core.intensities import per_channel
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.inference.tiles import Tile, release_memory, tiles
 from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.fine import collect, upsample
-from sdps.refinement.image_model import Model, State, build_model
+from sdps.refinement.image_model import Model, Refined, State, build_model
 from sdps.refinement.problems import build_problem, estimate_log_albedo, gather_pixels
-from sdps.refinement.refined import Refined
 from sdps.refinement.reflectance import LOBES, MODES, SHAPES
 from sdps.refinement.sites import Grid, Sites, select_grid
 from sdps.refinement.transport import trace
@@ -77,9 +76,7 @@ def refine(
     intensities: np.ndarray,
     *,
     directions_given: bool = False,
-    nearness: np.ndarray | None = None,
-    each: bool = False,
-    camera: Camera = ORTHOGRAPHIC,
+    rig: Rig = UNKNOWN,
     config: RefineConfig | None = None,
     stray: bool = True,
     saturation: float = np.inf,
@@ -93,9 +90,7 @@ def refine(
         lights: (L, 3) unit directions from the surface to the light.
         intensities: (L,) or (L, 3).
         directions_given: Leave directions as they are. Intensities always move: they also absorb what the model misses.
-        nearness: (L,) rho of the lamps (`sdps.core.geometry`), which stays: zeros for distant lamps; None: found.
-        each: Each lamp has a distance of its own; otherwise those that are found are one.
-        camera: The camera.
+        rig: The camera, and the lamps' nearness where it is known; otherwise it is found.
         config: Iterations and rates.
         stray: Subtract stray light from the images.
         saturation: Radiance at which a channel is clipped; such observations are ignored.
@@ -110,22 +105,17 @@ def refine(
     parts = tiles(scene.mask, most, _HALO)
     values = gather_pixels(scene, scene.mask if len(parts) == 1 else select_grid(scene.mask, stride))
     problem = build_problem(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
-    capture = Capture.of(scene.mask, camera.crop(mask.shape, scene.rows.start, scene.columns.start))
-    grid = Grid(capture, scene.mask, stride)
-    if nearness is None or nearness.any() or camera.is_perspective:
+    capture = Capture.of(scene.mask, rig.camera.crop(mask.shape, scene.rows.start, scene.columns.start))
+    grid, free = Grid(capture, scene.mask, stride), _choose_free(directions_given, rig)
+    if not rig.is_plain:
         problem = problem._replace(sites=grid.sites())
     start_normals = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
-    given = {"directions": directions_given, "log_nearness": nearness is not None, "uneven": not each}
-    free = frozenset(State._fields) - {name for name, fixed in given.items() if fixed}
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
     with progress_bar(None, total=before + config.iterations + fine * len(parts), desc="refine") as bar:
         move = partial(solve, free=free, boost=config.boost, weights=Weights(), on_step=_advance(bar))
-        start = build_start(problem, start_normals, lights, gains, nearness)
+        start = build_start(problem, start_normals, lights, gains, rig.nearness)
         if before:
-            found = move(problem, start, iterations=before)
-            problem = _trace_light(problem, found, config.bounces, grid)
-            start = start._replace(log_nearness=found.log_nearness, uneven=found.uneven)
-            start = start._replace(log_albedo=estimate_log_albedo(problem, start))
+            problem, start = _trace_light(problem, start, move(problem, start, iterations=before), config.bounces, grid)
         state = move(problem, start, iterations=config.iterations)
         if stride == 1:
             return collect(scene, [(parts[0], problem, state)], state)
@@ -204,21 +194,35 @@ def build_start(
     return state._replace(log_albedo=estimate_log_albedo(problem, state))
 
 
-def _trace_light(problem: Problem, state: State, bounces: int, grid: Grid) -> Problem:
-    """Return the problem without observations in cast shadows, with bounced light, and with pixels in their places."""
-    model = build_model(state)
+def _choose_free(directions_given: bool, rig: Rig) -> frozenset[str]:
+    """Return which parts of the state move."""
+    known = rig.nearness is not None
+    fixed = {"directions": directions_given, "log_nearness": known, "uneven": known or not rig.each}
+    return frozenset(State._fields) - {name for name, stays in fixed.items() if stays}
+
+
+def _trace_light(
+    problem: Problem, start: State, found: State, bounces: int, grid: Grid
+) -> tuple[Problem, State]:  # fmt: skip
+    """Return the problem as light over the surface that was found shows it, and where to start once more.
+
+    Observations in cast shadows are left out, bounced light is known, pixels are in their places.
+    """
+    model = build_model(found)
     heights = grid.integrate(model.normals)
     if problem.sites is not None:
         problem = problem._replace(sites=grid.sites(heights))
     shade, ways = _shade_grid(model, problem.sites)
     normals, albedo = model.normals.numpy(), model.albedo.numpy()
-    found = trace(heights, problem.mask, normals, ways, grid.camera)
+    traced = trace(heights, problem.mask, normals, ways, grid.camera)
     brightest = float(np.quantile(albedo, _BRIGHTEST))
-    first, more = (found.bounce(shade, albedo / brightest, count) for count in (1, bounces))
+    first, more = (traced.bounce(shade, albedo / brightest, count) for count in (1, bounces))
     twice = float(more.sum() / max(first.sum(), 1e-9)) - 1.0
     first *= brightest
-    usable = problem.usable * torch.from_numpy(found.lit)
-    return problem._replace(usable=usable, bounced=torch.from_numpy(first), twice=twice)
+    usable = problem.usable * torch.from_numpy(traced.lit)
+    problem = problem._replace(usable=usable, bounced=torch.from_numpy(first), twice=twice)
+    start = start._replace(log_nearness=found.log_nearness, uneven=found.uneven)
+    return problem, start._replace(log_albedo=estimate_log_albedo(problem, start))
 
 
 def _shade_grid(model: Model, sites: Sites | None) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from scipy import ndimage
 from sdps.core.estimate import Estimate
 from sdps.core.geometry import FAR
 from sdps.core.metrics import angle_degrees
-from sdps.refinement.refined import Refined
+from sdps.refinement.image_model import Refined
 
 FEWEST_IMAGES = 8
 """With fewer, what a method found is kept."""

@@ -13,9 +13,8 @@ from sdps.methods import pretrained
 from sdps.methods.parse import parse
 from sdps.methods.runner import Runner
 from sdps.refinement.fused import data_term
-from sdps.refinement.image_model import State, build_model, measure_differences
+from sdps.refinement.image_model import Refined, State, build_model, measure_differences
 from sdps.refinement.refine import RefineConfig, refine
-from sdps.refinement.refined import Refined
 from sdps.refinement.reflectance import LOBES, MODES
 from sdps.refinement.sites import Sites
 from sdps.refinement.trust import RefinedEstimate

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import render_support as support
 
+from sdps.core.geometry import Rig
 from sdps.core.metrics import angle_degrees
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.transport import Transport, trace
@@ -100,8 +101,8 @@ def test_refinement_of_a_white_cavity_gains_from_bounced_light() -> None:
         images[:, mask] = light.transpose(2, 0, 1)
         config = RefineConfig(iterations=150, iterations_before=75, bounces=bounces)
         made = refine(
-            images, mask, true, lights, np.ones(16), directions_given=True, nearness=np.zeros(16), config=config,
-            stray=False,
+            images, mask, true, lights, np.ones(16), directions_given=True, config=config, stray=False,
+            rig=Rig(nearness=np.zeros(16)),
         )  # fmt: skip
         return float(angle_degrees(made.normals[mask], normals).mean())
 

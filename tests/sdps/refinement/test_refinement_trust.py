@@ -12,7 +12,7 @@ from sdps.methods import pretrained
 from sdps.methods.parse import parse
 from sdps.methods.runner import Runner
 from sdps.refinement import refine as refining
-from sdps.refinement.refined import Refined
+from sdps.refinement.image_model import Refined
 from sdps.refinement.trust import FEWEST_IMAGES, Trust, trust
 
 SIDE, COUNT = 24, 40
