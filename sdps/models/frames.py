@@ -81,8 +81,10 @@ class FusedMap(NamedTuple):
         """Return normals (B, 3, H, W) that lines of sight see in the camera's frame."""
         if self.sights is None:
             return normals
-        turns = turn_to_sight(self.sights.permute(0, 2, 3, 1))  # (B, H, W, 3, 3)
-        return (normals.permute(0, 2, 3, 1)[..., None, :] @ turns)[..., 0, :].permute(0, 3, 1, 2)
+        with torch.autocast(normals.device.type, enabled=False):
+            turns = turn_to_sight(self.sights.permute(0, 2, 3, 1).float())  # (B, H, W, 3, 3)
+            turned = normals.float().permute(0, 2, 3, 1)[..., None, :] @ turns
+        return turned[..., 0, :].permute(0, 3, 1, 2)
 
 
 class StagedNormals(NamedTuple):
@@ -266,9 +268,10 @@ def object_pixels(seen: Observations) -> tuple[Tensor, Pixels]:
 
 def see_lamps(pixels: Pixels, nearness: Tensor, own: Placement) -> Pixels:
     """Return pixels under lamps of nearness (N, Q) as their lines of sight see them; `own` holds (N, 3) each."""
-    off = pixels.directions - nearness[..., None] * own.places[:, None]  # (N, Q, 3)
-    squared = off.square().sum(dim=-1).clamp(min=_NEAREST)
-    towards = (off / squared.sqrt()[..., None]) @ turn_to_sight(own.sights).transpose(1, 2)
+    with torch.autocast(nearness.device.type, enabled=False):
+        off = pixels.directions.float() - nearness.float()[..., None] * own.places.float()[:, None]  # (N, Q, 3)
+        squared = off.square().sum(dim=-1).clamp(min=_NEAREST)
+        towards = (off / squared.sqrt()[..., None]) @ turn_to_sight(own.sights.float()).transpose(1, 2)
     return pixels._replace(values=pixels.values * squared[..., None], directions=towards)
 
 

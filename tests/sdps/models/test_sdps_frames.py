@@ -292,3 +292,18 @@ def test_lines_of_sight_turn_with_the_scene(trained, symmetry):
         theirs = trained.encode(turned)
     for one, other in zip(ours, theirs, strict=True):
         torch.testing.assert_close(one, other, atol=2e-4, rtol=1e-3)
+
+
+def test_near_lamps_are_seen_in_full_precision_under_autocast(trained):
+    seen = observations(6)
+    side = seen.images.shape[-1]
+    tilts = torch.rand(1, 3, side, side) * 0.4 - 0.2
+    tilts[:, 2] = 1.0
+    near = seen._replace(nearness=torch.full((1, 6), 0.2), placement=Placement(torch.randn(1, 3, side, side), tilts))
+    with torch.no_grad():
+        exact = object_pixels(near)[1].directions
+        with torch.autocast("cpu", torch.bfloat16):
+            rounded, normals = object_pixels(near)[1].directions, trained(near)
+    assert rounded.dtype == normals.dtype == torch.float32 and torch.equal(rounded, exact)
+    inside = seen.mask[0, 0] > 0.5
+    assert float((normals.norm(dim=1)[:, inside] - 1.0).abs().max()) < 1e-5
