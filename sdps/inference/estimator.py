@@ -41,7 +41,15 @@ class _Known(NamedTuple):
     directions: np.ndarray | None  # (L, 3), unit
     intensities: np.ndarray | None  # (L,), with the mean of the range of training
     balance: np.ndarray | None  # (L, 3), colours with mean 1
+    nearness: np.ndarray | None = None  # (L,)
     capture: Capture | None = None
+
+    def place_lamps(self, found: Estimate) -> Estimate:
+        """Return lights with the nearness that is known, if it is."""
+        if self.nearness is None:
+            return found
+        near = np.asarray(self.nearness, np.float32)
+        return replace(found, nearness=near if (near >= FAR).any() else None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,19 +114,16 @@ class Estimator(InferenceConfig):
         given no lights see the images as they are, even where lights are given.
 
         Args:
-            images: (L, H, W, 3), linear radiance of any overall scale, L >= 1, any size; an array, or anything that
-                gives the images of a slice. It is read several times, a few images at once.
+            images: (L, H, W, 3), linear, of any overall scale; an array, or anything that gives those of a slice.
             mask: (H, W) bool.
-            lights: (L, 3) known light directions.
-            intensities: (L,) or (L, 3) known intensities, of any overall scale.
+            lights, intensities: (L, 3) directions and (L,) or (L, 3) intensities that are known; of any overall scale.
             found: What `estimate_lights` of an estimator with the same lighting networks and options gave for these
                 images and intensities; it saves estimating the lights again, and changes nothing else.
             rig: The camera, and the lamps' nearness where it is known; else it is what the lighting network finds.
                 Networks that do not see where pixels lie take lamps for distant, and cameras for orthographic.
 
         Returns:
-            The estimate. Directions or intensities that nobody gave, estimated or assumed are empty, (0, 3) and (0,),
-            so that scoring them is refused.
+            The estimate. What nobody gave, estimated or assumed is empty, (0, 3) or (0,): scoring it is refused.
 
         Raises:
             InputError: sizes that do not fit, non-finite values, an empty mask, lights wanted without a lighting
@@ -127,16 +132,12 @@ class Estimator(InferenceConfig):
         if self.needs_lights and self.lighting is None and lights is None:
             raise InputError("no lighting model was loaded, so light directions must be given")
         began = time.perf_counter() - (found.seconds if found is not None else 0.0)
-        scene, known = self._prepare(images, mask, lights, intensities)
-        camera = rig.camera.crop(mask.shape, scene.rows.start, scene.columns.start)
-        known = known._replace(capture=Capture.of(scene.mask, camera))
+        scene, known = self._prepare(images, mask, lights, intensities, rig)
         if found is None:
             found = self._estimate_lights(scene, known)
         elif known.directions is not None or len(found.light_directions) != len(scene):
             raise InputError("found holds lights of other images, or of images whose lights are given")
-        if rig.nearness is not None:
-            near = np.asarray(rig.nearness, np.float32)
-            found = replace(found, nearness=near if (near >= FAR).any() else None)
+        found = known.place_lamps(found)
         normals, expected, exposure = self._place_normals(scene, known, self._lights(found, known))
         return replace(
             found,
@@ -170,8 +171,9 @@ class Estimator(InferenceConfig):
         return replace(found, precision=precision, stray_light=scene.stray, seconds=time.perf_counter() - began)
 
     def _prepare(
-        self, images: ImageSource, mask: np.ndarray, lights: np.ndarray | None, intensities: np.ndarray | None
-    ) -> tuple[ObjectImages, _Known]:
+        self, images: ImageSource, mask: np.ndarray, lights: np.ndarray | None, intensities: np.ndarray | None,
+        rig: Rig = UNKNOWN,
+    ) -> tuple[ObjectImages, _Known]:  # fmt: skip
         """Check the arguments of `estimate`; return the object's images, and what is known of the lights.
 
         Directions become of unit length; intensities, whose scale is their own, come to that of training.
@@ -185,7 +187,8 @@ class Estimator(InferenceConfig):
             scaled = scale_to_mean(np.asarray(intensities, np.float64), self._mean_intensity())
             strengths, colours = grey(scaled).astype(np.float32), colour_balance(scaled)
             balance = None if colours is None else colours.astype(np.float32)
-        return scene, _Known(directions, strengths, balance)
+        camera = rig.camera.crop(mask.shape, scene.rows.start, scene.columns.start)
+        return scene, _Known(directions, strengths, balance, rig.nearness, Capture.of(scene.mask, camera))
 
     def _estimate_lights(self, scene: ObjectImages, known: _Known) -> Estimate:
         """Return the lights, without normals: what is known, and what the lighting network finds of the rest.

@@ -80,7 +80,6 @@ class Problem(NamedTuple):
         twice: How much brighter further bounces would make it.
         corrected: The images are without bounced light, and divided by G.
         sites: Where the pixels lie; None: lamps are distant, the camera is orthographic.
-        heights: (H, W) z of the surface that light was traced on, in pixels of the grid; None before that.
     """
 
     mask: np.ndarray
@@ -91,7 +90,6 @@ class Problem(NamedTuple):
     twice: float = 0.0
     corrected: bool = False
     sites: Sites | None = None
-    heights: np.ndarray | None = None
 
     def remove_bounced(self, model: Model, whiteness: float) -> Tensor:  # (P, 3, L)
         """Return the images without bounced light, if the brightest parts have this albedo."""

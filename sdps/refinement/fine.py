@@ -12,19 +12,17 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from sdps.core.geometry import Capture
 from sdps.inference.image_source import ObjectImages
 from sdps.inference.tiles import Tile
 from sdps.refinement.descent import Problem
 from sdps.refinement.image_model import Refined, State, build_model, measure_differences
 from sdps.refinement.modes import evaluate_modes
 from sdps.refinement.problems import build_problem, estimate_log_albedo, split_pixels
-from sdps.refinement.sites import place_sites
+from sdps.refinement.sites import Grid, place_sites
 
 
 def upsample(
-    values: np.ndarray, scene: ObjectImages, tile: Tile, coarse: Problem, stride: int, state: State, full: np.ndarray,
-    capture: Capture,
+    values: np.ndarray, scene: ObjectImages, tile: Tile, coarse: Problem, grid: Grid, state: State, full: np.ndarray
 ) -> tuple[Problem, State]:  # fmt: skip
     """Return the problem of every pixel and the state there: interpolated between coarse pixels, but for the albedo.
 
@@ -32,24 +30,23 @@ def upsample(
         values: (P, 3, L) radiance of the outer part's pixels; divided in place.
         scene: The object.
         tile: Which part of it.
-        coarse: The coarse grid, of every `stride`-th pixel.
+        coarse: The pixels of the coarse grid.
+        grid: Where these lie.
         state: On the coarse grid.
         full: (3, L), radiance at which a channel is clipped.
-        capture: The whole object before its camera.
     """
     model, mask = build_model(state), scene.mask[tile.outer_rows, tile.outer_columns]
     mean = None if mask.shape == scene.mask.shape else coarse.mean  # the same for all tiles
     problem = build_problem(values, mask, 1, model.log_intensities.exp().numpy(), full, mean)
-    up = _make_interpolator(coarse.mask, mask, stride, (tile.outer_rows.start, tile.outer_columns.start))
+    up = _make_interpolator(coarse.mask, mask, grid.stride, (tile.outer_rows.start, tile.outer_columns.start))
     normals = up(state.normals.numpy())
     normals /= normals.norm(dim=1, keepdim=True)
     own = model._replace(normals=normals)
-    if coarse.heights is not None:
-        heights = np.zeros(scene.mask.shape)
-        heights[tile.outer_rows, tile.outer_columns][mask] = stride * up(coarse.heights[coarse.mask][:, None])[:, 0]
-        part = np.zeros_like(scene.mask)
-        part[tile.outer_rows, tile.outer_columns] = mask
-        problem = problem._replace(sites=place_sites(capture, part, heights))
+    if coarse.sites is not None:
+        heights = grid.stride * up(grid.integrate(model.normals)[coarse.mask][:, None])[:, 0]
+        rows, columns = np.nonzero(mask)
+        rows, columns = rows + tile.outer_rows.start, columns + tile.outer_columns.start
+        problem = problem._replace(sites=place_sites(grid.capture, rows, columns, heights.numpy()))
     share = (coarse.images - coarse.remove_bounced(model, float(state.whiteness))) * (coarse.mean / problem.mean)
     for number in range(values.shape[2]):
         if coarse.bounced is not None:

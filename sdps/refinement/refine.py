@@ -23,7 +23,7 @@ from sdps.refinement.fine import collect, upsample
 from sdps.refinement.image_model import Model, Refined, State, build_model
 from sdps.refinement.problems import build_problem, estimate_log_albedo, gather_pixels
 from sdps.refinement.reflectance import LOBES, MODES, SHAPES
-from sdps.refinement.sites import Grid, Sites, select_grid
+from sdps.refinement.sites import Grid, Sites
 from sdps.refinement.transport import trace
 
 _FEWEST = 4
@@ -84,15 +84,12 @@ def refine(
     """Refine normals and lights.
 
     Args:
-        images: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time.
-        mask: (H, W) bool.
-        normals: (H, W, 3) unit, as a method found them.
-        lights: (L, 3) unit directions from the surface to the light.
+        images, mask: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time; (H, W) bool.
+        normals, lights: (H, W, 3) and (L, 3), unit, as a method found them.
         intensities: (L,) or (L, 3).
         directions_given: Leave directions as they are. Intensities always move: they also absorb what the model misses.
         rig: The camera, and the lamps' nearness where it is known; otherwise it is found.
-        config: Iterations and rates.
-        stray: Subtract stray light from the images.
+        config, stray: Iterations and rates; whether stray light is subtracted.
         saturation: Radiance at which a channel is clipped; such observations are ignored.
 
     Raises:
@@ -102,28 +99,24 @@ def refine(
     scene = survey(images, mask, 0, stray=stray)
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
     most = TILE_BYTES // (_PIXEL_BYTES + _OBSERVATION_BYTES * len(scene)) if stride > 1 else scene.mask.size
-    parts = tiles(scene.mask, most, _HALO)
-    values = gather_pixels(scene, scene.mask if len(parts) == 1 else select_grid(scene.mask, stride))
-    problem = build_problem(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
     capture = Capture.of(scene.mask, rig.camera.crop(mask.shape, scene.rows.start, scene.columns.start))
-    grid, free = Grid(capture, scene.mask, stride), _choose_free(directions_given, rig)
-    if not rig.is_plain:
-        problem = problem._replace(sites=grid.sites())
-    start_normals = normals[scene.rows, scene.columns][::stride, ::stride][problem.mask]
+    grid, parts = Grid(capture, scene.mask, stride), tiles(scene.mask, most, _HALO)
+    values = gather_pixels(scene, scene.mask if len(parts) == 1 else grid.which)
+    problem = build_problem(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
+    problem = problem._replace(sites=None if rig.is_plain else grid.sites())
+    start = build_start(problem, normals[scene.rows, scene.columns][grid.which], lights, gains, rig.nearness)
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
+    moving = _choose_free(directions_given, rig)
     with progress_bar(None, total=before + config.iterations + fine * len(parts), desc="refine") as bar:
-        move = partial(solve, free=free, boost=config.boost, weights=Weights(), on_step=_advance(bar))
-        start = build_start(problem, start_normals, lights, gains, rig.nearness)
+        move = partial(solve, free=moving, boost=config.boost, weights=Weights(), on_step=_advance(bar))
         if before:
             problem, start = _trace_light(problem, start, move(problem, start, iterations=before), config.bounces, grid)
         state = move(problem, start, iterations=config.iterations)
         if stride == 1:
             return collect(scene, [(parts[0], problem, state)], state)
-        if problem.sites is not None:
-            problem = problem._replace(heights=grid.integrate(build_model(state).normals))
         weights = Weights(curl=(config.fine_curl, config.fine_curl))
         settle = partial(move, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
-        fit = partial(upsample, coarse=problem, stride=stride, state=state, full=full, capture=capture)
+        fit = partial(upsample, coarse=problem, grid=grid, state=state, full=full)
         return collect(scene, _refine_tiles(scene, parts, values, fit, settle), state)
 
 

@@ -73,10 +73,11 @@ class Grid(NamedTuple):
 
     def sites(self, heights: np.ndarray | None = None) -> Sites:
         """Return where its pixels lie, of heights (h, w) in steps of the grid, or all at the object's mean depth."""
-        full = np.zeros(self.mask.shape)
+        rows, columns = np.nonzero(self.which)
+        found = np.zeros(len(rows))
         if heights is not None:
-            full[:: self.stride, :: self.stride] = self.stride * heights
-        return place_sites(self.capture, select_grid(self.mask, self.stride), full)
+            found += self.stride * heights[rows // self.stride, columns // self.stride]
+        return place_sites(self.capture, rows, columns, found)
 
     def integrate(self, normals: Tensor) -> np.ndarray:  # (h, w)
         """Return the heights of its normals (P, 3), in steps of the grid."""
@@ -86,22 +87,24 @@ class Grid(NamedTuple):
         return integrate(laid, mask, discontinuities=True, camera=self.camera).z
 
     @property
+    def which(self) -> np.ndarray:  # (H, W) bool
+        """Which pixels are on it."""
+        return select_grid(self.mask, self.stride)
+
+    @property
     def camera(self) -> Camera:
         """The camera of the grid's picture."""
         return self.capture.camera.thin(self.capture.shape, self.stride)
 
 
-def place_sites(capture: Capture, which: np.ndarray, heights: np.ndarray | None = None) -> Sites:
-    """Return the sites of some pixels of a picture.
-
-    Args:
-        capture: The object before its camera.
-        which: (H, W) bool.
-        heights: (H, W) in pixels, read where `which` is true; None: all at the object's mean depth.
-    """
-    heights = np.zeros(capture.shape) if heights is None else heights
-    sights = torch.from_numpy(capture.camera.sights(capture.shape)[which].astype(np.float32))
-    return Sites(torch.from_numpy(capture.places(heights)[which].astype(np.float32)), sights, turn_to_sight(sights))
+def place_sites(capture: Capture, rows: np.ndarray, columns: np.ndarray, heights: np.ndarray) -> Sites:
+    """Return the sites of the pixels at rows (P,) and columns (P,) of a picture, of heights (P,) in pixels."""
+    camera, shape = capture.camera, capture.shape
+    places = (camera.place(shape, rows, columns, heights) - capture.centre) / capture.radius
+    flat = camera.place(shape, rows, columns, np.zeros(len(rows)))
+    sights = np.concatenate([-flat[:, :2] / camera.focal, np.ones((len(rows), 1))], axis=1)
+    found = torch.from_numpy(sights.astype(np.float32))
+    return Sites(torch.from_numpy(places.astype(np.float32)), found, turn_to_sight(found))
 
 
 def select_grid(mask: np.ndarray, stride: int) -> np.ndarray:
