@@ -13,6 +13,7 @@ from sdps.refinement.fused import data_term
 from sdps.refinement.image_model import DATA_FLOOR, Model, State, build_model
 from sdps.refinement.modes import evaluate_modes, fit_modes
 from sdps.refinement.priors import Neighbours, find_neighbours, measure_curl, measure_drift, measure_roughness
+from sdps.refinement.reflectance import evaluate_factor, measure_angles
 from sdps.refinement.sites import Sites
 
 RATES = {
@@ -161,16 +162,22 @@ def solve(
 @torch.no_grad()
 def _search_globals(problem: Problem, state: State, model: Model, free: frozenset[str]) -> Tensor:
     """Set the brightest parts' albedo and the modes to what fits the images better; return the corrected images."""
+    if problem.corrected:
+        return problem.images
+    seen = model.see(problem.sites)
+    angles = measure_angles(seen.normals, seen.directions)
+    bent = evaluate_factor(angles, state.modes)[:, None]
     if problem.bounced is not None and "whiteness" in free:
         now = float(state.whiteness)
         tried = sorted({min(max(now + step, 0.0), _WHITEST) for step in (-_WHITENESS_STEP, 0.0, _WHITENESS_STEP)})
-        states = [state._replace(whiteness=torch.tensor(white)) for white in tried]
-        terms = [float(data_term(model, problem.correct(model, one), problem.usable, problem.sites)) for one in states]
+        images = (problem.remove_bounced(model, white) / bent for white in tried)
+        terms = [float(data_term(model, some, problem.usable, problem.sites)) for some in images]
         state.whiteness.fill_(tried[int(np.argmin(terms))])
+    bare = problem.remove_bounced(model, float(state.whiteness))
     if "modes" in free:
-        bare = problem.remove_bounced(model, float(state.whiteness))
-        state.modes.copy_(fit_modes(model, bare, problem.usable, problem.sites))
-    return problem.correct(model, state)
+        state.modes.copy_(fit_modes(model, bare, problem.usable, seen, angles))
+        bent = evaluate_factor(angles, state.modes)[:, None]
+    return bare / bent
 
 
 def _measure_misfit(data: float) -> float:

@@ -261,8 +261,8 @@ def _see_lamps(
     x: Any, turn: np.ndarray, directions: np.ndarray, nearness: np.ndarray, shares: np.ndarray, lights: np.ndarray,
     half: np.ndarray, stretched: np.ndarray, length: np.ndarray,
 ) -> None:  # fmt: skip
-    """Write lamps as a pixel at x sees them: l and h (3, L), shares over falloff (3, L), and 1 / |off| (L,)."""
-    for i in range(len(length)):
+    """Write lamps as a pixel at x sees them: l and h (3, L), shares over falloff (3, L), 1 / |off| and 1 / |l + v|."""
+    for i in range(length.shape[1]):
         rho = nearness[i]
         ox, oy, oz = directions[0, i] - rho * x[0], directions[1, i] - rho * x[1], directions[2, i] - rho * x[2]
         squared = max(ox * ox + oy * oy + oz * oz, _NEAREST)
@@ -275,28 +275,28 @@ def _see_lamps(
         lights[0, i], lights[1, i], lights[2, i] = lx, ly, lz
         half[0, i], half[1, i], half[2, i] = lx * to_half, ly * to_half, (lz + _ONE) * to_half
         stretched[0, i], stretched[1, i] = shares[0, i] * squared, shares[1, i] * squared
-        stretched[2, i], length[i] = shares[2, i] * squared, inverse
+        stretched[2, i], length[0, i], length[1, i] = shares[2, i] * squared, inverse, to_half
 
 
 @numba.njit(fastmath=True, error_model="numpy")
 def _give_back(
-    x: Any, turn: np.ndarray, lights: np.ndarray, half: np.ndarray, nearness: np.ndarray, length: np.ndarray,
+    x: Any, turn: np.ndarray, lights: np.ndarray, half: np.ndarray, length: np.ndarray,
     own: np.ndarray, light: np.ndarray,
 ) -> None:  # fmt: skip
     """Add the gradient of a pixel's lamps, own (9, L), to that of all: light (7, L), directions, log e, nearness."""
-    for i in range(len(length)):
+    for i in range(length.shape[1]):
         hx, hy, hz, lx, ly, lz = half[0, i], half[1, i], half[2, i], lights[0, i], lights[1, i], lights[2, i]
         along = own[3, i] * hx + own[4, i] * hy + own[5, i] * hz
-        to_half = _ONE / np.sqrt(lx * lx + ly * ly + (lz + _ONE) * (lz + _ONE))
+        inverse, to_half = length[0, i], length[1, i]
         ax = own[0, i] + (own[3, i] - along * hx) * to_half
         ay = own[1, i] + (own[4, i] - along * hy) * to_half
         az = own[2, i] + (own[5, i] - along * hz) * to_half
         # Observations grow with |off|^2, as if intensities fell.
-        stronger = _TWO * (own[6, i] + own[7, i] + own[8, i]) * length[i]
+        stronger = _TWO * (own[6, i] + own[7, i] + own[8, i]) * inverse
         along = ax * lx + ay * ly + az * lz
-        tx = (ax - along * lx) * length[i] - stronger * lx
-        ty = (ay - along * ly) * length[i] - stronger * ly
-        tz = (az - along * lz) * length[i] - stronger * lz
+        tx = (ax - along * lx) * inverse - stronger * lx
+        ty = (ay - along * ly) * inverse - stronger * ly
+        tz = (az - along * lz) * inverse - stronger * lz
         bx = turn[0, 0] * tx + turn[1, 0] * ty + turn[2, 0] * tz
         by = turn[0, 1] * tx + turn[1, 1] * ty + turn[2, 1] * tz
         bz = turn[0, 2] * tx + turn[1, 2] * ty + turn[2, 2] * tz
@@ -325,7 +325,7 @@ def _near_pass(
     for block in numba.prange(BLOCKS):
         scratch, summed, own = _make_scratch(lamps), 0.0, np.empty((9, lamps), np.float32)
         lights, half = np.empty((3, lamps), np.float32), np.empty((3, lamps), np.float32)
-        stretched, length = np.empty((3, lamps), np.float32), np.empty(lamps, np.float32)
+        stretched, length = np.empty((3, lamps), np.float32), np.empty((2, lamps), np.float32)
         for p in range(block * count // BLOCKS, (block + 1) * count // BLOCKS):
             x, turn = (places[p, 0], places[p, 1], places[p, 2]), turns[p]
             _see_lamps(x, turn, directions, nearness, shares, lights, half, stretched, length)
@@ -339,7 +339,7 @@ def _near_pass(
                 n, (albedo[p, 0], albedo[p, 1], albedo[p, 2]), strength[p], body, amplitudes, sharpness, lights, half,
                 stretched, images[p], usable[p], scratch, own, lobe[block], shape[block],
             )  # fmt: skip
-            _give_back(x, turn, lights, half, nearness, length, own, light[block])
+            _give_back(x, turn, lights, half, length, own, light[block])
             summed += float(term)
             for k in range(3):
                 pixel[p, k] = turn[0, k] * gx + turn[1, k] * gy + turn[2, k] * gz

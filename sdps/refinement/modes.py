@@ -15,7 +15,15 @@ from torch import Tensor
 
 from render.shared.config import read_yaml
 from sdps.refinement.image_model import Model
-from sdps.refinement.reflectance import MODES, MOST_LOG_FACTOR, evaluate_factor, measure_angles, mode_terms, reflect
+from sdps.refinement.reflectance import (
+    MODES,
+    MOST_LOG_FACTOR,
+    Angles,
+    evaluate_factor,
+    measure_angles,
+    mode_terms,
+    reflect,
+)
 from sdps.refinement.sites import Seen, Sites
 
 _OBSERVATIONS = 100.0
@@ -36,28 +44,30 @@ def evaluate_modes(model: Model, modes: Tensor, sites: Sites | None = None) -> T
     return torch.cat([evaluate_factor(measure_angles(some.normals, some.directions), modes) for some in seen])
 
 
-def fit_modes(model: Model, images: Tensor, usable: Tensor, sites: Sites | None = None) -> Tensor:  # (MODES,)
+def fit_modes(model: Model, images: Tensor, usable: Tensor, seen: Seen, angles: Angles) -> Tensor:  # (MODES,)
     """Return m.
 
     Args:
         model: The model.
         images: (P, 3, L), without bounced light.
         usable: (P, L), 0 for observations that are ignored.
-        sites: Where the pixels lie; None: lamps are distant, the camera is orthographic.
+        seen: Normals and lamps as the pixels see them.
+        angles: Theirs.
     """
-    seen = model.see(sites)
-    left, weights = compare_logs(model, images, usable, seen)
-    terms = mode_terms(measure_angles(seen.normals, seen.directions))
+    left, weights = compare_logs(model, images, usable, seen, angles)
+    terms = mode_terms(angles)
     shapes = torch.stack([torch.ones_like(left), *terms], dim=-1).flatten(0, 1)  # (P L, 1 + MODES)
     weighted = shapes.T * (weights.flatten() * (_OBSERVATIONS / _SPREAD**2))
     normal = (weighted @ shapes).double() + _load_precision()
     return torch.linalg.solve(normal, (weighted @ left.flatten()).double())[1:].float()
 
 
-def compare_logs(model: Model, images: Tensor, usable: Tensor, seen: Seen) -> tuple[Tensor, Tensor]:
+def compare_logs(
+    model: Model, images: Tensor, usable: Tensor, seen: Seen, angles: Angles
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return the logarithm of observed over predicted radiance (P, L), and its weights, which add up to 1."""
     cosine = seen.cosines  # (P, L)
-    reflected = reflect(measure_angles(seen.normals, seen.directions), model)
+    reflected = reflect(angles, model)
     predicted = (reflected * cosine.clamp_min(0.0)[:, None]).mean(dim=1)
     observed = seen.even_out(images * torch.exp(-model.log_intensities).T).mean(dim=1)
     left = torch.log((observed + _LEAST_RADIANCE) / (predicted + _LEAST_RADIANCE))

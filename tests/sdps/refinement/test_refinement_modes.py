@@ -35,9 +35,11 @@ def test_modes_that_images_were_made_with_are_found() -> None:
     )  # fmt: skip
     model = build_model(state)
     shade = (normals @ lights.T).clamp_min(0.0)
-    expected = evaluate_modes(model, FABRIC)
+    expected, seen = evaluate_modes(model, FABRIC), model.see(None)
     images = (shade * expected)[:, None].repeat(1, 3, 1)
-    found = evaluate_modes(model, fit_modes(model, images, torch.ones_like(shade)))
+    found = evaluate_modes(
+        model, fit_modes(model, images, torch.ones_like(shade), seen, measure_angles(normals, lights))
+    )
     ratio = torch.log(found / expected)[shade > 0.1]
     # A constant is the albedo's; what is left of the logarithms' spread:
     assert float(ratio.std()) < 0.3 * float(expected.log()[shade > 0.1].std())

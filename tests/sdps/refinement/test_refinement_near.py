@@ -1,0 +1,101 @@
+"""Near lamps and perspective in refinement: nearness that is found or known, lines of sight, the grid."""
+
+import numpy as np
+import pytest
+import torch
+
+from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture, Rig, reach
+from sdps.core.metrics import angle_degrees
+from sdps.refinement.image_model import Refined
+from sdps.refinement.priors import find_neighbours, measure_curl
+from sdps.refinement.refine import RefineConfig, refine
+from sdps.refinement.sites import Grid
+
+QUICK = RefineConfig(coarse_pixels=700, iterations=500, iterations_before=250, fine_iterations=0)
+
+
+def ball(side: int = 48, camera: Camera = ORTHOGRAPHIC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return normals, mask and heights of a sphere of 0.95 half widths, whose heights are 0 on average."""
+    radius = 0.95 * side / 2
+    points = camera.image_points((side, side))
+    towards = -camera.sights((side, side)) if camera.is_perspective else np.broadcast_to([0.0, 0, -1], (side, side, 3))
+    start = np.concatenate([points, np.zeros((side, side, 1))], axis=-1)
+    # The nearer of the two points where the line of sight meets the sphere about the origin.
+    a, b, c = (towards**2).sum(-1), (start * towards).sum(-1), (start**2).sum(-1) - radius**2
+    inside = b**2 - a * c
+    mask = inside > 0.02 * radius**2
+    along = np.where(mask, (-b - np.sqrt(np.maximum(inside, 0))) / a, 0.0)
+    normals = (start + along[..., None] * towards) / radius
+    depth = np.where(mask, radius * normals[..., 2], 0.0)
+    return normals * mask[..., None], mask, depth
+
+
+def photograph(
+    normals: np.ndarray, mask: np.ndarray, heights: np.ndarray, nearness: np.ndarray, camera: Camera = ORTHOGRAPHIC
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return images (L, H, W, 3) of a matte object under lamps seen from its middle, and their directions."""
+    rng = np.random.default_rng(3)
+    count = len(nearness)
+    around, up = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.5, 1.0, count)
+    out = np.sqrt(1 - up**2)
+    lights = np.stack([out * np.cos(around), out * np.sin(around), up], axis=-1)
+    places = Capture.of(mask, camera).places(heights)[mask]
+    ways, falloff = reach(places, lights, nearness)
+    shade = np.maximum((ways * normals[mask][:, None]).sum(-1), 0.0) * falloff
+    images = np.zeros((count, *mask.shape, 3), np.float32)
+    images[:, mask] = shade.T[..., None] * [0.7, 0.5, 0.3]
+    return images, lights
+
+
+def centred(heights: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    return np.where(mask, heights - heights[mask].mean(), 0.0)
+
+
+def errors(found: Refined, normals: np.ndarray, mask: np.ndarray, lights: np.ndarray) -> tuple[float, float]:
+    of_normals = float(angle_degrees(found.normals[mask], normals[mask]).mean())
+    return of_normals, float(angle_degrees(found.light_directions, lights).mean())
+
+
+def test_a_matte_ball_tells_how_near_its_lamps_stand() -> None:
+    """Its own reflectance could explain much of what near lamps do to a ball; the rest is enough."""
+    normals, mask, heights = ball()
+    images, lights = photograph(normals, mask, centred(heights, mask), np.full(30, 0.2))
+    off = []
+    for known in (np.zeros(30), None):  # started as distant
+        found = refine(images, mask, normals, lights, np.ones(30), config=QUICK, rig=Rig(nearness=known))
+        off.append(errors(found, normals, mask, lights))
+    assert found.nearness == pytest.approx(0.2, rel=0.02)
+    assert off[0][0] > 2.0 and off[1][0] < 1.0  # 2.8 and 0.7
+    assert off[0][1] > 2.5 and off[1][1] < 0.8  # 3.7 and 0.4
+
+
+def test_lamps_that_are_known_stay_where_they_are() -> None:
+    normals, mask, heights = ball()
+    nearness = np.linspace(0.1, 0.3, 20)
+    images, lights = photograph(normals, mask, centred(heights, mask), nearness)
+    found = refine(images, mask, normals, lights, np.ones(20), config=QUICK, rig=Rig(nearness=nearness))
+    assert found.nearness == pytest.approx(nearness, rel=1e-5)
+    assert max(errors(found, normals, mask, lights)) < 0.8
+
+
+def test_what_a_pinhole_sees_of_a_surface_has_no_curl() -> None:
+    camera = Camera(70.0)
+    normals, mask, _ = ball(camera=camera)
+    near, inside = find_neighbours(mask), torch.from_numpy(normals[mask].astype(np.float32))
+    sights = torch.from_numpy(camera.sights(mask.shape)[mask].astype(np.float32))
+    # What is left is the pixels' size, and the thousandth that the measure has at zero.
+    assert float(measure_curl(inside, near, sights)) < 0.2 * float(measure_curl(inside, near))
+
+
+def test_the_grid_lies_where_the_whole_picture_does() -> None:
+    _, mask, heights = ball(camera=Camera(70.0))
+    grid = Grid(Capture.of(mask, Camera(70.0)), mask, 3)
+    few = heights[::3, ::3] / 3
+    which = grid.which
+    found = grid.sites(few)
+    places = grid.capture.places(heights)[which]
+    np.testing.assert_allclose(found.places.numpy(), places, atol=1e-5)
+    sights = grid.capture.camera.sights(mask.shape)[which]
+    np.testing.assert_allclose(found.sights.numpy(), sights, atol=1e-6)
+    ahead = np.einsum("pij,pj->pi", found.turns.numpy(), sights / np.linalg.norm(sights, axis=1, keepdims=True))
+    np.testing.assert_allclose(ahead, np.tile([0.0, 0.0, 1.0], (len(ahead), 1)), atol=1e-6)
