@@ -87,7 +87,8 @@ def test_what_a_pinhole_sees_of_a_surface_has_no_curl() -> None:
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     near, inside = find_neighbours(mask), torch.from_numpy(normals[mask].astype(np.float32))
     sights = torch.from_numpy(camera.sights(mask.shape)[mask].astype(np.float32))
-    assert float(measure_curl(inside, near, sights)) < 0.3 * float(measure_curl(inside, near))
+    # The measure is a thousandth where there is none.
+    assert float(measure_curl(inside, near, sights)) < 0.0011 and float(measure_curl(inside, near)) > 0.002
 
 
 def test_the_grid_lies_where_the_whole_picture_does() -> None:
