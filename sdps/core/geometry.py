@@ -191,6 +191,10 @@ class Capture:
         heights = np.zeros(self.shape) if heights is None else heights
         return (self.camera.positions(heights) - self.centre) / self.radius
 
+    def place(self, rows: np.ndarray, columns: np.ndarray, heights: np.ndarray) -> np.ndarray:  # (n, 3)
+        """Return (X - C) / R of some pixels, of their rows, columns and heights in pixels (n,), float64."""
+        return (self.camera.place(self.shape, rows, columns, heights) - self.centre) / self.radius
+
 
 def reach(places: Array, directions: Array, nearness: Array) -> tuple[Array, Array]:
     """Return how light reaches pixels: l (P, L, 3) unit, and falloff (P, L); NumPy, or torch and differentiable.

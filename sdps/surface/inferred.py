@@ -17,6 +17,7 @@ from render.shared.files import atomic_path, write_json
 from render.shared.images import quantise, write_png
 from render.shared.progress import stage
 from sdps.core.estimate import Estimate
+from sdps.core.geometry import FAR, Capture
 from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import angle_degrees
 from sdps.inference.tiles import release_memory
@@ -25,7 +26,7 @@ from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
 from sdps.refinement.trust import RefinedEstimate
 from sdps.surface.meshing import mesh, step_of, write_mesh
-from sdps.surface.relight import Residuals, fit_albedo, relit, residuals, trace_light
+from sdps.surface.relight import Lamps, Residuals, fit_albedo, relit, residuals, trace_light
 from sdps.surface.verdict import give_verdict
 
 RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
@@ -72,9 +73,23 @@ class Inference:
         return self.estimate.intensities
 
     @property
+    def nearness(self) -> np.ndarray | None:
+        """The object's radius over each lamp's distance (L,), given or found (`sdps.core.geometry`); None: distant."""
+        given = self.photos.light_nearness
+        return self.estimate.nearness if given is None else given
+
+    @property
     def refinement(self) -> RefinedEstimate | None:
         """The estimate with what refinement says; None where nothing was refined."""
         return self.estimate if isinstance(self.estimate, RefinedEstimate) else None
+
+    @property
+    def _lamps(self) -> Lamps | None:
+        """Lamps before the surface; None where they count as distant."""
+        photos = self.photos
+        if self.nearness is None or not (self.nearness >= FAR).any():
+            return None
+        return Lamps(Capture.of(photos.mask, photos.camera), self.depth.z, self.nearness)
 
     @cached_property
     def depth(self) -> Depth:
@@ -87,14 +102,16 @@ class Inference:
         """Lambertian albedo under the lights found, relative; None where no lights were found."""
         if not len(self.light_directions):
             return None
-        return fit_albedo(self.photos, self.photos.mask, self.normals, self.light_directions, self.gains)
+        known = self.photos, self.photos.mask, self.normals, self.light_directions, self.gains
+        return fit_albedo(*known, lamps=self._lamps)
 
     @cached_property
     def residuals(self) -> Residuals | None:
         """How far the photographs are from Lambert's law on what was found; None where no lights were found."""
         if self.albedo is None:
             return None
-        return residuals(self.photos, self.photos.mask, self.normals, self.light_directions, self.gains, self.albedo)
+        known = self.photos, self.photos.mask, self.normals, self.light_directions, self.gains
+        return residuals(*known, self.albedo, lamps=self._lamps)
 
     @property
     def expected_error(self) -> np.ndarray | None:
@@ -221,8 +238,7 @@ class Inference:
         write_png(folder / "normal.png", _encode_normals(normals))
         write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
         if len(self.light_directions):
-            near = self.photos.light_nearness
-            write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains, near)
+            write_lights(folder / "lights.json", self.photos.files, self.light_directions, self.gains, self.nearness)
         if self.refinement is not None:
             refined = self.refinement.refined
             _save_array(folder / "albedo.npy", refined.albedo)

@@ -1,20 +1,22 @@
 """Albedo on estimated normals and lights, pictures under new lights, and how well both explain the images.
 
-Everything is Lambertian: radiance = albedo x intensity x max(n . l, 0), in the images' own scale. Images are read a few
-at a time and several times over, so that memory does not grow with their number.
+Everything is Lambertian: radiance = albedo x intensity x max(n . l, 0), in the images' own scale. Under near lamps l is
+each pixel's own direction, and the intensity counts times its falloff (`sdps.core.geometry`). Images are read a few at
+a time and several times over, so that memory does not grow with their number.
 
 Legend: L images, (H, W) their sides, n mask pixels, C = 3 channels.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 
 from render.shared.errors import InputError
 from render.shared.progress import repeat, stage
+from sdps.core.geometry import Capture, reach
 from sdps.core.integration import Depth, check_normals
 from sdps.core.intensities import per_channel
 
@@ -27,6 +29,48 @@ _BAND = 2**22  # pixels, of larger pictures only the object's rows are read, so 
 _TRACED = 2**20  # pixels of the box above which shadows are traced on a coarser grid
 _LEAST = 0.02  # of a pixel's brightness: smaller residuals do not gain more weight
 _LIFT = 1.0  # pixels by which an occluder must rise above a ray, since the depth has errors of its own
+
+
+class Lamps(NamedTuple):
+    """Near lamps, and the surface they stand before.
+
+    Attributes:
+        capture: The object before its camera.
+        heights: (H, W) z of the surface in pixels, as of `sdps.core.integration.Depth`; not read outside the mask.
+        nearness: (L,) rho of the lamps (`sdps.core.geometry`), at least 0 and under 1.
+    """
+
+    capture: Capture
+    heights: np.ndarray
+    nearness: np.ndarray
+
+
+class _Scene(NamedTuple):
+    """Pixels of an object and what lights them, all float32.
+
+    Attributes:
+        unit: (n, 3) normals.
+        lights: (L, 3).
+        intensities: (L, 3).
+        places: (n, 3), (X - C) / R; None under distant lights.
+        nearness: (L,); of no use without `places`.
+    """
+
+    unit: np.ndarray
+    lights: np.ndarray
+    intensities: np.ndarray
+    places: np.ndarray | None
+    nearness: np.ndarray
+
+    def shade(self, number: int, some: slice) -> np.ndarray:  # (p, C)
+        """Return what some pixels of albedo 1 show under a light."""
+        intensity = self.intensities[number]
+        if self.places is None:
+            return np.maximum(self.unit[some] @ self.lights[number], 0.0)[:, None] * intensity
+        one = slice(number, number + 1)
+        directions, falloff = reach(self.places[some], self.lights[one], self.nearness[one])
+        facing = np.maximum((self.unit[some] * directions[:, 0]).sum(axis=1), 0.0)
+        return (facing * falloff[:, 0])[:, None] * intensity
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +90,7 @@ class Residuals:
 
 def fit_albedo(
     images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray, *,
-    passes: int = 3,
+    passes: int = 3, lamps: Lamps | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Estimate the Lambertian albedo of each pixel, robustly.
 
@@ -61,6 +105,7 @@ def fit_albedo(
         lights: (L, 3) unit, from the surface to the light.
         intensities: (L,) or (L, 3).
         passes: 1 for plain least squares.
+        lamps: Where near lamps stand; None for distant lights.
 
     Returns:
         (H, W, 3) float32 >= 0 in units of image value per intensity; 0 outside the mask and where no light falls.
@@ -74,22 +119,21 @@ def fit_albedo(
     for number, rows in enumerate(bands):
         some = _Rows(images, rows, mask.shape) if rows != slice(0, len(mask)) else images
         with repeat(number, len(bands)):
-            unit, directions, strengths = _check(some, mask[rows], normals[rows], lights, intensities)
-            picture[rows][mask[rows]] = _fit(some, mask[rows], unit, directions, strengths, passes)
+            scene = _check(some, mask[rows], normals[rows], lights, intensities, _places(lamps, mask, rows))
+            picture[rows][mask[rows]] = _fit(some, mask[rows], scene, passes)
     return picture
 
 
-def _fit(
-    images: "ImageSource", mask: np.ndarray, unit: np.ndarray, lights: np.ndarray, intensities: np.ndarray, passes: int
-) -> np.ndarray:  # (n, C)
-    """Return the albedo of the mask's pixels; arguments as `_check` returns them."""
+def _fit(images: "ImageSource", mask: np.ndarray, scene: _Scene, passes: int) -> np.ndarray:  # (n, C)
+    """Return the albedo of the mask's pixels, which are those of the scene."""
+    count = len(scene.unit)
     albedo = smallest = None
     for number in range(passes):
-        above, below = np.zeros((2, len(unit), 3), np.float32)
+        above, below = np.zeros((2, count, 3), np.float32)
         for part, observed in _read(images, mask):
-            for light, intensity, values in zip(lights[part], intensities[part], observed, strict=True):
-                for some in _parts(len(unit)):
-                    model = _shading(unit[some], light)[:, None] * intensity  # (p, C)
+            for light, values in zip(range(part.start, part.stop), observed, strict=True):
+                for some in _parts(count):
+                    model = scene.shade(light, some)
                     weighted = model
                     if albedo is not None and smallest is not None:
                         off = np.abs((values[some] - model * albedo[some]).mean(axis=1))
@@ -181,7 +225,7 @@ def _march(z: np.ndarray, mask: np.ndarray, direction: np.ndarray) -> np.ndarray
 
 def residuals(
     images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray,
-    albedo: np.ndarray,
+    albedo: np.ndarray, *, lamps: Lamps | None = None,
 ) -> Residuals:  # fmt: skip
     """Compare the images with Lambert's law; arguments as for `fit_albedo`, whose result `albedo` is.
 
@@ -193,28 +237,25 @@ def residuals(
     for number, rows in enumerate(bands):
         with repeat(number, len(bands)):
             some = _Rows(images, rows, mask.shape) if rows != slice(0, len(mask)) else images
-            sums, of_pixels = _sums(some, mask[rows], normals[rows], lights, intensities, albedo[rows])
+            scene = _check(some, mask[rows], normals[rows], lights, intensities, _places(lamps, mask, rows))
+            sums, of_pixels = _sums(some, mask[rows], scene, albedo[rows])
         wrong += sums
         picture[rows][mask[rows]] = _relative(*of_pixels)
     return Residuals(_relative(*wrong), picture, float(_relative(*wrong.sum(axis=1, keepdims=True))[0]))
 
 
-def _sums(
-    images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray,
-    albedo: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def _sums(images: "ImageSource", mask: np.ndarray, scene: _Scene, albedo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared differences and the squared images, summed over each image (2, L) and each pixel (2, n)."""
-    unit, lights, intensities = _check(images, mask, normals, lights, intensities)
-    inside = albedo[mask].astype(np.float32)
-    wrong, power = np.zeros((2, len(lights))), np.zeros((2, len(unit)))
+    inside, count = albedo[mask].astype(np.float32), len(scene.unit)
+    wrong, power = np.zeros((2, len(images))), np.zeros((2, count))
     for part, observed in _read(images, mask):
         for number, values in zip(range(part.start, part.stop), observed, strict=True):
-            for some in _parts(len(unit)):
-                model = _shading(unit[some], lights[number])[:, None] * intensities[number] * inside[some]
+            for some in _parts(count):
+                model = scene.shade(number, some) * inside[some]
                 off, squared = ((values[some] - model) ** 2).sum(axis=1), (values[some] ** 2).sum(axis=1)  # (p,)
                 wrong[:, number] += off.sum(dtype=np.float64), squared.sum(dtype=np.float64)
                 power[:, some] += off, squared
-        stage("residuals", part.stop, len(lights))
+        stage("residuals", part.stop, len(images))
     return wrong, power
 
 
@@ -223,14 +264,25 @@ def _relative(off: np.ndarray, power: np.ndarray) -> np.ndarray:
     return np.sqrt(np.divide(off, power, out=(off > 0).astype(np.float64), where=power > np.finfo(np.float32).tiny))
 
 
-def _shading(unit: np.ndarray, light: np.ndarray) -> np.ndarray:  # (n,)
-    return np.maximum(unit @ light, 0.0)
+def _places(lamps: Lamps | None, mask: np.ndarray, band: slice) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return (X - C) / R of the mask's pixels in some rows (n, 3), and nearness (L,), float32; None without lamps."""
+    if lamps is None:
+        return None
+    nearness = np.asarray(lamps.nearness, np.float32)
+    if lamps.heights.shape != mask.shape or lamps.capture.shape != mask.shape:
+        raise InputError(f"heights must be {mask.shape} like the mask, got {lamps.heights.shape}")
+    if not ((nearness >= 0.0) & (nearness < 1.0)).all():
+        raise InputError("nearness must be at least 0 and under 1, which is a lamp at the object's edge")
+    rows, columns = np.nonzero(mask[band])
+    places = lamps.capture.place(rows + band.start, columns, lamps.heights[band][mask[band]])
+    return places.astype(np.float32), nearness
 
 
 def _check(
-    images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return normals (n, 3), lights (L, 3) and intensities (L, 3), all float32."""
+    images: "ImageSource", mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray,
+    near: tuple[np.ndarray, np.ndarray] | None,
+) -> _Scene:  # fmt: skip
+    """Return what is to be shaded, of some rows and what `_places` says of them."""
     unit = _unit(normals, mask)
     lights, intensities = np.asarray(lights, np.float32), np.asarray(intensities, np.float32)
     count = len(images)
@@ -241,7 +293,10 @@ def _check(
         )
     if not (count and np.isfinite(lights).all() and np.isfinite(intensities).all()):
         raise InputError("there must be images, and their lights and intensities must be finite")
-    return unit, lights, per_channel(intensities)
+    places, nearness = near or (None, np.zeros(count, np.float32))
+    if nearness.shape != (count,):
+        raise InputError(f"{count} images need nearness ({count},), got {nearness.shape}")
+    return _Scene(unit, lights, per_channel(intensities), places, nearness)
 
 
 class _Rows:

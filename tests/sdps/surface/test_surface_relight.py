@@ -13,8 +13,9 @@ from lab.bench import bench_surface
 from lab.commands import main as lab_main
 from render.records.shards import Shard
 from render.shared.errors import InputError
+from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture, reach
 from sdps.core.integration import integrate
-from sdps.surface.relight import fit_albedo, relit, residuals, trace_light
+from sdps.surface.relight import Lamps, fit_albedo, relit, residuals, trace_light
 from sdps.surface.views import depth_normals, strip, turned
 
 
@@ -79,6 +80,43 @@ def test_memory_is_bounded(monkeypatch, scene):
     source = Counted(scene.images)
     fit_albedo(source, scene.mask, scene.normals, scene.lights, scene.intensities, passes=2)
     assert (source.most, source.reads) == (4, 60)
+
+
+@pytest.mark.parametrize("camera", [ORTHOGRAPHIC, Camera(200.0)])
+@pytest.mark.parametrize("banded", [False, True])
+def test_near_lamps_leave_an_even_albedo_even(monkeypatch, camera, banded):
+    """Both as one piece and in bands of rows and parts of pixels, with a distance for each lamp."""
+    z, normals, mask = sphere(64, 30.0, 0.9)
+    heights = np.where(mask, z - z[mask].mean(), np.nan)  # what is outside must not be read
+    capture, nearness, directions = Capture.of(mask, camera), np.linspace(0.1, 0.4, 30), lights(30)
+    ways, falloff = reach(capture.places(heights)[mask], directions.astype(np.float64), nearness)
+    shading = np.maximum(np.einsum("pc,plc->pl", normals[mask], ways), 0.0) * falloff
+    images = np.zeros((30, *mask.shape, 3))
+    images[:, mask] = 0.6 * shading.T[..., None]
+    if banded:
+        monkeypatch.setattr("sdps.surface.relight._BAND", 700)
+        monkeypatch.setattr("sdps.surface.relight._PART", 300)
+    known = images, mask, normals, directions, np.ones(30)
+    lamps = Lamps(capture, heights, nearness)
+    found = fit_albedo(*known, lamps=lamps)
+    assert np.allclose(found[mask], 0.6, rtol=1e-4)
+    assert residuals(*known, found, lamps=lamps).overall < 1e-4
+    distant = fit_albedo(*known)
+    assert np.ptp(distant[mask]) > 0.15
+    assert residuals(*known, distant).overall > 0.1
+
+
+def test_lamps_that_do_not_fit_are_refused(scene):
+    scene = scene[0]
+    known = scene.images, scene.mask, scene.normals, scene.lights, scene.intensities
+    flat, capture = np.zeros(scene.mask.shape), Capture.of(scene.mask)
+    for lamps, words in [
+        (Lamps(capture, flat[1:], np.full(30, 0.1)), "heights must be"),
+        (Lamps(capture, flat, np.full(30, 1.0)), "nearness must be"),
+        (Lamps(capture, flat, np.full(29, 0.1)), "30 images need nearness"),
+    ]:
+        with pytest.raises(InputError, match=words):
+            fit_albedo(*known, lamps=lamps)
 
 
 def test_relit_predicts_an_image_that_was_not_used(scene):
