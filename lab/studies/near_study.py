@@ -125,8 +125,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             kept[setting] = measure(*setting)
             with file.open("a", encoding="utf-8") as out:
                 out.write(json.dumps(list(asdict(kept[setting]).values())) + "\n")
-        print(f"{number} of {len(wanted)}: {kept[setting]}", flush=True)
-    print(summarise([kept[setting] for setting in wanted]))
+        sys.stdout.write(f"{number} of {len(wanted)}: {kept[setting]}\n")
+    sys.stdout.write(summarise([kept[setting] for setting in wanted]))
     return 0
 
 
