@@ -65,7 +65,7 @@ class Weights(NamedTuple):
     shift: tuple[float, float] = (10.0, 0.03)
     near: float = 0.15
     dark: float = 0.1
-    uneven: float = 0.1
+    uneven: float = 0.03
 
 
 class Problem(NamedTuple):

@@ -78,6 +78,18 @@ def test_lamps_that_are_known_stay_where_they_are() -> None:
     assert max(errors(found, normals, mask, lights)) < 1.4  # 0.9; taken for distant, about four
 
 
+def test_each_lamp_of_a_hand_has_a_distance_of_its_own() -> None:
+    normals, mask, heights = ball()
+    nearness = 0.2 * np.exp(0.2 * np.random.default_rng(5).standard_normal(30))
+    images, lights = photograph(normals, mask, centred(heights, mask), nearness)
+    gaps = []
+    for each in (False, True):
+        found = refine(images, mask, normals, lights, np.ones(30), config=QUICK, rig=Rig(each=each))
+        gaps.append(np.log(found.nearness / nearness))
+        assert np.ptp(found.nearness) > 0.05 or not each
+    assert gaps[1].std() < 0.5 * gaps[0].std()
+
+
 def test_what_a_pinhole_sees_of_a_surface_has_no_curl() -> None:
     camera, mask = Camera(70.0), np.ones((48, 48), bool)
     x, y = np.moveaxis(camera.image_points(mask.shape), -1, 0)
