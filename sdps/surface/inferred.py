@@ -99,7 +99,7 @@ class Inference:
         return self.estimate if isinstance(self.estimate, RefinedEstimate) else None
 
     @property
-    def _lamps(self) -> Lamps | None:
+    def near_lamps(self) -> Lamps | None:
         """Lamps before the surface; None where they count as distant."""
         photos = self.photos
         if self.nearness is None or not (self.nearness >= FAR).any():
@@ -118,7 +118,7 @@ class Inference:
         if not len(self.light_directions):
             return None
         known = self.photos, self.photos.mask, self.normals, self.light_directions, self.gains
-        return fit_albedo(*known, lamps=self._lamps)
+        return fit_albedo(*known, lamps=self.near_lamps)
 
     @cached_property
     def residuals(self) -> Residuals | None:
@@ -126,7 +126,7 @@ class Inference:
         if self.albedo is None:
             return None
         known = self.photos, self.photos.mask, self.normals, self.light_directions, self.gains
-        return residuals(*known, self.albedo, lamps=self._lamps)
+        return residuals(*known, self.albedo, lamps=self.near_lamps)
 
     @property
     def expected_error(self) -> np.ndarray | None:
