@@ -86,6 +86,7 @@ def main(args: argparse.Namespace) -> int:
 
         sys.stdout.write(compare(args.folder, result, args.out))
     sys.stdout.write(describe(result.findings[said:]))
+    sys.stdout.write(f"{_tell_lamps(result)}\n")
     sys.stdout.write(f"{result.method}: {result.seconds:.1f} s; {', '.join(path.name for path in made)}\n{page}\n")
     if result.verdict:
         sys.stdout.write(f"{_MARKS['error']} {result.verdict}\n")
@@ -125,6 +126,12 @@ def _name_camera(photos: "Photographs") -> str:
     return photos.camera_summary if photos.camera.is_perspective else "taken for orthographic"
 
 
+def _tell_lamps(result: "Inference") -> str:
+    """Return the sentence that says how far away the lamps stood."""
+    text: str = result.lamps["text"]
+    return f"{text[0].upper()}{text[1:]}."
+
+
 def _list_images(images: Sequence[str]) -> str:
     if not images:
         return ""
@@ -153,7 +160,8 @@ def _section(result: "Inference") -> SectionWriter:
     text = (
         f"{len(photos)} photographs of {photos.shape[1]}x{photos.shape[0]} pixels, {photos.bits} bits, gamma "
         f"{photos.gamma}; mask: {photos.mask_origin}, {int(mask.sum())} pixels. Method: {result.method}. Frame: "
-        f"x right, y up, z to the camera; lights from the surface to the light. The camera is {_name_camera(photos)}."
+        f"x right, y up, z to the camera; lights from the surface to the light. The camera is {_name_camera(photos)}. "
+        f"{_tell_lamps(result)}"
     )
     section = Section(
         name="photographs",
@@ -263,7 +271,11 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
             expected = facts["refined"].get("expected_light_error_degrees")
             body = tuple((*row, f"{expected[row[0]]:.1f}°" if expected else "given, not known") for row in body)
             header = (*header, "error to expect")
-        tables.append(Table(title="Lights", header=header, rows=body))
+        if not facts["lamps"]["far"]:
+            away = ["far" if np.isinf(distance) else f"{distance:.2f}" for distance in result.lamp_distances]
+            body = tuple((*row, distance) for row, distance in zip(body, away, strict=True))
+            header = (*header, "object sizes away")
+        tables.append(Table(title="Lights", header=header, rows=body, note=_tell_lamps(result)))
     return tuple(tables)
 
 

@@ -208,12 +208,14 @@ def _check_given_lights(photos: Photographs, _: Measures) -> Iterator[Finding]:
 
 
 def _near_lamps(photos: Photographs, measures: Measures) -> Iterator[Finding]:
-    if measures.dimming.near:
+    known = photos.light_nearness is not None and photos.light_nearness.any()
+    if measures.dimming.near and not known:
         yield Finding(
             "warning",
             "The whole frame is the object, and each picture dims towards the rim away from its lamp: the lamps "
-            f"probably stood near, about {measures.dimming.distance:.1f} object widths away. A flat object will come "
-            "out as a dome. Move the lamps further away, at least 5 object widths.",
+            f"probably stood near, about {measures.dimming.distance:.1f} object widths away. Refinement allows for "
+            "that; without it a flat object comes out as a dome. Give the lamps' distance if you know it, or move them "
+            "further away, at least 5 object widths.",
         )
 
 

@@ -121,9 +121,13 @@ def reflect(angles: Angles, surface: Any) -> Array:  # (P, 3, L)
 
 
 def shade(normals: Array, directions: Array, surface: Any) -> Array:  # (P, 3, L)
-    """Return the radiance of unit normals (P, 3) under lights (L, 3) of intensity 1; the surface has modes (M,) too."""
+    """Return the radiance of unit normals (P, 3) under lights (L, 3) or (P, L, 3), those of each pixel, of intensity 1.
+
+    The surface has modes (M,) too.
+    """
     angles = measure_angles(normals, directions)
-    lit = _library(normals).clip(normals @ directions.T, 0.0, None) * evaluate_factor(angles, surface.modes)
+    cosines = normals @ directions.T if directions.ndim == 2 else (directions @ normals[..., None])[..., 0]
+    lit = _library(normals).clip(cosines, 0.0, None) * evaluate_factor(angles, surface.modes)
     return reflect(angles, surface) * lit[:, None]
 
 

@@ -25,6 +25,7 @@ from sdps.methods import pretrained
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
 from sdps.refinement.trust import RefinedEstimate
+from sdps.surface.lamp_distance import Origin, describe_lamps, measure_distances
 from sdps.surface.meshing import mesh, step_of, write_mesh
 from sdps.surface.relight import Lamps, Residuals, fit_albedo, relit, residuals, trace_light
 from sdps.surface.verdict import give_verdict
@@ -79,12 +80,26 @@ class Inference:
         return self.estimate.nearness if given is None else given
 
     @property
+    def lamp_distances(self) -> np.ndarray:
+        """Distances of the lamps in object sizes, (L,) float64; inf of those that count as distant."""
+        return measure_distances(self.nearness, len(self.photos))
+
+    @property
+    def lamps(self) -> dict[str, Any]:
+        """How far away the lamps stood, in words (`text`) and numbers (`sdps.surface.lamp_distance`), JSON ready."""
+        photos, refined = self.photos, self.refinement
+        found = self.estimate.nearness is not None or (refined is not None and not refined.trust.doubt)
+        origin: Origin = "given" if photos.light_nearness is not None else "found" if found else "assumed"
+        size = photos.pixel_size and 2.0 * Capture.of(photos.mask, photos.camera).radius * photos.pixel_size
+        return describe_lamps(self.lamp_distances, origin, size)
+
+    @property
     def refinement(self) -> RefinedEstimate | None:
         """The estimate with what refinement says; None where nothing was refined."""
         return self.estimate if isinstance(self.estimate, RefinedEstimate) else None
 
     @property
-    def _lamps(self) -> Lamps | None:
+    def near_lamps(self) -> Lamps | None:
         """Lamps before the surface; None where they count as distant."""
         photos = self.photos
         if self.nearness is None or not (self.nearness >= FAR).any():
@@ -103,7 +118,7 @@ class Inference:
         if not len(self.light_directions):
             return None
         known = self.photos, self.photos.mask, self.normals, self.light_directions, self.gains
-        return fit_albedo(*known, lamps=self._lamps)
+        return fit_albedo(*known, lamps=self.near_lamps)
 
     @cached_property
     def residuals(self) -> Residuals | None:
@@ -111,7 +126,7 @@ class Inference:
         if self.albedo is None:
             return None
         known = self.photos, self.photos.mask, self.normals, self.light_directions, self.gains
-        return residuals(*known, self.albedo, lamps=self._lamps)
+        return residuals(*known, self.albedo, lamps=self.near_lamps)
 
     @property
     def expected_error(self) -> np.ndarray | None:
@@ -177,6 +192,7 @@ class Inference:
             "mask_pixels": int(photos.mask.sum()),
             "light_directions": "found" if photos.light_directions is None else "given",
             "light_intensities": "found" if photos.intensities is None else "given",
+            "lamps": self.lamps,
             "camera": photos.camera_summary,
             **({"pixel_size": photos.pixel_size} if photos.pixel_size else {}),
             "frame": "x right, y up, z to the camera; lights from the surface to the light",

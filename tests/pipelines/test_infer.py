@@ -309,6 +309,31 @@ def test_a_focal_length_bends_the_surface_and_a_pixel_size_measures_it(hills: tu
     assert np.array_equal(np.load(tmp_path / "near" / "normal.npy"), np.load(tmp_path / "plain" / "normal.npy"))
 
 
+def test_people_are_told_how_far_away_the_lamps_stood(hills: tuple, tmp_path: Path, capsys) -> None:
+    folder, _, mask = hills
+    flags = ["--lights", folder / "known.txt", "--frame", "y-down", "--method", "least-squares", "--no-refine", "--out"]
+
+    def run(name: str, *more: str) -> tuple[str, dict, str, dict]:
+        assert main(["infer", str(folder), *map(str, flags), str(tmp_path / name), *more]) == 0
+        facts, lights = (json.loads((tmp_path / name / f"{file}.json").read_text()) for file in ("result", "lights"))
+        return capsys.readouterr().out, facts, (tmp_path / name / "report.html").read_text(), lights
+
+    text, facts, page, lights = run("far")
+    assert "\nThe lamps were taken for far away.\n" in text and "The lamps were taken for far away." in page
+    assert facts["lamps"] == {"text": "the lamps were taken for far away", "origin": "assumed", "far": True}
+    assert "object sizes away" not in page and "kind" not in lights
+    distant = facts["lambertian_residual"]
+    text, facts, page, lights = run("near", "--light-distance", "2.5", "--pixel-size", "2")
+    size = np.ptp(np.nonzero(mask), axis=1).max() + 1
+    said = f"he lamps stood about 2.5 object sizes ({float(f'{5 * size:.2g}'):g} mm) away, as given"
+    assert f"\nT{said}.\n" in text and page.count(f"T{said}.") == 2
+    assert facts["lamps"] == {"text": f"t{said}", "origin": "given", "far": False, "distance_in_object_sizes": 2.5,
+                              "distance_in_millimetres": 5.0 * size}  # fmt: skip
+    assert "object sizes away</th>" in page and "2.50</td>" in page
+    assert lights["kind"] == "near" and np.linalg.norm(lights["images"][3]["position"]) == pytest.approx(2.5)
+    assert facts["lambertian_residual"] > distant  # these lamps were far
+
+
 @pytest.mark.parametrize(
     ("flags", "said"),
     [

@@ -3,19 +3,23 @@
 Pictures are thinned to at most 384 pixels a side. Everything is in the frame x right, y up, z to the camera.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from PIL import Image
 
 from pipelines.app.pages.reflectance_tables import build_tables
 from pipelines.infer import depth_picture
 from pipelines.shared import pictures
 from render.shared.progress import stage
+from sdps.core.geometry import Capture, turn_to_sight
 from sdps.core.intensities import grey
 from sdps.refinement.reflectance import shade
+from sdps.refinement.sites import Sites, see
 from sdps.surface.meshing import mesh, write_mesh
 
 if TYPE_CHECKING:
@@ -68,6 +72,8 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
         "confidence": [confidence[name] for name in result.photos.files] if confidence else [],
         "components": result.depth.components, "integrability": facts["depth"]["residual_degrees"],
         "residual": facts.get("lambertian_residual"), "camera": facts["camera"],
+        "lamps": facts["lamps"]["text"],
+        "distances": [] if facts["lamps"]["far"] else _round_distances(result.lamp_distances),
     }  # fmt: skip
 
 
@@ -81,13 +87,20 @@ def shade_object(
         albedo: (h, w, 3).
         strength: (h, w) of the highlights.
         lobes: `amplitudes`, `sharpness`, `body` and `modes` of a refined object; empty for Lambert's law.
-        light: (3,) unit.
+        light: (3,) unit, or (h, w, 3), that of each pixel.
     """
     if not lobes:
-        return albedo * np.maximum(normals @ light, 0.0)[..., None]
+        cosines = normals @ light if light.ndim == 1 else (normals * light).sum(axis=-1)
+        return albedo * np.maximum(cosines, 0.0)[..., None]
     numbers = {name: np.array(values) for name, values in lobes.items()}
     surface = SimpleNamespace(albedo=albedo.reshape(-1, 3), strength=strength.reshape(-1), **numbers)
-    return shade(normals.reshape(-1, 3), light[None], surface).reshape(albedo.shape)
+    lights = light[None] if light.ndim == 1 else light.reshape(-1, 1, 3)
+    return shade(normals.reshape(-1, 3), lights, surface).reshape(albedo.shape)
+
+
+def _round_distances(distances: np.ndarray) -> list[float | None]:
+    """Return distances (L,) as the page has them; None for far away."""
+    return [None if np.isinf(distance) else round(float(distance), 2) for distance in distances]
 
 
 def _reflectance(result: "Inference") -> tuple[np.ndarray, np.ndarray, dict[str, list[float]]]:
@@ -113,13 +126,36 @@ def _observations(
     if not len(result.light_directions):
         return
     gains = grey(result.gains)
-    lights = result.light_directions.astype(np.float64)
     model = np.stack(
-        [gain * grey(shade_object(normals, albedo, strength, lobes, light))
-         for gain, light in zip(gains, lights, strict=True)], axis=-1,
+        [gain * falloff * grey(shade_object(turned, albedo, strength, lobes, light))
+         for gain, (turned, light, falloff) in zip(gains, _see_lamps(result, few, normals), strict=True)], axis=-1,
     )  # fmt: skip
     scale = float((observed * model).sum() / max(float((model**2).sum()), 1e-12))
     np.save(folder / "model.npy", (scale * model).astype(np.float16))
+
+
+def _see_lamps(
+    result: "Inference", few: tuple[slice, slice], normals: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | float]]:
+    """Yield normals (h, w, 3), light (3,) or (h, w, 3) and falloff (h, w) or 1 of each lamp; lines of sight are z."""
+    photos, lamps = result.photos, result.near_lamps
+    lights = result.light_directions.astype(np.float64)
+    if lamps is None and not photos.camera.is_perspective:
+        yield from ((normals, light, 1.0) for light in lights)
+        return
+    capture, mask, shape = Capture.of(photos.mask, photos.camera), photos.mask, normals.shape[:2]
+    rows, columns = (places[few].ravel() for places in np.indices(mask.shape, np.int32, sparse=False))
+    places = capture.place(rows, columns, np.where(mask[few], result.depth.z[few], 0.0).ravel())
+    places[~mask[few].ravel()] = 0.0  # where a near lamp might stand
+    sights = torch.from_numpy(photos.camera.thin(mask.shape, few[0].step).sights(shape).reshape(-1, 3))
+    sites = Sites(torch.from_numpy(places), sights, turn_to_sight(sights))
+    nearness = torch.zeros(len(lights)) if lamps is None else torch.from_numpy(lamps.nearness)
+    flat = torch.from_numpy(normals.reshape(-1, 3).astype(np.float64))
+    for light, near in zip(torch.from_numpy(lights), nearness, strict=True):
+        seen = see(flat, light[None], near[None], sites)
+        assert seen.gain is not None  # since there are sites
+        vectors = (values.numpy().reshape(*shape, 3) for values in (seen.normals, seen.directions))
+        yield *vectors, 1.0 / seen.gain.numpy().reshape(shape)
 
 
 def _mesh(result: "Inference", path: Path) -> None:

@@ -142,6 +142,7 @@ async function show(run) {
   }));
   const facts = [`method: ${run.method}`, `${seconds(run.seconds)}`, `${run.components} part${run.components > 1 ? "s" : ""}`, `integrability: ${run.integrability}°`];
   if (run.camera?.startsWith("perspective")) facts.push(`camera: ${run.camera}`);
+  if (run.lamps) facts.push(run.lamps);
   if (run.residual !== null) facts.push(`deviation from Lambert's law: ${run.residual}`);
   if (run.error !== null) facts.push(`error of the normals: ${run.error}°`);
   $("verdict").hidden = !run.verdict;
@@ -177,11 +178,11 @@ function drawLights(run) {
     ...[30, 60].map((angle) => element("circle", { r: Math.sin(angle * Math.PI / 180), fill: "none", stroke: "currentColor", "stroke-width": 0.004, "stroke-dasharray": "0.02 0.03" })));
   run.lights.forEach(([x, y], number) => {
     const part = run.intensities[number] / strongest, sure = run.confidence.length ? run.confidence[number] : 1;
-    const text = `${run.files[number]}: intensity ${part.toFixed(2)}${run.confidence.length ? `, confidence ${sure.toFixed(2)}` : ""}`;
+    const text = `${run.files[number]}: intensity ${part.toFixed(2)}${run.confidence.length ? `, confidence ${sure.toFixed(2)}` : ""}${run.distances?.length ? `, ${run.distances[number] ?? "over 50"} object sizes away` : ""}`;
     svg.append(element("circle", { class: "light", cx: x, cy: -y, r: 0.02 + 0.03 * Math.sqrt(part), fill: `hsl(${45 - 20 * (1 - part)} 95% ${35 + 25 * part}%)`, stroke: "currentColor", "stroke-width": 0.008, "fill-opacity": 0.25 + 0.75 * Math.min(1, sure) }, element("title", {}, text)));
   });
   $("sphere").replaceChildren(svg);
-  $("sphere-note").textContent = `Seen from the camera; rings at 30° and 60°. Larger: stronger.${run.confidence.length ? " Fainter: less certain." : ""}`;
+  $("sphere-note").textContent = `Seen from the camera; rings at 30° and 60°. Larger: stronger.${run.confidence.length ? " Fainter: less certain." : ""}${run.lamps ? ` ${run.lamps[0].toUpperCase()}${run.lamps.slice(1)}.` : ""}`;
 }
 
 // ---- A pixel's intensities ----

@@ -7,7 +7,9 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import photo_folders as folders
 import pytest
+import surface_scenes
 from scipy.interpolate import RegularGridInterpolator
 from sdps_scenes import hemisphere_lights
 
@@ -19,6 +21,8 @@ from pipelines.app.pages.studio_tasks import check_choice, make_training_preset,
 from pipelines.shared import presets
 from render.shared.errors import InputError
 from render.shared.imaging.srgb import to_srgb
+from sdps.api import infer, load
+from sdps.core.geometry import Camera, Capture, reach
 
 RNG = np.random.default_rng(0)
 
@@ -46,6 +50,49 @@ def ball(side: int = 96) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     normals = np.stack([x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))], axis=-1) * inside[..., None]
     albedo = np.where((x > 0)[..., None], [0.8, 0.5, 0.2], [0.1, 0.3, 0.7]) * inside[..., None]
     return normals, albedo, (0.2 + 0.1 * y) * inside
+
+
+@pytest.mark.parametrize("lobes", [{}, *OBJECTS.values()], ids=["Lambertian", *OBJECTS])
+def test_each_pixel_may_have_a_light_of_its_own(lobes: dict) -> None:
+    normals, albedo, strength = ball(24)
+    owners = RNG.integers(len(LIGHTS), size=normals.shape[:2])
+    found = shade_object(normals, albedo, strength, lobes, LIGHTS[owners])
+    for number, light in enumerate(LIGHTS):
+        own = owners == number
+        assert np.allclose(found[own], shade_object(normals, albedo, strength, lobes, light)[own])
+
+
+@pytest.mark.parametrize("flags", [{}, {"focal": "200px"}], ids=["orthographic", "perspective"])
+def test_a_pixel_s_intensities_are_explained_under_near_lamps(tmp_path: Path, flags: dict) -> None:
+    z, normals, mask = surface_scenes.sphere(64, 30.0, 0.9)
+    lights = hemisphere_lights(12, np.random.default_rng(0))
+    nearness = np.full(12, 0.25)
+    camera = Camera(200.0) if flags else Camera()
+    places = Capture.of(mask, camera).places(z - z[mask].mean())[mask]
+    ways, falloff = reach(places, lights.astype(np.float64), nearness)
+    images = np.zeros((12, *mask.shape, 3), np.float32)
+    images[:, mask] = (np.maximum(np.einsum("pc,plc->pl", normals[mask], ways), 0) * falloff).T[..., None] * 0.3
+    folders.write_folder(tmp_path / "near", images, mask)
+    rows = "\n".join(f"{x} {y} {z}" for x, y, z in lights)
+    (tmp_path / "lights.txt").write_text(rows)
+    known = {"lights": tmp_path / "lights.txt", "intensities": "equal", "gamma": "linear"} | flags
+
+    def view(distance: str) -> tuple[dict, float]:
+        photos = load(tmp_path / "near", light_distance=distance, **known)
+        result = infer(photos, "least-squares", refine=False)
+        result.estimate.normals[:] = normals  # the method's own errors are not what is tested here
+        (tmp_path / distance).mkdir()
+        about = object_view.write(result, tmp_path / distance)
+        names = ("observed", "model")
+        observed, model = (np.load(tmp_path / distance / f"{name}.npy").astype(float)[mask] for name in names)
+        return about, float(np.sqrt(((model - observed) ** 2).sum() / (observed**2).sum()))
+
+    about, off = view("2.0")
+    assert about["lamps"] == "the lamps stood about 2 object sizes away, as given" and about["distances"] == [2.0] * 12
+    assert off < 0.01
+    about, off = view("far")
+    assert about["lamps"] == "the lamps stood far away, as given" and about["distances"] == []
+    assert off > 0.1
 
 
 def code(radiance: np.ndarray) -> np.ndarray:

@@ -132,6 +132,8 @@ def test_a_folder_under_near_lamps_is_warned_of(tmp_path: Path) -> None:
 
     near = texts("near", folders.plate(AROUND, distance=1.6))
     assert "dims towards the rim" in near and "dome" in near and "moved" not in near and "edges lie" not in near
+    known = photos.check(photos.load(tmp_path / "near", light_distance="2"))
+    assert not any("dims towards the rim" in finding.text for finding in known)
     for name, distance in (("far", None), ("six widths", 6.0)):
         assert "dims towards the rim" not in texts(name, folders.plate(AROUND, distance=distance))
     images, mask = folders.matte(AROUND)
