@@ -21,6 +21,7 @@ from render.shared.files import atomic_path, read_whole_lines, source_digest
 from render.shared.progress import progress_bar
 
 if TYPE_CHECKING:
+    from sdps.core.geometry import Camera
     from sdps.inference.image_source import ImageSource
     from sdps.methods.runner import Found as FoundLights
     from sdps.methods.runner import Runner
@@ -45,6 +46,7 @@ class TestObject:
         light_directions: (L, 3) true directions, or None.
         intensities: (L,) or (L, 3) true intensities, or None.
         pictured: Whether its normal maps may be kept.
+        camera: What the images were taken with.
     """
 
     __test__ = False  # nothing for pytest to collect
@@ -57,6 +59,7 @@ class TestObject:
     light_directions: np.ndarray | None = None
     intensities: np.ndarray | None = None
     pictured: bool = True
+    camera: "Camera | None" = None
 
     @property
     def true_directions(self) -> np.ndarray:
@@ -207,7 +210,10 @@ class Evaluation:
     ) -> dict[str, Any]:
         """Run a method and return the part of its result that is kept, JSON ready."""
         try:
-            estimate = runner.estimate(images, item.mask, item.light_directions, item.intensities, lights)
+            from sdps.core.geometry import ORTHOGRAPHIC, Rig
+
+            rig = Rig(item.camera or ORTHOGRAPHIC)
+            estimate = runner.estimate(images, item.mask, item.light_directions, item.intensities, lights, rig=rig)
         except InputError as error:  # such as least squares under lights that were all estimated alike
             _log.warning("%s, %s: no score (%s)", item.name, runner.method.name, error)
             return {"scores": {}, "reason": str(error), "seconds": 0.0, "normals": False, "lights": [], "gains": [],

@@ -48,28 +48,34 @@ class DiligentConfig:
         bits: 16 reads the PNGs exactly; 8 keeps the high byte, which is all that the published results of SDPS-Net saw.
         bear: Images of bear: 96, as in the paper, or 76 without the first 20.
         margin: Pixels kept around the mask's bounding box; sides are then rounded up to multiples of 4.
+        focal: Focal length in pixels, the benchmark's about 3772; 0: taken for orthographic. The principal point is the
+            middle of the files' pictures.
     """
 
     bits: int = 8
     bear: int = 96
     margin: int = MARGIN
+    focal: float = 0.0
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 16):
             raise InputError(f"bits must be 8 or 16, got {self.bits}")
         if self.bear not in (76, 96):
             raise InputError(f"bear must be 96 or 76, got {self.bear}")
+        if self.focal < 0:
+            raise InputError(f"focal must be a length in pixels, or 0 for an orthographic camera, got {self.focal:g}")
         if self.margin < 0:
             raise InputError(f"margin must be 0 pixels or more, got {self.margin}")
 
     def describe(self) -> str:
         """Say in words how images are read."""
         depth = "16 bits" if self.bits == 16 else "8 bits (the high byte of 16-bit files)"
+        lens = f"; focal length {self.focal:g} px" if self.focal else ""
         bear = "bear with all 96 images" if self.bear == 96 else "bear without its first 20 images (76)"
         return (
             f"{depth}; cropped to the mask's box with {self.margin} pixels of margin, sides multiples of 4; images "
             "divided by full scale, times the mask, not divided by the known intensities (methods that are given the "
-            f"lights get the file's directions and intensities); {bear}"
+            f"lights get the file's directions and intensities); {bear}{lens}"
         )
 
 
@@ -80,6 +86,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="16: the PNGs exactly; 8: their high byte, as published (default: 8)")  # fmt: skip
     parser.add_argument("--bear", type=int, default=96, choices=(96, 76),
                         help="images of bear; 76 drops the corrupted first 20 (default: 96, as the paper)")  # fmt: skip
+    parser.add_argument("--focal", type=float, default=0.0, metavar="PX",
+                        help="focal length in pixels, 3772 of its camera (default: orthographic)")  # fmt: skip
 
 
 def main(args: argparse.Namespace) -> int:
@@ -126,6 +134,8 @@ def diligent_objects(tree: Path, config: DiligentConfig) -> list[TestObject]:
 
 def _object(source: Source, config: DiligentConfig) -> TestObject:
     """Read what is small, and refer to the images."""
+    from sdps.core.geometry import Camera
+
     truth = source.truth()
     drop = _BEAR_CORRUPT if source.shape == "bear" and config.bear == 76 else 0
     if drop >= len(source.images):
@@ -134,7 +144,8 @@ def _object(source: Source, config: DiligentConfig) -> TestObject:
     return build_object(
         source.shape, Images.of_files(files, lambda path: _read(path, config.bits)), truth.mask,
         source.directions[drop:], source.intensities[drop:], normals=truth.normals, margin=config.margin,
-        files=[source.folder / "mask.png", truth.origin], settings=(config.bits,),
+        files=[source.folder / "mask.png", truth.origin], camera=Camera(config.focal) if config.focal else None,
+        settings=(config.bits, config.focal) if config.focal else (config.bits,),
     )  # fmt: skip
 
 

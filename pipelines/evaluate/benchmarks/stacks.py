@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,6 +13,9 @@ from pipelines.evaluate.evaluation import TestObject
 from render.exchange.ingest import Box, crop_box
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
+
+if TYPE_CHECKING:
+    from sdps.core.geometry import Camera
 
 MARGIN = 15
 """Pixels kept around the mask's bounding box, as the published results do (SDPS-Net's preparation of DiLiGenT)."""
@@ -124,6 +127,7 @@ def build_object(
     longest: int = 0,
     files: Sequence[Path] = (),
     settings: tuple[object, ...] = (),
+    camera: "Camera | None" = None,
 ) -> TestObject:
     """Return an object of which the lights are known; its images stay on disk.
 
@@ -138,6 +142,7 @@ def build_object(
         longest: Greatest side in pixels, 0 for no limit.
         files: What else the object comes from, such as its mask.
         settings: What else its images depend on.
+        camera: Of whole pictures.
     """
     box = crop_box(mask, margin)
     stack = Stack(images, mask, box, longest)
@@ -147,4 +152,5 @@ def build_object(
         name=name, digest=files_digest([*images.files, *files], *settings, margin, longest, directions.tolist(), gains),
         load=lambda: stack, mask=stack.mask, normals=None if normals is None else box.cut(normals),
         light_directions=directions.astype(np.float32), intensities=intensities,
+        camera=None if camera is None else camera.crop(mask.shape, box.top, box.left),
     )  # fmt: skip

@@ -249,3 +249,17 @@ def test_the_real_ball(tmp_path):
     assert errors[16] == pytest.approx(4.17, abs=0.02)
     assert errors[8] == pytest.approx(4.49, abs=0.05)  # the low byte is cut off, not rounded
     assert scores(out)["objects"]["ball"]["images"] == 96
+
+
+def test_a_focal_length_goes_with_the_cropped_pictures(tree: Path) -> None:
+    plain, seen = (diligent_objects(tree, DiligentConfig(focal=focal))[0] for focal in (0.0, 3772.0))
+    assert plain.camera is None and plain.digest != seen.digest
+    whole = read_image(tree / "ballPNG" / "mask.png").shape
+    rows, columns = np.nonzero(read_image(tree / "ballPNG" / "mask.png").reshape(*whole[:2], -1)[..., 0])
+    inside = np.nonzero(seen.mask)
+    assert seen.camera.focal == 3772.0  # the middle of the whole picture, where the part has it
+    assert seen.camera.principal == pytest.approx(
+        ((whole[1] - 1) / 2 - columns.min() + inside[1].min(), (whole[0] - 1) / 2 - rows.min() + inside[0].min())
+    )
+    with pytest.raises(InputError, match="focal must be a length in pixels"):
+        DiligentConfig(focal=-1.0)
