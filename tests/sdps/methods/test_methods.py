@@ -159,7 +159,7 @@ def test_lights_that_methods_share_are_estimated_once(
     alone = [Evaluation(tmp_path / "alone").results(item, [runner])[0] for runner in runners]
     asked = []
     whole = Estimator.estimate_lights
-    monkeypatch.setattr(Estimator, "estimate_lights", lambda *given: asked.append(given) or whole(*given))
+    monkeypatch.setattr(Estimator, "estimate_lights", lambda *given, **_: asked.append(given) or whole(*given))
     together = Evaluation(tmp_path / "together").results(item, runners)
     assert len(asked) == 3  # LCNet, over two views, and with the intensities given
     for one, other in zip(together, alone, strict=True):
@@ -173,7 +173,7 @@ def test_results_are_kept_until_something_changes(tmp_path: Path, runs: Path, mo
     first = Evaluation(tmp_path).results(item, [runner], ["least-squares, true lights"])[0]
     assert first.scores["normal_mae"] < 10 and first.normals().shape == (40, 40, 3)
 
-    def refuse(*_: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise AssertionError("ran again")
 
     with monkeypatch.context() as patched:
@@ -298,7 +298,7 @@ def test_results_of_other_code_are_found_again(tmp_path: Path, monkeypatch: pyte
     item, runner = hills(), Runner(parse("least-squares", pretrained.require), pretrained.require)
     Evaluation(tmp_path).results(item, [runner])
     asked = []
-    monkeypatch.setattr(Runner, "estimate", lambda *given: asked.append(given) or constant_estimate(12, item.mask))
+    monkeypatch.setattr(Runner, "estimate", lambda *given, **_: asked.append(given) or constant_estimate(12, item.mask))
     Evaluation(tmp_path).results(item, [runner])
     assert not asked
     monkeypatch.setattr(evaluation, "code_identity", lambda: "other code")
