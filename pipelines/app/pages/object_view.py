@@ -144,7 +144,8 @@ def _see_lamps(
         yield from ((normals, light, 1.0) for light in lights)
         return
     capture, mask, shape = Capture.of(photos.mask, photos.camera), photos.mask, normals.shape[:2]
-    rows, columns = (places[few].ravel() for places in np.indices(mask.shape, np.int32, sparse=False))
+    sides = (np.arange(side)[part] for side, part in zip(mask.shape, few, strict=True))
+    rows, columns = (index.ravel() for index in np.meshgrid(*sides, indexing="ij"))
     places = capture.place(rows, columns, np.where(mask[few], result.depth.z[few], 0.0).ravel())
     places[~mask[few].ravel()] = 0.0  # where a near lamp might stand
     sights = torch.from_numpy(photos.camera.thin(mask.shape, few[0].step).sights(shape).reshape(-1, 3))
@@ -154,8 +155,8 @@ def _see_lamps(
     for light, near in zip(torch.from_numpy(lights), nearness, strict=True):
         seen = see(flat, light[None], near[None], sites)
         assert seen.gain is not None  # since there are sites
-        vectors = (values.numpy().reshape(*shape, 3) for values in (seen.normals, seen.directions))
-        yield *vectors, 1.0 / seen.gain.numpy().reshape(shape)
+        turned, towards = (values.numpy().reshape(*shape, 3) for values in (seen.normals, seen.directions))
+        yield turned, towards, 1.0 / seen.gain.numpy().reshape(shape)
 
 
 def _mesh(result: "Inference", path: Path) -> None:
