@@ -144,8 +144,8 @@ def _see_lamps(
         yield from ((normals, light, 1.0) for light in lights)
         return
     capture, mask, shape = Capture.of(photos.mask, photos.camera), photos.mask, normals.shape[:2]
-    grid = np.indices(mask.shape, np.int32)
-    rows, columns = grid[0][few].ravel(), grid[1][few].ravel()
+    sides = (np.arange(side)[part] for side, part in zip(mask.shape, few, strict=True))
+    rows, columns = (index.ravel() for index in np.meshgrid(*sides, indexing="ij"))
     places = capture.place(rows, columns, np.where(mask[few], result.depth.z[few], 0.0).ravel())
     places[~mask[few].ravel()] = 0.0  # where a near lamp might stand
     sights = torch.from_numpy(photos.camera.thin(mask.shape, few[0].step).sights(shape).reshape(-1, 3))

@@ -127,6 +127,7 @@ async def start_task(request: Request) -> Response:
         arguments |= {key: asked.get(key) is True for key in ("refine", "anyway", "discontinuities")}
         arguments["scale"] = float(_read_choice(asked, "scale", _SCALES))
         arguments["focal"] = str(asked.get("focal") or "")[:40]
+        arguments["light_distance"] = str(asked.get("light_distance") or "auto")[:40]
     try:
         return queue_task(request, task, **arguments)
     except Refused:

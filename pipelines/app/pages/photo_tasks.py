@@ -115,7 +115,7 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
         number: Of the run.
         refine: Refine where `sdps.infer` does by default.
         method, anyway, discontinuities: As of `sdps.infer`.
-        options: As of `check`, `scale` of `sdps.load`, and `focal`: the 35 mm equivalent in millimetres.
+        options: As of `check`, `scale` of `sdps.load`, `light_distance`, and `focal`: 35 mm equivalent in millimetres.
 
     Returns:
         What the page shows of the run.
@@ -166,7 +166,7 @@ def _measure_error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float
 
 def _load(
     folder: Path, *, anyway: bool, gamma: str = "auto", frame: str = "y-up", lights: bool = False, scale: float = 1.0,
-    focal: str = "",
+    focal: str = "", light_distance: str = "auto",
 ) -> Any:  # fmt: skip
     import sdps
 
@@ -174,7 +174,7 @@ def _load(
     return sdps.load(
         folder / PHOTOS, mask=painted if painted.is_file() else None, lights="folder" if lights else None,
         frame=frame, gamma=gamma, anyway=anyway, scale=scale,
-        focal=f"{focal}mm" if focal[-1:].isdigit() else focal,  # as the page asks for it
+        light_distance=light_distance, focal=f"{focal}mm" if focal[-1:].isdigit() else focal,  # as the page asks for it
     )  # fmt: skip
 
 

@@ -120,6 +120,7 @@ async function infer(event) {
   for (const name of ["refine", "discontinuities", "anyway"]) asked[name] = $(name).checked;
   asked.scale = $("scale").value;
   asked.focal = $("focal").value;
+  asked.light_distance = $("light-distance").value;
   try {
     if (!$("mask-use").disabled) await ask(inSet("mask"), { method: "PUT", body: await painter.blob() });
     const found = await follow(await post(inSet("start/infer"), asked), $("run-status"), "Surface");

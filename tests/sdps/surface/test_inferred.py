@@ -1,6 +1,8 @@
 """What `infer` writes: a folder with a result.json holds files of one run."""
 
 import errno
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 import sdps
 from render.shared.errors import InputError
+from sdps.core.geometry import FAR
 
 
 def test_a_run_that_is_cut_off_leaves_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -31,3 +34,29 @@ def test_a_run_that_is_cut_off_leaves_no_result(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(InputError, match="cannot be written"):
         found.save(out)
     assert not (out / "result.json").exists() and np.load(out / "normal.npy").shape == found.normals.shape
+
+
+def test_lamps_that_were_found_light_the_albedo_and_are_written(tmp_path: Path) -> None:
+    ring = np.arange(12) * np.pi / 6
+    lights = np.stack([0.8 * np.cos(ring), 0.8 * np.sin(ring), np.full(12, 0.6)], axis=-1)
+    images, mask = folders.matte(lights)
+    photos = sdps.load(folders.write_folder(tmp_path / "photos", images, mask))
+    plain = sdps.infer(photos, "pf14", findings=())
+    nearness = np.linspace(0.1, 0.2, 12, dtype=np.float32)
+    near, far, told = (
+        replace(plain, photos=replace(photos, light_nearness=given), estimate=replace(plain.estimate, nearness=found))
+        for given, found in ((None, nearness), (None, np.full(12, 0.9 * FAR, np.float32)), (nearness, None))
+    )
+    origins = [result.lamps["origin"] for result in (plain, far, near, told)]
+    assert origins == ["assumed", "found", "found", "given"]
+    said = "the lamps stood about 3.3 object sizes away, the nearest 2.5, the furthest 5"
+    assert near.summary()["lamps"]["text"] == said
+    assert told.lamps["text"] == f"{said}, as given"
+    assert plain.albedo is not None and near.albedo is not None and told.albedo is not None
+    assert np.array_equal(far.albedo, plain.albedo)
+    assert np.abs(near.albedo - plain.albedo).max() > 0.05 * plain.albedo.max()
+    assert np.array_equal(near.albedo, told.albedo)
+    near.save(tmp_path / "out")
+    written = json.loads((tmp_path / "out" / "lights.json").read_text())
+    far_away = [np.linalg.norm(image["position"]) for image in written["images"]]
+    assert far_away == pytest.approx(0.5 / nearness, rel=1e-4)

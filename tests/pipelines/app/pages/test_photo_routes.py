@@ -85,6 +85,22 @@ def test_a_focal_length_is_used(address: str, hills: Path) -> None:
         assert job["state"] == "failed" and said in job["message"]
 
 
+def test_a_distance_of_the_lamps_is_used(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+
+    def infer(**more: object) -> dict:
+        return client.wait(client.post(f"{path}/start/infer", {"method": "factorisation", **more}))
+
+    assert infer()["result"]["lamps"] == "the lamps were taken for far away"
+    assert infer(light_distance="far")["result"]["lamps"] == "the lamps stood far away, as given"
+    found = infer(light_distance=4)["result"]
+    assert found["lamps"] == "the lamps stood about 4 object sizes away, as given"
+    assert found["distances"] == [4.0] * len(found["files"])
+    job = infer(light_distance="near")
+    assert job["state"] == "failed" and "--light-distance" in job["message"]
+
+
 def test_a_painted_mask_is_used(address: str, hills: Path) -> None:
     client = Client(address)
     path = client.new_set(hills)
