@@ -1,4 +1,4 @@
-"""A first normal of every pixel by robust least squares, and the frame that goes with it.
+"""A first normal of every pixel by robust least squares, the frame that goes with it, and that of a line of sight.
 
 Legend: N pixels, Q lights.
 """
@@ -60,3 +60,11 @@ def frames(normals: Tensor) -> Tensor:
     tangent = tangent + facing * torch.stack([z, torch.zeros_like(z), -x], dim=-1)
     first = functional.normalize(tangent, dim=-1)
     return torch.stack([first, torch.linalg.cross(normals, first), normals], dim=1)
+
+
+def turn_to_sight(sights: Tensor) -> Tensor:  # (P, 3, 3)
+    """Return the smallest rotations that bring vectors (P, 3) with z = 1 to the z axis."""
+    x, y, z = functional.normalize(sights, dim=-1).unbind(dim=-1)
+    share = 1.0 / (1.0 + z)
+    rows = [1.0 - x * x * share, -x * y * share, -x, -x * y * share, 1.0 - y * y * share, -y, x, y, z]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))

@@ -16,16 +16,14 @@ w = -f log(1 - z / f). `render.records.view_geometry` has the same camera, its l
 """
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
-import torch
-from torch.nn.functional import normalize
 
 from render.shared.errors import InputError
-from sdps.core.lighting import library
 
-Array = TypeVar("Array", np.ndarray, torch.Tensor)
+Array = Any
+"""A NumPy array or a torch tensor; all arguments of a call are of one kind. Torch is not loaded here."""
 FAR = 0.01
 """Nearness below which lamps count as distant: over the object, directions differ by a degree at most."""
 
@@ -111,11 +109,11 @@ class Camera:
         shrunk = 1.0 - np.asarray(heights, np.float64) / self.focal
         return np.stack([(columns - column) * shrunk, (row - rows) * shrunk, heights], axis=-1)
 
-    def height(self, logarithmic: Array) -> Array:
+    def height(self, logarithmic: np.ndarray) -> np.ndarray:
         """Return z of w = -f log(1 - z / f), what slopes integrate to, any shape."""
         if not self.is_perspective:
             return logarithmic
-        return -self.focal * library(logarithmic).expm1(-logarithmic / self.focal)
+        return -self.focal * np.expm1(-logarithmic / self.focal)
 
 
 ORTHOGRAPHIC = Camera()
@@ -207,11 +205,3 @@ def reach(places: Array, directions: Array, nearness: Array) -> tuple[Array, Arr
     off = directions - nearness[..., None] * places[:, None]  # (P, L, 3)
     squared = (off * off).sum(-1)
     return off / squared[..., None] ** 0.5, 1.0 / squared
-
-
-def turn_to_sight(sights: torch.Tensor) -> torch.Tensor:  # (P, 3, 3)
-    """Return the smallest rotations that bring vectors (P, 3) with z = 1 to the z axis."""
-    x, y, z = normalize(sights, dim=-1).unbind(dim=-1)
-    share = 1.0 / (1.0 + z)
-    rows = [1.0 - x * x * share, -x * y * share, -x, -x * y * share, 1.0 - y * y * share, -y, x, y, z]
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))

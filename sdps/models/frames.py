@@ -22,8 +22,7 @@ from torch.nn import functional
 
 from render.shared.errors import InputError, unknown
 from render.shared.progress import stage
-from sdps.core.first_normals import first_normals, frames
-from sdps.core.geometry import turn_to_sight
+from sdps.core.first_normals import first_normals, frames, turn_to_sight
 from sdps.core.losses import NormalCriterion, expected_error_loss
 from sdps.core.symmetry import Symmetry
 from sdps.models.base import FusionNetwork, Observations, Placement, Truth

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sdps.core.geometry import Camera, Capture, reach, turn_to_sight
+from sdps.core.first_normals import turn_to_sight
+from sdps.core.geometry import Camera, Capture, reach
 from sdps.core.integration import integrate
 
 

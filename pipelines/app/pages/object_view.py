@@ -16,7 +16,8 @@ from pipelines.app.pages.reflectance_tables import build_tables
 from pipelines.infer import depth_picture
 from pipelines.shared import pictures
 from render.shared.progress import stage
-from sdps.core.geometry import Capture, turn_to_sight
+from sdps.core.first_normals import turn_to_sight
+from sdps.core.geometry import Capture
 from sdps.core.intensities import grey
 from sdps.refinement.reflectance import shade
 from sdps.refinement.sites import Sites, see

@@ -50,9 +50,9 @@ def test_the_first_views_are_groups_and_all_are_different() -> None:
 def test_the_mean_of_lights_undoes_the_turns() -> None:
     true = torch.nn.functional.normalize(torch.rand(1, 4, 3), dim=-1)
     gains = torch.rand(1, 4)
-    found = [(symmetry, Lights(symmetry.vectors(true), gains, gains, gains)) for symmetry in SYMMETRIES]
+    found = [(symmetry, Lights(symmetry.vectors(true), *[gains] * 4)) for symmetry in SYMMETRIES]
     mean = mean_lights(found)
-    for one, two in zip(mean, (true, gains, gains, gains), strict=True):
+    for one, two in zip(mean, (true, *[gains] * 4), strict=True):
         torch.testing.assert_close(one, two)
 
 

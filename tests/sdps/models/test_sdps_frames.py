@@ -12,8 +12,7 @@ from torch.nn import functional
 
 from render.shared.config import to_plain
 from render.shared.errors import InputError
-from sdps.core.first_normals import first_normals, frames
-from sdps.core.geometry import turn_to_sight
+from sdps.core.first_normals import first_normals, frames, turn_to_sight
 from sdps.core.symmetry import Symmetry
 from sdps.data.augment import Augmentation
 from sdps.models.base import Lights, Observations, Placement

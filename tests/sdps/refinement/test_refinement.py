@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from render.shared.errors import InputError
-from sdps.core.geometry import turn_to_sight
+from sdps.core.first_normals import turn_to_sight
 from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
 from sdps.methods.parse import parse
