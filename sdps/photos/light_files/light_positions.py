@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from render.shared.errors import InputError, unknown
+from render.shared.errors import InputError, list_names, unknown
 from render.shared.tables import number_lines
 from sdps.photos.light_files.light_table import Near, Table
 
@@ -36,7 +36,7 @@ def read_unit(where: str | Path, word: Any) -> str:
     text = str(word).strip().lower()
     text = _OTHER_WORDS.get(text, text)
     if text not in UNITS:
-        raise InputError(f"{where}: {unknown('unit', text, UNITS)}")
+        raise InputError(f"{where}: unknown unit {text!r}; it is one of {list_names(UNITS)}")
     return text
 
 
