@@ -160,6 +160,13 @@ def solve(
 
 
 @torch.no_grad()
+def measure_fit(problem: Problem, state: State) -> float:
+    """Return the data term of a state."""
+    model = build_model(state)
+    return float(data_term(model, problem.correct(model, state).contiguous(), problem.usable, problem.sites))
+
+
+@torch.no_grad()
 def _search_globals(problem: Problem, state: State, model: Model, free: frozenset[str]) -> Tensor:
     """Set the brightest parts' albedo and the modes to what fits the images better; return the corrected images."""
     if problem.corrected:

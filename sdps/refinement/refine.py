@@ -18,7 +18,7 @@ from sdps.core.geometry import UNKNOWN, Capture, Rig, reach
 from sdps.core.intensities import per_channel
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.inference.tiles import Tile, release_memory, tiles
-from sdps.refinement.descent import Problem, Weights, solve
+from sdps.refinement.descent import Problem, Weights, measure_fit, solve
 from sdps.refinement.fine import collect, upsample
 from sdps.refinement.image_model import Model, Refined, State, build_model
 from sdps.refinement.problems import build_problem, estimate_log_albedo, gather_pixels
@@ -32,6 +32,8 @@ _SHARPEST, _BROADEST = 300.0, 10.0
 _START_HEIGHT = -4.0
 START_NEARNESS = 0.03
 """What nearness that is to be found begins with."""
+_CLEARLY = 0.02
+"""Share by which near lamps must lower the data term: 0.01 where they are distant, 0.04 or more at seven radii."""
 _BRIGHTEST, _WHITENESS = 0.95, 0.3  # quantile of the brightest parts, and the albedo they start with
 TILE_BYTES = 3 * 2**29
 """Memory for the pixels that are refined at once; objects whose box fits are one tile."""
@@ -85,8 +87,7 @@ def refine(
 
     Args:
         images, mask: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time; (H, W) bool.
-        normals, lights: (H, W, 3) and (L, 3), unit, as a method found them.
-        intensities: (L,) or (L, 3).
+        normals, lights, intensities: As a method found them; (H, W, 3) and (L, 3), unit, and (L,) or (L, 3).
         directions_given: Leave directions as they are. Intensities always move: they also absorb what the model misses.
         rig: The camera, and the lamps' nearness where it is known; otherwise it is found.
         config, stray: Iterations and rates; whether stray light is subtracted.
@@ -106,16 +107,17 @@ def refine(
     problem = problem._replace(sites=None if rig.is_plain else grid.sites())
     start = build_start(problem, normals[scene.rows, scene.columns][grid.which], lights, gains, rig.nearness)
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
-    moving = _choose_free(directions_given, rig)
-    with progress_bar(None, total=before + config.iterations + fine * len(parts), desc="refine") as bar:
-        move = partial(solve, free=moving, boost=config.boost, weights=Weights(), on_step=_advance(bar))
+    free, tries = _choose_free(directions_given, rig), 1 if rig.nearness is not None else 2
+    with progress_bar(None, total=tries * before + config.iterations + fine * len(parts), desc="refine") as bar:
+        move = partial(solve, boost=config.boost, weights=Weights(), on_step=_advance(bar))
         if before:
-            problem, start = _trace_light(problem, start, move(problem, start, iterations=before), config.bounces, grid)
-        state = move(problem, start, iterations=config.iterations)
+            problem, found, free = _choose_lamps(problem, start, free, partial(move, iterations=before), rig)
+            problem, start = _trace_light(problem, start, found, config.bounces, grid)
+        state = move(problem, start, free=free, iterations=config.iterations)
         if stride == 1:
             return collect(scene, [(parts[0], problem, state)], state)
-        weights = Weights(curl=(config.fine_curl, config.fine_curl))
-        settle = partial(move, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
+        settle = partial(move, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=Weights(
+            curl=(config.fine_curl, config.fine_curl)))  # fmt: skip
         fit = partial(upsample, coarse=problem, grid=grid, state=state, full=full)
         return collect(scene, _refine_tiles(scene, parts, values, fit, settle), state)
 
@@ -192,6 +194,26 @@ def _choose_free(directions_given: bool, rig: Rig) -> frozenset[str]:
     known = rig.nearness is not None
     fixed = {"directions": directions_given, "log_nearness": known, "uneven": known or not rig.each}
     return frozenset(State._fields) - {name for name, stays in fixed.items() if stays}
+
+
+def _choose_lamps(
+    problem: Problem, start: State, free: frozenset[str], move: Callable[..., State], rig: Rig
+) -> tuple[Problem, State, frozenset[str]]:
+    """Return the problem, what the first steps find, and what moves from then on: of near lamps, or of distant ones.
+
+    A model that misses something of the reflectance takes nearness for it (metals run to lamps that touch the object),
+    so near lamps must explain the photographs clearly better than distant ones do.
+    """
+    near = move(problem, start, free=free)
+    if "log_nearness" not in free:
+        return problem, near, free
+    distant = problem._replace(sites=problem.sites if rig.camera.is_perspective else None)
+    begun = start._replace(log_nearness=torch.tensor(-torch.inf), uneven=torch.zeros_like(start.uneven))
+    fixed = free - {"log_nearness", "uneven"}
+    far = move(distant, begun, free=fixed)
+    if measure_fit(problem, near) < (1.0 - _CLEARLY) * measure_fit(distant, far):
+        return problem, near, free
+    return distant, far, fixed
 
 
 def _trace_light(

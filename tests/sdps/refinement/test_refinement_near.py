@@ -69,6 +69,28 @@ def test_a_matte_ball_tells_how_near_its_lamps_stand() -> None:
     assert off[0][1] > 2.5 and off[1][1] < 0.8  # 3.7 and 0.4
 
 
+def test_distant_lamps_stay_distant() -> None:
+    normals, mask, heights = ball()
+    images, lights = photograph(normals, mask, centred(heights, mask), np.zeros(30))
+    found, known = (
+        refine(images, mask, normals, lights, np.ones(30), config=QUICK, rig=rig)
+        for rig in (Rig(), Rig(nearness=np.zeros(30)))
+    )
+    assert not found.nearness.any()
+    np.testing.assert_array_equal(found.normals, known.normals)  # and cost nothing
+
+
+@pytest.mark.parametrize(("near", "far", "kept"), [(0.97, 1.0, True), (0.99, 1.0, False), (1.03, 1.0, False)])
+def test_near_lamps_must_explain_clearly_more(near: float, far: float, kept: bool, monkeypatch) -> None:
+    normals, mask, heights = ball()
+    images, lights = photograph(normals, mask, centred(heights, mask), np.full(12, 0.1))
+    answers = iter((near, far))
+    monkeypatch.setattr("sdps.refinement.refine.measure_fit", lambda *_: next(answers))
+    few = RefineConfig(coarse_pixels=300, iterations=3, iterations_before=2, fine_iterations=0)
+    found = refine(images, mask, normals, lights, np.ones(12), config=few)
+    assert found.nearness.any() == kept
+
+
 def test_lamps_that_are_known_stay_where_they_are() -> None:
     normals, mask, heights = ball()
     nearness = np.linspace(0.1, 0.3, 20)
