@@ -19,9 +19,9 @@ import numpy as np
 from render.shared.errors import InputError
 from render.shared.files import atomic_path, read_whole_lines, source_digest
 from render.shared.progress import progress_bar
+from sdps.core.geometry import ORTHOGRAPHIC, Camera, Rig
 
 if TYPE_CHECKING:
-    from sdps.core.geometry import Camera
     from sdps.inference.image_source import ImageSource
     from sdps.methods.runner import Found as FoundLights
     from sdps.methods.runner import Runner
@@ -59,7 +59,7 @@ class TestObject:
     light_directions: np.ndarray | None = None
     intensities: np.ndarray | None = None
     pictured: bool = True
-    camera: "Camera | None" = None
+    camera: Camera | None = None
 
     @property
     def true_directions(self) -> np.ndarray:
@@ -210,8 +210,6 @@ class Evaluation:
     ) -> dict[str, Any]:
         """Run a method and return the part of its result that is kept, JSON ready."""
         try:
-            from sdps.core.geometry import ORTHOGRAPHIC, Rig
-
             rig = Rig(item.camera or ORTHOGRAPHIC)
             estimate = runner.estimate(images, item.mask, item.light_directions, item.intensities, lights, rig=rig)
         except InputError as error:  # such as least squares under lights that were all estimated alike

@@ -16,7 +16,7 @@ w = -f log(1 - z / f). `render.records.view_geometry` has the same camera, its l
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -82,14 +82,11 @@ class Camera:
 
     def image_points(self, shape: tuple[int, int]) -> np.ndarray:  # (H, W, 2)
         """Return x and y of every pixel of a picture (H, W), float64."""
-        column, row = self.middle(shape)
-        x, y = np.arange(shape[1]) - column, row - np.arange(shape[0])
-        return np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=-1).astype(np.float64)
+        return self.place(shape, *_every(shape), 0.0)[..., :2]
 
     def sights(self, shape: tuple[int, int]) -> np.ndarray:  # (H, W, 3)
         """Return v' of every pixel of a picture (H, W), float64: towards the camera, with z = 1."""
-        tilts = -self.image_points(shape) / self.focal if self.is_perspective else np.zeros((*shape, 2))
-        return np.concatenate([tilts, np.ones((*shape, 1))], axis=-1)
+        return self.look(shape, *_every(shape))
 
     def views(self, shape: tuple[int, int]) -> np.ndarray:  # (H, W, 3)
         """Return the unit vectors v from the surface to the camera, of every pixel of a picture (H, W), float64."""
@@ -98,22 +95,32 @@ class Camera:
 
     def positions(self, heights: np.ndarray) -> np.ndarray:  # (H, W, 3)
         """Return X of every pixel, of heights z (H, W) in pixels, float64."""
-        shrunk = 1.0 - np.asarray(heights, np.float64)[..., None] / self.focal
-        return np.concatenate([self.image_points(heights.shape) * shrunk, heights[..., None]], axis=-1)
+        return self.place(heights.shape, *_every(heights.shape), heights)
 
     def place(
-        self, shape: tuple[int, int], rows: np.ndarray, columns: np.ndarray, heights: np.ndarray
-    ) -> np.ndarray:  # (n, 3)
-        """Return X of some pixels of a picture (H, W), of their rows, columns and heights (n,), float64."""
+        self, shape: tuple[int, int], rows: np.ndarray, columns: np.ndarray, heights: np.ndarray | float
+    ) -> np.ndarray:  # (..., 3)
+        """Return X of some pixels of a picture (H, W), of their rows, columns and heights, float64; these broadcast."""
         column, row = self.middle(shape)
         shrunk = 1.0 - np.asarray(heights, np.float64) / self.focal
-        return np.stack([(columns - column) * shrunk, (row - rows) * shrunk, heights], axis=-1)
+        return np.stack(np.broadcast_arrays((columns - column) * shrunk, (row - rows) * shrunk, heights), axis=-1)
+
+    def look(self, shape: tuple[int, int], rows: np.ndarray, columns: np.ndarray) -> np.ndarray:  # (..., 3)
+        """Return v' of some pixels of a picture (H, W), of their rows and columns, float64; these broadcast."""
+        column, row = self.middle(shape)
+        tilts = (column - columns) / self.focal, (rows - row) / self.focal
+        return np.stack(np.broadcast_arrays(*tilts, 1.0), axis=-1)
 
     def height(self, logarithmic: np.ndarray) -> np.ndarray:
         """Return z of w = -f log(1 - z / f), what slopes integrate to, any shape."""
         if not self.is_perspective:
             return logarithmic
         return -self.focal * np.expm1(-logarithmic / self.focal)
+
+
+def _every(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows (H, 1) and columns (1, W) of every pixel."""
+    return np.arange(shape[0])[:, None], np.arange(shape[1])[None]
 
 
 ORTHOGRAPHIC = Camera()
@@ -186,12 +193,16 @@ class Capture:
 
     def places(self, heights: np.ndarray | None = None) -> np.ndarray:  # (H, W, 3)
         """Return (X - C) / R of every pixel, float64; of heights (H, W) in pixels, or at the object's mean depth."""
-        heights = np.zeros(self.shape) if heights is None else heights
-        return (self.camera.positions(heights) - self.centre) / self.radius
+        return self.place(*_every(self.shape), 0.0 if heights is None else heights)
 
-    def place(self, rows: np.ndarray, columns: np.ndarray, heights: np.ndarray) -> np.ndarray:  # (n, 3)
-        """Return (X - C) / R of some pixels, of their rows, columns and heights in pixels (n,), float64."""
+    def place(self, rows: np.ndarray, columns: np.ndarray, heights: np.ndarray | float) -> np.ndarray:  # (..., 3)
+        """Return (X - C) / R of some pixels, of their rows, columns and heights in pixels, float64; these broadcast."""
         return (self.camera.place(self.shape, rows, columns, heights) - self.centre) / self.radius
+
+
+def are_near(nearness: np.ndarray | None) -> TypeGuard[np.ndarray]:
+    """Return whether any lamp stands so near that it matters; None: all are taken for distant."""
+    return nearness is not None and bool(np.max(nearness, initial=0.0) > FAR)
 
 
 def reach(places: Array, directions: Array, nearness: Array) -> tuple[Array, Array]:

@@ -166,8 +166,7 @@ def _facing(unit: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:  
     if not camera.is_perspective:
         return unit[:, 2]
     rows, columns = np.nonzero(mask)  # of the mask alone: pictures are large
-    points = camera.place(mask.shape, rows, columns, np.zeros(len(unit)))
-    return unit[:, 2] - (unit * points).sum(axis=-1) / camera.focal
+    return (unit * camera.look(mask.shape, rows, columns)).sum(axis=-1)
 
 
 def _graph(unit: np.ndarray, facing: np.ndarray, mask: np.ndarray) -> _Graph:

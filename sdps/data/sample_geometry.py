@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.records.manifest import SceneSpec
-from render.records.view_geometry import image_points
+from render.records.view_geometry import image_points, incident
 from sdps.core.symmetry import Symmetry
 
 
@@ -92,12 +92,10 @@ def place(layout: Layout, mask: np.ndarray, directions: np.ndarray) -> Placed:
     radius = float(np.ptp(seen, axis=0).max() + pixel) / 2 * shrunk
     centre = np.array([*(seen.mean(axis=0) * shrunk), mean])
     tilts = -image / camera if perspective else np.zeros_like(image)
-    nearness, irradiance = np.zeros(len(directions)), np.ones(len(directions))
+    nearness = np.zeros(len(directions))
     if positions is not None:
-        off = positions - centre
-        away = np.linalg.norm(off, axis=1)
-        directions, nearness = off / away[:, None], radius / away
-        irradiance = (np.linalg.norm(positions - reference, axis=1) / away) ** 2
+        nearness = radius / np.linalg.norm(positions - centre, axis=1)
+    seen_from, irradiance = incident(centre[None], directions, positions, reference)
     sights = np.concatenate([tilts, np.ones((*depth.shape, 1))], axis=-1)
-    found = ((points - centre) / radius * mask[..., None], sights, directions, nearness, irradiance)
+    found = ((points - centre) / radius * mask[..., None], sights, seen_from[:, 0], nearness, irradiance[:, 0])
     return Placed(*(np.ascontiguousarray(part, np.float32) for part in found))

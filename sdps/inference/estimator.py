@@ -13,14 +13,14 @@ from render.shared.errors import InputError
 from render.shared.imaging.vectors import unit
 from render.shared.progress import repeat, share
 from sdps.core.estimate import Estimate
-from sdps.core.geometry import FAR, UNKNOWN, Capture, Rig
+from sdps.core.geometry import UNKNOWN, Capture, Rig, are_near
 from sdps.core.integration import integrate
 from sdps.core.intensities import check_intensities, colour_balance, grey, scale_to_mean
 from sdps.core.precision import Arithmetic, arithmetic
 from sdps.core.symmetry import SYMMETRIES
 from sdps.data.augment import measure_exposure
 from sdps.inference.chunked import lighting_prediction, normal_map, pad_to, pixel_normal_map
-from sdps.inference.image_source import ImageSource, ObjectImages, View, survey
+from sdps.inference.image_source import ImageSource, ObjectImages, Surface, View, survey
 from sdps.inference.inference_config import InferenceConfig
 from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES, release_memory, tiles
 from sdps.inference.turned_views import KeptView, TurnedView, mean_lights, mean_normals
@@ -49,7 +49,7 @@ class _Known(NamedTuple):
         if self.nearness is None:
             return found
         near = np.asarray(self.nearness, np.float32)
-        return replace(found, nearness=near if (near >= FAR).any() else None)
+        return replace(found, nearness=near if are_near(near) else None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -245,17 +245,18 @@ class Estimator(InferenceConfig):
         sees = isinstance(network, FusionNetwork) and network.sees_places
         if capture is None or not sees or not (near or capture.camera.is_perspective):
             return self._box_normals(scene, known, lights)
-        sights = capture.camera.sights(capture.shape)
+        surface = Surface(capture)
         if near:
             with share(0.0, 0.4):
-                rough = replace(self, normal_views=1)._box_normals(scene, known, lights, (capture.places(), sights))[0]
+                rough = replace(self, normal_views=1)._box_normals(scene, known, lights, surface)[0]
             heights = integrate(rough, scene.mask, discontinuities=True, camera=capture.camera).z
+            surface = Surface(capture, heights)
         with share(0.4 if near else 0.0, 1.0):
-            return self._box_normals(scene, known, lights, (capture.places(heights if near else None), sights))
+            return self._box_normals(scene, known, lights, surface)
 
     def _box_normals(
         self, scene: ObjectImages, known: _Known, lights: Lights | None,
-        placement: tuple[np.ndarray, np.ndarray] | None = None,
+        surface: Surface | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None, float]:  # fmt: skip
         """Return what is found in the object's box: normals (h, w, 3) float32, zero outside the mask, the errors to
         expect, (h, w) float32 where the network predicts them, and the factor of the exposure.
@@ -268,9 +269,7 @@ class Estimator(InferenceConfig):
         predicted = False
         for number, tile in enumerate(parts):
             window = tile.outer_rows, tile.outer_columns
-            part = replace(view, images=scene.part(*window))
-            if placement is not None:
-                part = replace(part, placement=tuple(np.ascontiguousarray(each[window]) for each in placement))
+            part = replace(view, images=scene.part(*window), placement=surface and surface.place(*window))
             with repeat(number, len(parts)):
                 normals, expected = self._normals(part, lights)  # padded
             inside = scene.mask[tile.inner]

@@ -5,7 +5,7 @@ Legend: L images, (H, W) their sides, (h, w) the sides of the object's box.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 from render.shared.errors import InputError
 from render.shared.progress import stage
 from render.shared.seeds import generator
+from sdps.core.geometry import Capture
 from sdps.data.augment import Exposure
 from sdps.inference.stray_light import remove_stray_light, stray_light
 
@@ -128,6 +129,25 @@ def survey(source: ImageSource, mask: np.ndarray, margin: int | None, *, stray: 
     return ObjectImages(source, rows, columns, mask[rows, columns], shape, level, remove_stray_light(sample, level))
 
 
+class Surface(NamedTuple):
+    """An object before its camera, and what is known of its depth.
+
+    Attributes:
+        capture: The object before its camera.
+        heights: (h, w) z in pixels; None: all at the object's mean depth.
+    """
+
+    capture: Capture
+    heights: np.ndarray | None = None
+
+    def place(self, rows: slice, columns: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the pixels of a part lie and how they are seen, (h, w, 3) float32 each."""
+        capture, heights = self.capture, 0.0 if self.heights is None else self.heights[rows, columns]
+        where = np.arange(rows.start, rows.stop)[:, None], np.arange(columns.start, columns.stop)[None]
+        sights = capture.camera.look(capture.shape, *where)
+        return capture.place(*where, heights).astype(np.float32), sights.astype(np.float32)
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """The object's images as a network wants them, in chunks.
@@ -164,7 +184,7 @@ class View:
         """The placement at the network's size, (1, 3, h', w') float32 each."""
         if self.placement is None:
             return None
-        pictures = (torch.from_numpy(each.astype(np.float32)).to(self.device) for each in self.placement)
+        pictures = (torch.from_numpy(each).to(self.device) for each in self.placement)
         return tuple(self.fit(each.permute(2, 0, 1)[None, None], self._mask())[0][:, 0] for each in pictures)
 
     def __iter__(self) -> Iterator[tuple[slice, Tensor]]:

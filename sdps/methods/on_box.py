@@ -28,11 +28,6 @@ def estimate_bytes(name: str, images: int, box: float) -> float:
     return min(whole, PART_BYTES) if classical.METHODS[name].by_pixel else whole
 
 
-def run_on_box(name: str, images: ImageSource, mask: np.ndarray, given: tuple[Any, ...]) -> Estimate:
-    """Run a classical method on the object's box; arguments as of `sdps.classical.registry.run`."""
-    return Box(name, images, mask).run(given)
-
-
 class Box:
     """Images of an object's box, for one run of a classical method or several; read once where they fit into memory.
 

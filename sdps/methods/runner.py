@@ -14,9 +14,9 @@ import numpy as np
 from render.records.shards import file_hash
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
-from sdps.classical.common.near_lamps import are_near, settle
+from sdps.classical.common.near_lamps import settle
 from sdps.core.estimate import Estimate, constant_estimate
-from sdps.core.geometry import UNKNOWN, Rig
+from sdps.core.geometry import UNKNOWN, Rig, are_near
 from sdps.core.metrics import score
 from sdps.inference.estimator import Estimator, default_device, load_model
 from sdps.inference.image_source import ImageSource
@@ -158,7 +158,7 @@ class Runner:
         else:
             run = partial(Box(name, images, mask).run, arguments)
 
-        if rig.nearness is None or not are_near(rig.nearness):
+        if not are_near(rig.nearness):
             return run()
         if not classical.METHODS[name].calibrated:
             _log.warning("%s takes the lamps for distant; how near they stand is not used", name)

@@ -22,7 +22,8 @@ from sdps.refinement.sites import Grid, place_sites
 
 
 def upsample(
-    values: np.ndarray, scene: ObjectImages, tile: Tile, coarse: Problem, grid: Grid, state: State, full: np.ndarray
+    values: np.ndarray, scene: ObjectImages, tile: Tile, coarse: Problem, grid: Grid, heights: np.ndarray | None,
+    state: State, full: np.ndarray,
 ) -> tuple[Problem, State]:  # fmt: skip
     """Return the problem of every pixel and the state there: interpolated between coarse pixels, but for the albedo.
 
@@ -32,6 +33,7 @@ def upsample(
         tile: Which part of it.
         coarse: The pixels of the coarse grid.
         grid: Where these lie.
+        heights: Of these, (h, w) in steps of the grid; None: lamps are distant, the camera is orthographic.
         state: On the coarse grid.
         full: (3, L), radiance at which a channel is clipped.
     """
@@ -42,11 +44,11 @@ def upsample(
     normals = up(state.normals.numpy())
     normals /= normals.norm(dim=1, keepdim=True)
     own = model._replace(normals=normals)
-    if coarse.sites is not None:
-        heights = grid.stride * up(grid.integrate(model.normals)[coarse.mask][:, None])[:, 0]
+    if heights is not None:
+        own_heights = grid.stride * up(heights[coarse.mask][:, None])[:, 0]
         rows, columns = np.nonzero(mask)
         rows, columns = rows + tile.outer_rows.start, columns + tile.outer_columns.start
-        problem = problem._replace(sites=place_sites(grid.capture, rows, columns, heights.numpy()))
+        problem = problem._replace(sites=place_sites(grid.capture, rows, columns, own_heights.numpy()))
     share = (coarse.images - coarse.remove_bounced(model, float(state.whiteness))) * (coarse.mean / problem.mean)
     for number in range(values.shape[2]):
         if coarse.bounced is not None:

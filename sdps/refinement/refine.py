@@ -116,22 +116,22 @@ def refine(
         state = move(problem, start, free=free, iterations=config.iterations)
         if stride == 1:
             return collect(scene, [(parts[0], problem, state)], state)
-        settle = partial(move, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=Weights(
-            curl=(config.fine_curl, config.fine_curl)))  # fmt: skip
-        fit = partial(upsample, coarse=problem, grid=grid, state=state, full=full)
-        return collect(scene, _refine_tiles(scene, parts, values, fit, settle), state)
+        weights = Weights(curl=(config.fine_curl, config.fine_curl))
+        settle = partial(move, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
+        return collect(scene, _refine_tiles(scene, parts, values, problem, grid, state, full, settle), state)
 
 
 def _refine_tiles(
-    scene: ObjectImages, parts: list[Tile], values: np.ndarray, fit: Callable[..., tuple[Problem, State]],
-    settle: Callable[[Problem, State], State],
+    scene: ObjectImages, parts: list[Tile], values: np.ndarray, coarse: Problem, grid: Grid, state: State,
+    full: np.ndarray, settle: Callable[[Problem, State], State],
 ) -> Iterator[tuple[Tile, Problem, State]]:  # fmt: skip
     """Yield the tiles with their refined pixels; `values` are those of all pixels if there is one tile."""
+    heights = None if coarse.sites is None else grid.integrate(build_model(state).normals)
 
     def refine_tile(tile: Tile) -> tuple[Tile, Problem, State]:  # holds nothing of one tile while the next is made
         part = scene.part(tile.outer_rows, tile.outer_columns)
         own = values if len(parts) == 1 else gather_pixels(part, part.mask)
-        problem, start = fit(own, scene, tile)
+        problem, start = upsample(own, scene, tile, coarse, grid, heights, state, full)
         return tile, problem, settle(problem, start)
 
     for tile in parts:

@@ -100,12 +100,9 @@ class Grid(NamedTuple):
 
 def place_sites(capture: Capture, rows: np.ndarray, columns: np.ndarray, heights: np.ndarray) -> Sites:
     """Return the sites of the pixels at rows (P,) and columns (P,) of a picture, of heights (P,) in pixels."""
-    camera, shape = capture.camera, capture.shape
-    places = (camera.place(shape, rows, columns, heights) - capture.centre) / capture.radius
-    flat = camera.place(shape, rows, columns, np.zeros(len(rows)))
-    sights = np.concatenate([-flat[:, :2] / camera.focal, np.ones((len(rows), 1))], axis=1)
-    found = torch.from_numpy(sights.astype(np.float32))
-    return Sites(torch.from_numpy(places.astype(np.float32)), found, turn_to_sight(found))
+    found = capture.place(rows, columns, heights), capture.camera.look(capture.shape, rows, columns)
+    places, sights = (torch.from_numpy(each.astype(np.float32)) for each in found)
+    return Sites(places, sights, turn_to_sight(sights))
 
 
 def select_grid(mask: np.ndarray, stride: int) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from sdps.core.estimate import Estimate
-from sdps.core.geometry import FAR
+from sdps.core.geometry import are_near
 from sdps.core.metrics import angle_degrees
 from sdps.refinement.image_model import Refined
 
@@ -77,7 +77,7 @@ def choose(start: Estimate, refined: Refined, expected: Trust) -> RefinedEstimat
     if not expected.doubt:
         values["normals"], values["light_directions"] = refined.normals, refined.light_directions
         values["intensities"] = refined.grey_intensities
-        values["nearness"] = refined.nearness if refined.nearness.max() >= FAR else None
+        values["nearness"] = refined.nearness if are_near(refined.nearness) else None
     return RefinedEstimate(**values)
 
 

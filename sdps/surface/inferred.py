@@ -17,7 +17,7 @@ from render.shared.files import atomic_path, write_json
 from render.shared.images import quantise, write_png
 from render.shared.progress import stage
 from sdps.core.estimate import Estimate
-from sdps.core.geometry import FAR, Capture
+from sdps.core.geometry import Capture, are_near
 from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import angle_degrees
 from sdps.inference.tiles import release_memory
@@ -101,10 +101,8 @@ class Inference:
     @property
     def near_lamps(self) -> Lamps | None:
         """Lamps before the surface; None where they count as distant."""
-        photos = self.photos
-        if self.nearness is None or not (self.nearness >= FAR).any():
-            return None
-        return Lamps(Capture.of(photos.mask, photos.camera), self.depth.z, self.nearness)
+        photos, nearness = self.photos, self.nearness
+        return Lamps(Capture.of(photos.mask, photos.camera), self.depth.z, nearness) if are_near(nearness) else None
 
     @cached_property
     def depth(self) -> Depth:

@@ -14,7 +14,7 @@ def measure_distances(nearness: np.ndarray | None, count: int) -> np.ndarray:  #
     """Return the lamps' distances in object sizes, float64, inf of distant ones; None: all `count` are."""
     distances = np.full(count, np.inf)
     if nearness is not None:
-        np.divide(0.5, nearness, out=distances, where=nearness >= FAR)  # the radius is half a size
+        np.divide(0.5, nearness, out=distances, where=nearness > FAR)  # the radius is half a size
     return distances
 
 

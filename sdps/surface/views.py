@@ -80,8 +80,7 @@ def _of_the_box(depth: Depth, colour: np.ndarray | None, side: int) -> tuple[Dep
     every = max(1, int(max(np.ptp(rows), np.ptp(columns))) // side)
     few = slice(rows[0], rows[-1] + 1, every), slice(columns[0], columns[-1] + 1, every)
     z = depth.z[few] if every == 1 else depth.z[few] / np.float32(every)
-    camera = depth.camera.crop(depth.mask.shape, int(rows[0]), int(columns[0])).scale(1.0 / every)
-    return replace(depth, z=z, mask=depth.mask[few], camera=camera), None if colour is None else colour[few]
+    return replace(depth, z=z, mask=depth.mask[few]), None if colour is None else colour[few]
 
 
 def strip(

@@ -16,11 +16,10 @@ from pipelines.app.pages.reflectance_tables import build_tables
 from pipelines.infer import depth_picture
 from pipelines.shared import pictures
 from render.shared.progress import stage
-from sdps.core.first_normals import turn_to_sight
 from sdps.core.geometry import Capture
 from sdps.core.intensities import grey
 from sdps.refinement.reflectance import shade
-from sdps.refinement.sites import Sites, see
+from sdps.refinement.sites import place_sites, see
 from sdps.surface.meshing import mesh, write_mesh
 
 if TYPE_CHECKING:
@@ -147,13 +146,12 @@ def _see_lamps(
     capture, mask, shape = Capture.of(photos.mask, photos.camera), photos.mask, normals.shape[:2]
     sides = (np.arange(side)[part] for side, part in zip(mask.shape, few, strict=True))
     rows, columns = (index.ravel() for index in np.meshgrid(*sides, indexing="ij"))
-    places = capture.place(rows, columns, np.where(mask[few], result.depth.z[few], 0.0).ravel())
-    places[~mask[few].ravel()] = 0.0  # where a near lamp might stand
-    sights = torch.from_numpy(photos.camera.thin(mask.shape, few[0].step).sights(shape).reshape(-1, 3))
-    sites = Sites(torch.from_numpy(places), sights, turn_to_sight(sights))
+    inside = mask[few].ravel()
+    sites = place_sites(capture, rows, columns, np.where(inside, result.depth.z[few].ravel(), 0.0))
+    sites.places[~torch.from_numpy(inside)] = 0.0  # where a near lamp might stand
     nearness = torch.zeros(len(lights)) if lamps is None else torch.from_numpy(lamps.nearness)
-    flat = torch.from_numpy(normals.reshape(-1, 3).astype(np.float64))
-    for light, near in zip(torch.from_numpy(lights), nearness, strict=True):
+    flat = torch.from_numpy(normals.reshape(-1, 3).astype(np.float32))
+    for light, near in zip(torch.from_numpy(lights.astype(np.float32)), nearness, strict=True):
         seen = see(flat, light[None], near[None], sites)
         assert seen.gain is not None  # since there are sites
         turned, towards = (values.numpy().reshape(*shape, 3) for values in (seen.normals, seen.directions))
@@ -169,5 +167,5 @@ def _mesh(result: "Inference", path: Path) -> None:
     colour = None
     if albedo is not None:
         colour = pictures.tone_map(albedo[few] / max(float(np.percentile(albedo[mask], 99)), 1e-9))
-    camera = result.depth.camera.scale(1.0 / step)
+    camera = result.depth.camera.thin(mask.shape, step)
     write_mesh(mesh(z[few] / step, mask[few], camera=camera, colour=colour, normals=result.normals[few]), path)

@@ -20,6 +20,7 @@ from render.exchange.layouts.foreign_samples import Source
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.images import bit_depth, read_image, to_unit
+from sdps.core.geometry import Camera
 from sdps.inference.inference_config import inference_config
 from sdps.methods import select
 
@@ -134,8 +135,6 @@ def diligent_objects(tree: Path, config: DiligentConfig) -> list[TestObject]:
 
 def _object(source: Source, config: DiligentConfig) -> TestObject:
     """Read what is small, and refer to the images."""
-    from sdps.core.geometry import Camera
-
     truth = source.truth()
     drop = _BEAR_CORRUPT if source.shape == "bear" and config.bear == 76 else 0
     if drop >= len(source.images):

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,9 +13,7 @@ from pipelines.evaluate.evaluation import TestObject
 from render.exchange.ingest import Box, crop_box
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
-
-if TYPE_CHECKING:
-    from sdps.core.geometry import Camera
+from sdps.core.geometry import Camera
 
 MARGIN = 15
 """Pixels kept around the mask's bounding box, as the published results do (SDPS-Net's preparation of DiLiGenT)."""
@@ -127,7 +125,7 @@ def build_object(
     longest: int = 0,
     files: Sequence[Path] = (),
     settings: tuple[object, ...] = (),
-    camera: "Camera | None" = None,
+    camera: Camera | None = None,
 ) -> TestObject:
     """Return an object of which the lights are known; its images stay on disk.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from render.shared.progress import repeat
 from sdps.core.estimate import Estimate
-from sdps.core.geometry import FAR, Camera, Capture, reach
+from sdps.core.geometry import Camera, Capture, reach
 from sdps.core.integration import integrate
 from sdps.core.metrics import angle_degrees
 
@@ -38,11 +38,6 @@ class NearLamps:
     def reach(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (P, L, 3), (P, L)
         """Return directions and falloff at every pixel (P, 3), of the lamps' directions (L, 3) from the middle."""
         return reach(self.places, directions, np.asarray(self.nearness, np.float64))
-
-
-def are_near(nearness: np.ndarray | None) -> bool:
-    """Tell whether a lamp is known to stand so near that it matters."""
-    return nearness is not None and bool(np.max(nearness, initial=0.0) > FAR)
 
 
 def settle(solve: Callable[[NearLamps], Estimate], mask: np.ndarray, nearness: np.ndarray, camera: Camera) -> Estimate:

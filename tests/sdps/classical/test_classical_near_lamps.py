@@ -8,8 +8,8 @@ import pytest
 from render.shared.errors import InputError
 from sdps import api
 from sdps.classical import registry
-from sdps.classical.common.near_lamps import NearLamps, are_near, settle
-from sdps.core.geometry import FAR, ORTHOGRAPHIC, Camera, Capture, reach
+from sdps.classical.common.near_lamps import NearLamps, settle
+from sdps.core.geometry import FAR, ORTHOGRAPHIC, Camera, Capture, are_near, reach
 from sdps.core.metrics import normal_mae
 from sdps.methods.on_box import Box
 

@@ -18,7 +18,7 @@ from sdps.inference.estimator import Estimator
 from sdps.inference.image_source import survey
 from sdps.inference.tiles import PIXEL_BYTES, tiles
 from sdps.methods import on_box
-from sdps.methods.on_box import estimate_bytes, run_on_box
+from sdps.methods.on_box import Box, estimate_bytes
 from sdps.models.base import Lights
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.frames import FusedMap
@@ -129,10 +129,10 @@ def test_a_part_reads_what_the_whole_reads(sphere: tuple) -> None:
 @pytest.mark.parametrize("name", ["least-squares-shadows", "position-threshold", "robust-least-squares"])
 def test_methods_by_pixel_see_some_rows_at_once(name: str, sphere: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
     images, mask = sphere
-    whole = run_on_box(name, images, mask, (LIGHTS, None)).normals
+    whole = Box(name, images, mask).run((LIGHTS, None)).normals
     monkeypatch.setattr(on_box, "PART_BYTES", 8 * 2**20)
     assert estimate_bytes(name, len(images), mask.size) == 8 * 2**20
-    np.testing.assert_allclose(run_on_box(name, images, mask, (LIGHTS, None)).normals, whole, atol=1e-6)
+    np.testing.assert_allclose(Box(name, images, mask).run((LIGHTS, None)).normals, whole, atol=1e-6)
     assert estimate_bytes("pf14", len(images), mask.size) > 8 * 2**20  # sees all at once
 
 
