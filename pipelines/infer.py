@@ -256,7 +256,7 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
     if result.residuals is not None:
         rows.append(("photographs against Lambert's law, relative RMS", f"{result.residuals.overall:.3f}"))
     rows += _refinement_rows(facts)
-    if "expected_normal_error_degrees" in facts and "refined" not in facts:
+    if "expected_normal_error_degrees" in facts and ("fused" in facts or "refined" not in facts):
         rows.append(("error of the normals to expect", f"{facts['expected_normal_error_degrees']}°"))
     note = f"Terms of the weights: {facts['terms']}." if facts["terms"] else ""
     tables = [checks, Table(title="Figures", header=("what", "value"), rows=tuple(rows), note=note)]
@@ -290,4 +290,13 @@ def _refinement_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         ("refinement moved normals, lights", f"{about['normals_moved_degrees']}°, {about['lights_moved_degrees']}°"),
         ("error of the refined normals to expect", f"{about['expected_normal_error_degrees']}°"),
         ("photographs not explained", f"{len(unexplained)}{_list_images(unexplained)}"),
+        *_fusion_rows(facts.get("fused")),
     ]
+
+
+def _fusion_rows(about: dict[str, float] | None) -> list[tuple[str, str]]:
+    """Return what the table of figures says of joining."""
+    if about is None:
+        return []
+    away = f"{about['from_network_degrees']}°, {about['from_refinement_degrees']}°"
+    return [("joined normals are away from the network's, the refined ones", away)]

@@ -32,14 +32,14 @@ from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
 from sdps.methods.light_witness import question_lights, see_lights
-from sdps.methods.method import REFINE, Method
-from sdps.methods.parse import parse, uses_networks, with_refinement
+from sdps.methods.method import Method
+from sdps.methods.parse import AFTER, can_fuse, parse, uses_networks, with_fusion, with_refinement
 from sdps.methods.runner import Runner
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load
 from sdps.photos.faults import ANYWAY
 from sdps.photos.light_files.light_advice import advise
-from sdps.refinement.trust import FEWEST_IMAGES
+from sdps.refinement.trust import FEWEST_IMAGES, FEWEST_TO_FUSE
 from sdps.surface.inferred import Inference, check_out
 from sdps.surface.workload import Workload, workload
 from sdps.training.trainer import TrainingResult
@@ -75,8 +75,9 @@ def infer(
             `auto` for the best there is: a pretrained network, or a classical method where there is none.
         models: Folder of trained runs (`out` of `train`) to take weights from before the pretrained ones.
         config: How networks are used; the defaults are those of every command.
-        refine: Refine normals and lights by inverse rendering (`sdps.refinement`); the same as `+refine` at the end of
-            `method`. None: where a network finds the normals, from eight images on.
+        refine: Refine normals and lights by inverse rendering (`sdps.refinement`), and join that with what the network
+            says (`sdps.fusion`) where it tells its errors; the same as `+fuse` at the end of `method`, or else
+            `+refine`. None: where a network finds the normals and the images are enough.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
         anyway: Go on where the checks found an error. The method may still find that it cannot.
@@ -274,11 +275,16 @@ def _runner(
 ) -> Runner:  # fmt: skip
     """Return the method of an expression with its networks; `known`: light directions, intensities."""
     find = _finder(models)
-    plain = method.removesuffix(f"+{REFINE}")
+    plain, _, after = method.rpartition("+")
+    plain = plain if after in AFTER else method
     chosen = _adapt(_automatic(known[0], find) if plain == AUTO else plain, known, find)
+    if plain != method:
+        return Runner(AFTER[after](chosen), find, config)
+    fuses = can_fuse(chosen)
     if refine is None:
-        refine = uses_networks(chosen) and images >= FEWEST_IMAGES
-    return Runner(with_refinement(chosen) if refine or plain != method else chosen, find, config)
+        refine = uses_networks(chosen) and images >= (FEWEST_TO_FUSE if fuses else FEWEST_IMAGES)
+    finish = with_fusion if fuses else with_refinement
+    return Runner(finish(chosen) if refine else chosen, find, config)
 
 
 def _adapt(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> Method:

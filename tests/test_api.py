@@ -185,11 +185,11 @@ def test_methods_that_can_be_used_are_listed():
     ("lit", "refine", "images", "expected"),
     [
         (False, False, 96, "sdps-frames (lightset + frames)"),
-        (False, None, 7, "sdps-frames (lightset + frames)"),  # too few to refine
-        (False, None, 96, "sdps-frames (lightset + frames), refined"),
-        (False, True, 7, "sdps-frames (lightset + frames), refined"),
+        (False, None, 3, "sdps-frames (lightset + frames)"),  # too few to refine
+        (False, None, 96, "sdps-frames (lightset + frames), fused"),
+        (False, True, 7, "sdps-frames (lightset + frames), fused"),
         (True, False, 96, "frames, given lights"),
-        (True, None, 96, "frames, given lights, refined"),
+        (True, None, 96, "frames, given lights, fused"),
     ],
 )
 def test_the_automatic_method_depends_on_what_follows(

@@ -37,7 +37,7 @@ from sdps.refinement.image_model import Refined
 from sdps.refinement.refine import refine
 from sdps.refinement.trust import NORMAL, Trust, features, trust
 
-_PRESET = Path(__file__).with_suffix(".yaml")
+PRESET = Path(__file__).parents[1] / "presets" / "refinement_study.yaml"
 _NARROW = np.cos(np.radians(50.0))
 _LOSS = 0.3  # degrees; what counts as losing
 _OFFSET = 0.05  # degrees, added before the logarithm
@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=1, help="take every so many scenes")
     parser.add_argument("--fit", action="store_true", help="print the constants of sdps/refinement/trust.py")
     args = parser.parse_args(argv)
-    folder = args.merltest or load_scenes(args.out / "scenes")
+    folder = args.merltest or render_scenes(PRESET, args.out / "scenes")
     specs = list(enumerate(read_manifest(folder)))[:: args.every]
     results = []
     for (number, spec), images in tqdm([(spec, images) for images in args.images for spec in specs], disable=None):
@@ -86,8 +86,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def load_scenes(out: Path) -> Path:
-    command = [sys.executable, "-m", "pipelines.cli", "render-data", "--preset", str(_PRESET), "--out", str(out)]
+def render_scenes(preset: Path, out: Path) -> Path:
+    """Render the scenes of a preset that are not there yet; return their folder."""
+    command = [sys.executable, "-m", "pipelines.cli", "render-data", "--preset", str(preset), "--out", str(out)]
     subprocess.run(command, check=True)
     return out / "data" if (out / "data").is_dir() else out
 

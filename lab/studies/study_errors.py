@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.studies.refinement_study import Scene, load_scenes
+from lab.studies.refinement_study import PRESET, Scene, render_scenes
 from render.records.manifest import read_manifest
 from render.shared.errors import InputError
 from sdps.inference.inference_config import InferenceConfig
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--models", type=Path, help="folder of runs whose weights come before the pretrained ones")
     parser.add_argument("--every", type=int, default=1, help="take every so many scenes")
     args = parser.parse_args(argv)
-    folder = load_scenes(args.out / "scenes")
+    folder = render_scenes(PRESET, args.out / "scenes")
     specs, find = read_manifest(folder)[:: args.every], finder(args.models)
     for name in args.methods.split(","):
         runner = Runner(parse(name, find), find, InferenceConfig(light_views=8))

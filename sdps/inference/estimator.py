@@ -129,7 +129,7 @@ class Estimator(InferenceConfig):
             InputError: sizes that do not fit, non-finite values, an empty mask, lights wanted without a lighting
                 model, or lights found though they are given.
         """
-        if self.needs_lights and self.lighting is None and lights is None:
+        if self.needs_lights and self.lighting is None and lights is None and found is None:
             raise InputError("no lighting model was loaded, so light directions must be given")
         began = time.perf_counter() - (found.seconds if found is not None else 0.0)
         scene, known = self._prepare(images, mask, lights, intensities, rig)
@@ -148,6 +148,21 @@ class Estimator(InferenceConfig):
             exposure=found.exposure | {"normals": exposure},
             seconds=time.perf_counter() - began,
         )
+
+    def look_again(self, images: ImageSource, mask: np.ndarray, lit: Estimate, *, rig: Rig = UNKNOWN) -> Estimate:
+        """Estimate normals once more, under lights that something else found.
+
+        Args:
+            images, mask, rig: As in `estimate`; nearness comes with the lights.
+            lit: Directions, intensities, nearness, and the errors to expect of directions; None: they are exact.
+
+        Raises:
+            InputError: as in `estimate`.
+        """
+        scaled = scale_to_mean(lit.intensities.astype(np.float64), self._mean_intensity()).astype(np.float32)
+        errors = np.zeros(len(images), np.float32) if lit.expected_light_error is None else lit.expected_light_error
+        found = replace(lit, intensities=scaled, expected_light_error=errors, seconds=0.0)
+        return self.estimate(images, mask, found=found, rig=replace(rig, nearness=lit.nearness))
 
     @torch.inference_mode()
     def estimate_lights(self, images: ImageSource, mask: np.ndarray, intensities: np.ndarray | None = None) -> Estimate:

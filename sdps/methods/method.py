@@ -13,8 +13,8 @@ NONE = ""
 CONSTANT = "constant"
 """A predictor that sees nothing: what knowing nothing scores."""
 CLASSICAL = (*classical.METHODS, CONSTANT)
-REFINE = "refine"
-"""Last part of an expression: refine what the parts before it find."""
+REFINE, FUSE = "refine", "fuse"
+"""Last part of an expression: refine what the parts before it find, or join that with what the network says then."""
 VIEWS = ("light_views", "normal_views")
 
 
@@ -32,6 +32,7 @@ class Method:
             None for one.
         normal_views: The same for normals.
         refined: Refine what it finds by inverse rendering (`sdps.refinement`).
+        fused: Then ask its network again and join both answers (`sdps.fusion`).
         paper: Row of the paper's table.
     """
 
@@ -43,6 +44,7 @@ class Method:
     light_views: int | None = None
     normal_views: int | None = None
     refined: bool = False
+    fused: bool = False
     paper: str = ""
 
     def models(self) -> set[str]:

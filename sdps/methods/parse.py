@@ -7,7 +7,7 @@ from pathlib import Path
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.methods import pretrained
-from sdps.methods.method import CLASSICAL, CONSTANT, NONE, REFINE, Method, join, label, stem
+from sdps.methods.method import CLASSICAL, CONSTANT, FUSE, NONE, REFINE, Method, join, label, stem
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
 
@@ -48,19 +48,20 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
         text: A combination (`sdps`), a normal model (`nenet`), a classical method (`pf14`), a lighting model alone
             (`lcnet`), or lights and normals (`lcnet+psfcn`, `true+least-squares`). Calibrated methods alone are given
             the true lights, networks alone what they were trained on; `shipped:` before a name means the pretrained
-            weights. `+refine` at the end refines what was found.
+            weights. `+refine` at the end refines what was found, `+fuse` joins that with the network's own answer.
         find: Gives the weights file of a name, or raises InputError.
 
     Raises:
         InputError: an unknown name, weights that are not there, or parts that do not go together.
     """
     parts = [part.strip() for part in text.split("+")]
-    if parts == [REFINE]:
-        raise InputError(f"method {text}: say what is refined, as in sdps-plus+{REFINE}")
-    if parts[-1] == REFINE:
-        return with_refinement(parse("+".join(parts[:-1]), find))
+    last = parts[-1]
+    if last in AFTER:
+        if len(parts) == 1:
+            raise InputError(f"method {text}: say what is refined, as in sdps-frames+{last}")
+        return AFTER[last](parse("+".join(parts[:-1]), find))
     if not all(parts) or len(parts) > 2:
-        raise InputError(f"method {text!r}: want METHOD or LIGHTS+NORMALS, either with +{REFINE}")
+        raise InputError(f"method {text!r}: want METHOD or LIGHTS+NORMALS, either with +{REFINE} or +{FUSE}")
     if len(parts) == 2:
         return combine(parts[0], parts[1], None, find)
     (name,) = parts
@@ -87,6 +88,28 @@ def with_refinement(method: Method) -> Method:
     if method.normals in (NONE, CONSTANT):
         raise InputError(f"method {method.name}+{REFINE}: refinement needs a method that gives normals")
     return replace(method, name=f"{method.name}, refined", refined=True, paper="")
+
+
+def with_fusion(method: Method) -> Method:
+    """Return a method whose answer is joined from its network's and from refinement's (`sdps.fusion`).
+
+    Raises:
+        InputError: its normals are not those of a network that tells the error to expect.
+    """
+    if not can_fuse(method):
+        raise InputError(
+            f"method {method.name}+{FUSE}: needs a network that tells its errors, as in sdps-frames+{FUSE}"
+        )
+    return replace(method, name=f"{method.name}, fused", refined=True, fused=True, paper="")
+
+
+def can_fuse(method: Method) -> bool:
+    """Return whether the normals are those of a network that tells the error to expect."""
+    return stem(method.normals).removeprefix(pretrained.SHIPPED).startswith("frames")
+
+
+AFTER = {REFINE: with_refinement, FUSE: with_fusion}
+"""What the last part of an expression does to the method before it."""
 
 
 def uses_networks(method: Method) -> bool:

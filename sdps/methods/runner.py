@@ -27,6 +27,8 @@ from sdps.models.registry import TRUE_LIGHTS
 
 if TYPE_CHECKING:
     from sdps.models.checkpoint import TrainedModel
+    from sdps.refinement.refine import RefineConfig
+    from sdps.refinement.trust import RefinedEstimate
 
 _digest = cache(file_hash)
 _log = logging.getLogger(__name__)
@@ -48,13 +50,18 @@ class Runner:
         method: What to do.
         find: Gives the weights file of a name, or raises InputError.
         config: How networks are used; what the method itself says of its read-out and views is filled in.
+        refining: How it is refined, if it is.
 
     Raises:
         InputError: weights that are missing, damaged, or of another role.
     """
 
-    def __init__(self, method: Method, find: Callable[[str], Path], config: InferenceConfig | None = None) -> None:
+    def __init__(
+        self, method: Method, find: Callable[[str], Path], config: InferenceConfig | None = None,
+        refining: "RefineConfig | None" = None,
+    ) -> None:  # fmt: skip
         self.method, self.config = method, _fill_config(config or InferenceConfig(), method)
+        self.refining = refining
         self.files = {name: find(name) for name in sorted(method.models())}
 
         def model(name: str) -> "TrainedModel | None":
@@ -71,12 +78,18 @@ class Runner:
         """Return a digest of what results depend on besides images and code: weights, settings and arithmetic."""
         method = self.method
         names = {place: getattr(method, place) for place in _PLACES}
-        parts: list[Any] = [method.intensities, method.refined]
+        parts: list[Any] = [method.intensities, method.refined, method.fused, self.refining, *self._fusion()]
         parts += [(place, _digest(self.files[name]) if name in self.files else name) for place, name in names.items()]
         if self.estimator is not None:
             used = self.config.options() | {"precision": self.estimator.arithmetic.precision}
             parts += [used, str(self.estimator.device)]
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+    def _fusion(self) -> list[str]:
+        """Return a digest of the weights that join, where they do."""
+        from sdps.fusion.fuse import WEIGHTS
+
+        return [_digest(WEIGHTS)] if self.method.fused and WEIGHTS.is_file() else []
 
     def estimate(
         self,
@@ -184,10 +197,28 @@ class Runner:
         lit = given.get("lights") is not None
         refined = refine(
             images, mask, estimate.normals, estimate.light_directions, begun,
-            directions_given=lit, stray=self.config.stray_light, saturation=saturation, rig=rig,
+            directions_given=lit, config=self.refining, stray=self.config.stray_light, saturation=saturation,
+            rig=rig,
         )  # fmt: skip
         expected = trust(refined, mask, estimate, given=lit)
-        return choose(estimate, refined, expected)
+        chosen = choose(estimate, refined, expected)
+        return self._fuse(images, mask, chosen, lit, rig) if self.method.fused and not expected.blind else chosen
+
+    def _fuse(
+        self, images: ImageSource, mask: np.ndarray, found: "RefinedEstimate", lit: bool, rig: Rig
+    ) -> Estimate:  # fmt: skip
+        """Ask the network again under refined lights, and join its answer with that of refinement."""
+        from sdps.fusion.evidence import gather
+        from sdps.fusion.fuse import fuse
+
+        assert self.estimator is not None  # the method has a network
+        refined, near = found.refined, found.refined.nearness
+        lights = Estimate(
+            found.start.normals[:0, :0], refined.light_directions, refined.grey_intensities,
+            nearness=near if are_near(near) else None,
+        )  # fmt: skip
+        again = self.estimator.look_again(images, mask, lights, rig=rig)
+        return fuse(found, gather(mask, found.start, refined, again, found.trust, lit=lit), mask)
 
     def score(
         self,

@@ -92,13 +92,13 @@ def collect(scene: ObjectImages, parts: Iterable[tuple[Tile, Problem, State]], s
         state: Holds what is the same in all tiles.
     """
     normals, albedo = np.zeros((2, *scene.shape, 3), np.float32)
-    strength, residual = np.zeros((2, *scene.shape), np.float32)
+    strength, residual, used = np.zeros((3, *scene.shape), np.float32)
     by_image, model = torch.zeros(len(scene)), build_model(state)
     for tile, problem, own in parts:
         found, of_images = _evaluate_tile(tile, problem, own, scene.mask[tile.inner])
         del problem, own  # before the next tile is made
         by_image += of_images
-        for picture, values in zip((normals, albedo, strength, residual), found, strict=True):
+        for picture, values in zip((normals, albedo, strength, residual, used), found, strict=True):
             picture[scene.rows, scene.columns][tile.inner][scene.mask[tile.inner]] = values
     return Refined(
         normals=normals,
@@ -113,11 +113,12 @@ def collect(scene: ObjectImages, parts: Iterable[tuple[Tile, Problem, State]], s
         nearness=model.nearness.numpy(),
         pixel_residual=residual,
         image_residual=(by_image / int(scene.mask.sum())).numpy(),
+        used=used,
     )
 
 
 def _evaluate_tile(tile: Tile, problem: Problem, state: State, inside: np.ndarray) -> tuple[list[np.ndarray], Tensor]:
-    """Return normals, albedo, strength and residual of the inner part's pixels, and residuals summed over them (L,)."""
+    """Return what `collect` puts together of the inner part's pixels, and residuals summed over them (L,)."""
     model, inner = build_model(state), np.zeros(problem.mask.shape, bool)
     inner[tile.within] = inside
     chosen = torch.from_numpy(inner[problem.mask])
@@ -128,5 +129,5 @@ def _evaluate_tile(tile: Tile, problem: Problem, state: State, inside: np.ndarra
         gaps = measure_differences(model.select(part), images[part], problem.usable[part] == 0.0, sites)
         by_pixel[part] = gaps.mean(dim=(1, 2))
         by_image += gaps[chosen[part]].mean(dim=1).sum(dim=0)
-    found = (model.normals, model.albedo, model.strength, by_pixel)
+    found = (model.normals, model.albedo, model.strength, by_pixel, problem.usable.mean(dim=1))
     return [values[chosen].numpy() for values in found], by_image

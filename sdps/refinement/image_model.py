@@ -168,6 +168,7 @@ class Refined:
         nearness: (L,) float32, rho of the lamps (`sdps.core.geometry`); 0 where they are taken for distant.
         pixel_residual: (H, W) float32, mean robust difference, zero outside the mask.
         image_residual: (L,) float32, the same of each image.
+        used: (H, W) float32, share of the images that are not in shadow or clipped there.
     """
 
     normals: np.ndarray
@@ -182,6 +183,7 @@ class Refined:
     nearness: np.ndarray
     pixel_residual: np.ndarray
     image_residual: np.ndarray
+    used: np.ndarray
 
     @property
     def grey_intensities(self) -> np.ndarray:

@@ -18,6 +18,8 @@ from sdps.refinement.image_model import Refined
 
 FEWEST_IMAGES = 8
 """With fewer, what a method found is kept."""
+FEWEST_TO_FUSE = 4
+"""With fewer, there is nothing to join: refinement wants so many."""
 _PLANE = 0.08
 """Lights are taken to lie in one plane with the object if they leave it by less, root mean square."""
 _FLAT = 0.1
@@ -48,12 +50,16 @@ class Trust(NamedTuple):
         lights: (L,) float32, expected error in degrees; None where the directions were given: they may be exact or not.
         start: Expected mean error of the start's normals in degrees.
         doubt: Why the start is to be kept, in one line; empty where refinement is better.
+        blind: Photographs such as these cannot show the shape; refinement's word is worth nothing.
+        plain: (H, W) float32, `normals` by what refinement left over alone, without the network's word.
     """
 
     normals: np.ndarray
     lights: np.ndarray | None
     start: float
     doubt: str
+    blind: bool
+    plain: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,15 +102,16 @@ def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = Fa
     for of_normals in parts:
         plainly.append(np.exp(of_normals[:, : len(NORMAL)] @ NORMAL))
         values.append(np.exp(of_normals @ NORMAL_TOLD) if told else (_GIVEN if given else 1.0) * plainly[-1])
-    expected, plain = np.zeros(mask.shape, np.float32), np.concatenate(plainly)
-    expected[mask] = np.concatenate(values)
-    of_start, mean = float(np.exp(moved @ START)), float(plain.mean())
-    doubt = _doubt(mask, start.normals, start.light_directions)
+    expected, plain = np.zeros((2, *mask.shape), np.float32)
+    expected[mask], plain[mask] = np.concatenate(values), np.concatenate(plainly)
+    of_start, mean = float(np.exp(moved @ START)), float(plain[mask].mean())
+    blind = _find_blindness(mask, start.normals, start.light_directions)
+    doubt = blind or _count_images(len(found.light_directions))
     # What a network tells raises both sides, so it is left out here.
     if not doubt and not given and mean > of_start:
         doubt = f"the model does not explain the photographs: {mean:.1f} degrees expected, {of_start:.1f} without it"
     of_light = None if given else np.exp(of_lights @ LIGHT).astype(np.float32)
-    return Trust(expected, of_light, of_start, doubt)
+    return Trust(expected, of_light, of_start, doubt, bool(blind), plain)
 
 
 def features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -115,13 +122,18 @@ def features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.ndar
     return np.concatenate(list(parts)), of_lights, moved
 
 
+def measure_spread(lights: np.ndarray) -> float:
+    """Return how far lights (L, 3) lie from their mean, root mean square."""
+    return float(np.sqrt(max(lights.var(axis=0).sum(), _LEAST)))
+
+
 def _features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.ndarray, np.ndarray, Iterator[np.ndarray]]:
     """Return the features of lights, start and pixels, these a part at a time."""
     normals, lights = start.normals, start.light_directions
     images = len(lights)
     residual = float(found.pixel_residual[mask].mean())
     misfit, count = np.log(max(residual - _BEST, _LEAST)), np.log(images)
-    spread = 0.5 * np.log(max(found.light_directions.var(axis=0).sum(), _LEAST))
+    spread = np.log(measure_spread(found.light_directions))
     share = ndimage.uniform_filter(mask.astype(np.float32), _WINDOW)[mask]
     around = ndimage.uniform_filter(np.where(mask, found.pixel_residual, 0.0), _WINDOW)[mask] / share
     turned = angle_degrees(found.normals[mask], normals[mask])
@@ -149,10 +161,15 @@ def _features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.nda
     return of_lights, moved, (of_normals(part) for part in parts)
 
 
-def _doubt(mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> str:
+def _count_images(images: int) -> str:
+    """Return that these are too few, if they are."""
+    if images >= FEWEST_IMAGES:
+        return ""
+    return f"{images} images are too few to refine with; {FEWEST_IMAGES} are needed"
+
+
+def _find_blindness(mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> str:
     """Return why photographs such as these cannot show the shape, or nothing."""
-    if len(lights) < FEWEST_IMAGES:
-        return f"{len(lights)} images are too few to refine with; {FEWEST_IMAGES} are needed"
     if np.linalg.svd(lights, compute_uv=False)[-1] / np.sqrt(len(lights)) < _PLANE:
         return "the lights lie in one plane with the object, so photographs cannot show its shape"
     if np.sqrt(np.square(normals[mask] - normals[mask].mean(axis=0)).sum(axis=1).mean()) < _FLAT:

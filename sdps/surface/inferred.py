@@ -20,6 +20,8 @@ from sdps.core.estimate import Estimate
 from sdps.core.geometry import Capture, are_near
 from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import angle_degrees
+from sdps.fusion.evidence import find_box
+from sdps.fusion.fuse import FusedEstimate
 from sdps.inference.tiles import release_memory
 from sdps.methods import pretrained
 from sdps.photos import Finding, Photographs, write_lights
@@ -132,7 +134,8 @@ class Inference:
         predicts it. Where refinement was not kept it is the network's, if there is one.
         """
         found, own = self.refinement, self.estimate.expected_error
-        return own if found is None or (found.trust.doubt and own is not None) else found.trust.normals
+        kept = found is not None and not found.trust.doubt and not isinstance(found, FusedEstimate)
+        return found.trust.normals if found is not None and (kept or own is None) else own
 
     @cached_property
     def verdict(self) -> str:
@@ -214,6 +217,8 @@ class Inference:
             facts["expected_normal_error_degrees"] = round(float(self.expected_error[photos.mask].mean()), 2)
         if self.refinement is not None:
             facts["refined"] = _about_refined(self.refinement, photos)
+        if isinstance(self.estimate, FusedEstimate):
+            facts["fused"] = _about_fused(self.estimate, photos.mask)
         if self.residuals is not None:
             facts["lambertian_residual"] = round(self.residuals.overall, 4)
         return facts
@@ -321,6 +326,16 @@ def _about_refined(found: RefinedEstimate, photos: Photographs) -> dict[str, Any
         "body": refined.body.round(4).tolist(),
         "modes": refined.modes.round(4).tolist(),
         "lobes": {"amplitudes": refined.amplitudes.round(4).tolist(), "sharpness": refined.sharpness.round(1).tolist()},
+    }
+
+
+def _about_fused(found: FusedEstimate, mask: np.ndarray) -> dict[str, float]:
+    """Say how far the joined normals are from both witnesses, in degrees; JSON ready."""
+    box, evidence = find_box(mask), found.evidence
+    pairs = {"network": evidence.network, "refinement": evidence.refined}
+    return {
+        f"from_{name}_degrees": round(_mean_angle(found.normals[box], normals, evidence.mask), 2)
+        for name, normals in pairs.items()
     }
 
 

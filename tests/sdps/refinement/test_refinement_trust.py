@@ -1,7 +1,6 @@
 """What refinement is expected to be worth, and when the start is kept."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -45,7 +44,7 @@ def found(residual: float, lights: np.ndarray) -> Refined:
         normals=normals, light_directions=lights, intensities=np.ones((len(lights), 3)), albedo=normals,
         strength=mask.astype(np.float32), body=np.zeros(4), amplitudes=np.zeros(8), sharpness=np.ones(8),
         modes=np.zeros(6), nearness=np.zeros(len(lights)), image_residual=images,
-        pixel_residual=np.where(mask, residual, 0.0).astype(np.float32),
+        pixel_residual=np.where(mask, residual, 0.0).astype(np.float32), used=mask.astype(np.float32),
     )  # fmt: skip
 
 
@@ -103,13 +102,12 @@ def test_what_cannot_be_trusted_is_doubted(normals: str, lights: np.ndarray, res
 
 
 @pytest.mark.parametrize("count", [FEWEST_IMAGES - 1, FEWEST_IMAGES], ids=["doubted", "trusted"])
-def test_a_doubted_refinement_leaves_what_the_method_found(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+def test_a_doubted_refinement_leaves_what_the_method_found(count: int) -> None:
     normals, mask = dome()
     lights = around(count)
     images = np.maximum(np.einsum("hwc,lc->lhw", normals, lights), 0.0)[..., None].repeat(3, axis=-1).astype(np.float32)
     quick = refining.RefineConfig(coarse_pixels=200, iterations=3, fine_iterations=0)
-    monkeypatch.setattr(refining, "refine", partial(refining.refine, config=quick))
-    runner = Runner(parse("true+least-squares+refine", pretrained.require), pretrained.require)
+    runner = Runner(parse("true+least-squares+refine", pretrained.require), pretrained.require, refining=quick)
     estimate = runner.estimate(images, mask, lights, np.ones(count, np.float32))
     start, expected = estimate.start, estimate.trust
     assert isinstance(start, Estimate) and bool(expected.doubt) == (count < FEWEST_IMAGES)
@@ -120,7 +118,7 @@ def test_refinement_is_the_default_where_a_network_finds_the_normals() -> None:
     cases = {("auto", False): True, ("lcnet+psfcn", False): True, ("auto", True): True, ("pf14", False): False}
     for (method, lit), wanted in cases.items():
         assert _runner(method, (lit, False), None, None, None, images=FEWEST_IMAGES).method.refined == wanted, method
-    assert not _runner("auto", (False, False), None, None, None, images=FEWEST_IMAGES - 1).method.refined
+    assert not _runner("lcnet+psfcn", (False, False), None, None, None, images=FEWEST_IMAGES - 1).method.refined
     assert not _runner("auto", (False, False), None, None, False, images=96).method.refined
     assert _runner("pf14", (False, False), None, None, True, images=96).method.refined
 

@@ -1,0 +1,126 @@
+"""Make what the fusion network learns from: rendered scenes, answered by networks and by refinement.
+
+    python -m lab.releases.fusion_data out/fusion
+
+renders the scenes of `lab/presets/fusion.yaml` into `out/fusion/scenes` and answers them; `--part 0/2` answers every
+second one. Each becomes a file with the evidence, the truth and how far lights were off. What is there stays, so a run
+that was stopped goes on. The photographs of a scene, 4 to 48 of them, have random intensities, bits, and clipping.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from lab.studies.refinement_study import render_scenes
+from render.records.manifest import SceneSpec, read_manifest
+from render.records.shards import read_shard
+from render.shared.files import atomic_path
+from render.shared.seeds import generator
+from sdps.core.geometry import UNKNOWN, Camera, Rig
+from sdps.core.metrics import angle_degrees
+from sdps.data.sample_geometry import lay_out, place
+from sdps.fusion.evidence import find_box
+from sdps.fusion.fuse import FusedEstimate
+from sdps.inference.inference_config import InferenceConfig
+from sdps.methods.parse import parse
+from sdps.methods.pretrained import finder
+from sdps.methods.runner import Runner
+from sdps.refinement.refine import RefineConfig
+
+PRESET = Path(__file__).parents[1] / "presets" / "fusion.yaml"
+_COUNTS, _SHARES = ((4, 12), (12, 32), (48, 48)), (0.3, 0.5, 0.2)
+"""Numbers of photographs, evenly over their logarithm, and how often."""
+_LENS_KNOWN, _LIT = 0.75, 0.15
+_QUICK = RefineConfig(coarse_pixels=1200, iterations=500, iterations_before=200, fine_iterations=80)
+_BITS = (8, 8, 12, 16)
+
+
+class Photographs:
+    """A rendered scene as somebody photographs it.
+
+    Args:
+        folder: Of the scenes.
+        spec: The scene.
+    """
+
+    def __init__(self, folder: Path, spec: SceneSpec) -> None:
+        shard, rng = read_shard(folder / spec.file, spec), generator(11, spec.id, "fusion")
+        lights = shard.light_directions
+        low, high = _COUNTS[rng.choice(len(_COUNTS), p=_SHARES)]
+        count = round(float(np.exp(rng.uniform(np.log(low), np.log(min(high, len(lights)))))))
+        chosen = np.sort(rng.permutation(len(lights))[:count])
+        self.mask, self.normals = shard.mask, shard.normals
+        layout = lay_out(spec, shard.depth, shard.mask, chosen)
+        self.placed = place(layout, shard.mask, lights[chosen])
+        gains = rng.uniform(0.3, 2.0, count).astype(np.float32)
+        radiance = shard.images[chosen].astype(np.float32) * shard.mask[..., None] * gains[:, None, None, None]
+        full = float(np.quantile(radiance[:, shard.mask], rng.uniform(0.99, 1.0)))
+        self.images = quantise(np.clip(radiance / full, 0.0, 1.0), int(rng.choice(_BITS)))
+        self.gains = gains * self.placed.irradiance
+        lens = spec.view.camera_distance
+        known = lens is not None and rng.random() < _LENS_KNOWN
+        self.rig = Rig(Camera(lens * shard.mask.shape[1] / 2)) if known else UNKNOWN
+        self.lit = bool(rng.random() < _LIT)
+
+
+def quantise(radiance: np.ndarray, bits: int) -> np.ndarray:
+    """Return radiance in [0, 1] as photographs of so many bits keep it; those of 8 along a curve of a square root."""
+    steps = 2**bits - 1
+    if bits == 8:
+        return np.square(np.round(np.sqrt(radiance) * steps) / steps)
+    return np.round(radiance * steps) / steps
+
+
+def answer(shown: Photographs, lit: Runner, unlit: Runner) -> dict[str, np.ndarray]:
+    """Return the evidence of a scene, its true normals, and degrees by which lights are off, before and after."""
+    lights, gains = (shown.placed.directions, shown.gains) if shown.lit else (None, None)
+    rig = Rig(shown.rig.camera, shown.placed.nearness) if shown.lit and shown.placed.nearness.any() else shown.rig
+    found = (lit if shown.lit else unlit).estimate(shown.images, shown.mask, lights, gains, saturation=1.0, rig=rig)
+    if not isinstance(found, FusedEstimate):
+        return {}
+
+    def off(directions: np.ndarray) -> float:
+        return float(angle_degrees(directions, shown.placed.directions).mean())
+
+    kept = found.evidence.arrays() | {"truth": shown.normals[find_box(shown.mask)]}
+    pairs = {"lights_start": found.start, "lights_refined": found.refined}
+    measured = {name: off(lights.light_directions) for name, lights in pairs.items()}
+    measured["rho"] = float(shown.placed.nearness.mean())
+    expected = {} if found.trust.lights is None else {"lights_expected": float(found.trust.lights.mean())}
+    doubt = {"doubt": found.trust.doubt, "of_start": found.trust.start}
+    return {name: np.asarray(value) for name, value in (kept | measured | expected | doubt).items()}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Render and answer."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--part", default="0/1", metavar="K/N", help="every N-th scene, from the K-th on")
+    parser.add_argument("--models", type=Path, help="folder of runs with networks to take before the shipped ones")
+    parser.add_argument("--networks", default="sdps-frames+fuse,true+frames+fuse", help="without and with lights")
+    args = parser.parse_args(arguments)
+    number, parts = (int(word) for word in args.part.split("/"))
+    folder = render_scenes(PRESET, args.out / "scenes")
+    find = finder(args.models)
+    views = InferenceConfig(light_views=8, normal_views=8)
+    unlit, lit = (Runner(parse(text, find), find, views, _QUICK) for text in args.networks.split(","))
+    for spec in tqdm(list(read_manifest(folder))[number::parts], disable=None, miniters=1):
+        path = args.out / "answers" / f"{spec.id.replace('/', '_')}.npz"
+        if path.exists():
+            continue
+        kept = answer(Photographs(folder, spec), lit, unlit)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        thin: dict[str, Any] = {name: value.astype(np.float16) if value.ndim > 1 and value.dtype != bool else value
+                for name, value in kept.items()}  # fmt: skip
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **thin, held_out=np.asarray(spec.split == "val"))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

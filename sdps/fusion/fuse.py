@@ -1,0 +1,67 @@
+"""Join what a network and refinement found of an object into one answer."""
+
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file
+
+from render.shared.progress import stage
+from sdps.fusion.evidence import Evidence, find_box
+from sdps.fusion.network import MULTIPLE, REACH, FusionNet, prepare
+from sdps.inference.tiles import release_memory, tiles
+from sdps.models.blocks import chord_degrees
+from sdps.refinement.trust import RefinedEstimate
+
+TILE_PIXELS = 2**19
+"""Pixels that are joined at once, at about 1.5 kB each."""
+WEIGHTS = Path(str(resources.files("assets"))) / "fusion.safetensors"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FusedEstimate(RefinedEstimate):
+    """An estimate whose normals, and the errors to expect of them, are joined of a network's and of refinement's.
+
+    Attributes:
+        evidence: What they were joined from.
+    """
+
+    evidence: Evidence
+
+
+def fuse(refined: RefinedEstimate, evidence: Evidence, mask: np.ndarray) -> FusedEstimate:
+    """Return the joined answer; arguments: the estimate, what is known of it, and its mask (H, W) bool."""
+    normals, expected = join(evidence, load_fusion())
+    whole, errors = np.zeros((*mask.shape, 3), np.float32), np.zeros(mask.shape, np.float32)
+    box = find_box(mask)
+    whole[box], errors[box] = normals, expected
+    return FusedEstimate(**vars(refined) | {"normals": whole, "expected_error": errors}, evidence=evidence)
+
+
+@torch.inference_mode()
+def join(evidence: Evidence, network: FusionNet) -> tuple[np.ndarray, np.ndarray]:
+    """Return normals (h, w, 3) float32 unit, and degrees to expect (h, w) float32, zero outside the mask."""
+    mask = evidence.mask
+    normals, degrees = np.zeros((*mask.shape, 3), np.float32), np.zeros(mask.shape, np.float32)
+    parts = tiles(mask, TILE_PIXELS, REACH, MULTIPLE)
+    for number, tile in enumerate(parts, start=1):
+        found = network(prepare(evidence, (tile.outer_rows, tile.outer_columns)))
+        normals[tile.inner] = found.normals[0].permute(1, 2, 0).numpy()[tile.within]
+        degrees[tile.inner] = chord_degrees(found.expected)[0, 0].numpy()[tile.within]
+        stage("fusion", number, len(parts))
+        if len(parts) > 1:
+            del found
+            release_memory()
+    return normals * mask[..., None], degrees * mask
+
+
+@cache
+def load_fusion() -> FusionNet:
+    """Return the network with the weights shipped with the package; without them, what it begins as: the plain mean."""
+    network = FusionNet().eval()
+    if WEIGHTS.is_file():
+        network.load_state_dict({name: value.float() for name, value in load_file(WEIGHTS).items()})
+    return network

@@ -1,0 +1,139 @@
+"""The network that joins two normals of every pixel into one, and tells the error to expect of it.
+
+It sees what either witness says of itself and of the object, and what surrounds a pixel under both: where they agree,
+which of them is integrable, where images are dark. Its answer is a mean of the two normals, weighted pixel by pixel,
+and a small correction; it begins as their plain mean.
+
+Legend: B objects, H and W the sides of their boxes, multiples of 8.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from sdps.core.symmetry import Symmetry
+from sdps.fusion.evidence import Evidence
+from sdps.models.blocks import LOG_USUAL, SLOPE, conv, deconv
+
+MULTIPLE = 8
+_MAPS, _NUMBERS = 20, 9
+REACH = 96
+"""Pixels around a pixel that its answer depends on, at most."""
+_STILL, _FAINT, _DARK = 0.3, 0.003, 0.03  # added to degrees, residuals and albedo before the logarithm
+_MOST = 90.0
+_USUAL_DEGREES, _USUAL_RESIDUAL, _USUAL_IMAGES = 3.3, 0.03, 32.0  # inputs of such are 0
+_ALL = slice(None), slice(None)
+
+
+class Joined(NamedTuple):
+    """The answer."""
+
+    normals: Tensor  # (B, 3, H, W) float32 unit
+    expected: Tensor  # (B, 1, H, W) distance to the true normals
+
+
+class Inputs(NamedTuple):
+    """Evidence as the network takes it."""
+
+    network: Tensor  # (B, 3, H, W) normals
+    refined: Tensor  # (B, 3, H, W)
+    start: Tensor  # (B, 3, H, W)
+    maps: Tensor  # (B, 11, H, W), what does not turn with the object; the last one is the mask
+    numbers: Tensor  # (B, 9) of the object
+
+    def turn(self, symmetry: Symmetry) -> "Inputs":
+        """Return what the turned object would have shown."""
+        network, refined, start = (symmetry.vectors(symmetry.images(each), dim=1) for each in self[:3])
+        return Inputs(network, refined, start, symmetry.images(self.maps), self.numbers)
+
+
+class Block(nn.Module):
+    """Two convolutions beside what they are given."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first, self.second = conv(width, width), nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return features (B, C, H, W)."""
+        return features + functional.leaky_relu(self.second(self.first(features)), SLOPE)
+
+
+class FusionNet(nn.Module):
+    """Weights two normals of every pixel.
+
+    Args:
+        width: Channels of a pixel.
+    """
+
+    def __init__(self, *, width: int = 32) -> None:
+        super().__init__()
+        wide = 2 * width
+        self.enter = nn.Conv2d(_MAPS, width, 1)
+        self.told = nn.Linear(_NUMBERS, width)
+        self.near = Block(width)
+        self.smaller = nn.Sequential(conv(width, wide, stride=2), Block(wide))
+        self.quarter = nn.Sequential(conv(wide, wide, stride=2), Block(wide))
+        self.far = nn.Sequential(conv(wide, wide, stride=2), Block(wide), deconv(wide, wide))
+        self.back = nn.Sequential(conv(2 * wide, wide), deconv(wide, wide))
+        self.leave = nn.Sequential(conv(2 * wide, wide), deconv(wide, width))
+        last = nn.Conv2d(width, 5, 1)
+        self.out = nn.Sequential(conv(2 * width, width, kernel=1), conv(width, width, kernel=1), last)
+        for parameter in last.parameters():  # the plain mean
+            nn.init.zeros_(parameter)
+
+    def forward(self, given: Inputs) -> Joined:
+        """Return the joined normals and the distance to the true ones to expect."""
+        mask = given.maps[:, -1:]
+        seen = self.enter(torch.cat([*given[:4]], dim=1)) + self.told(given.numbers)[..., None, None]
+        near = self.near(functional.leaky_relu(seen * mask, SLOPE))
+        half = self.smaller(near)
+        quarter = self.quarter(half)
+        back = self.back(torch.cat([self.far(quarter), quarter], dim=1))
+        found = self.out(torch.cat([self.leave(torch.cat([back, half], dim=1)), near], dim=1))
+        share = torch.sigmoid(found[:, :1])
+        mean = share * given.refined + (1.0 - share) * given.network
+        normals = functional.normalize(mean + found[:, 1:4], dim=1)
+        return Joined(normals * mask, (found[:, 4:] + LOG_USUAL).exp())
+
+
+def prepare(evidence: Evidence, part: tuple[slice, slice] = _ALL) -> Inputs:
+    """Return evidence, or that of some rows and columns, as the network takes it: B = 1, padded right and below."""
+    own, inside = evidence.part(*part), evidence.mask[part]
+    residual, mean = own.residual, evidence.mean_residual
+    maps = [
+        *(_log_degrees(each) for each in (own.told, own.told_first, own.expected,
+                                          _between(own.network, own.refined), _between(own.start, own.network))),
+        np.log((residual + _FAINT) / _USUAL_RESIDUAL), np.log((residual + _FAINT) / (mean + _FAINT)),
+        np.log(own.albedo + _DARK), own.gloss, own.used,
+    ]  # fmt: skip
+    stacked = np.stack([np.where(inside, each, 0.0) for each in maps] + [inside.astype(np.float32)])
+    pictures = [each.transpose(2, 0, 1) for each in (own.network, own.refined, own.start)]
+    padding = [(0, 0), *((0, -side % MULTIPLE) for side in inside.shape)]
+    network, refined, start, rest = (
+        torch.from_numpy(np.pad(each, padding).astype(np.float32))[None] for each in (*pictures, stacked)
+    )
+    return Inputs(network, refined, start, rest, describe(evidence))
+
+
+def describe(evidence: Evidence) -> Tensor:
+    """Return what the network is given of the whole object, (1, 9)."""
+    inside, (images, spread, nearness, turned, lit) = evidence.mask, evidence.numbers
+    moved = _between(evidence.network[inside], evidence.refined[inside])
+    told = [_log_degrees(each).mean() for each in (evidence.told[inside], evidence.expected[inside], moved)]
+    misfit = np.log((evidence.mean_residual + _FAINT) / _USUAL_RESIDUAL)
+    numbers = [misfit, np.log(images / _USUAL_IMAGES), spread, 5.0 * nearness, _log_degrees(turned), lit, *told]
+    return torch.from_numpy(np.array(numbers, np.float32))[None]
+
+
+def _between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the angles in degrees between unit vectors (..., 3)."""
+    return np.degrees(2.0 * np.arcsin(0.5 * np.linalg.norm(first - second, axis=-1).clip(max=2.0)))
+
+
+def _log_degrees(degrees: np.ndarray | float) -> np.ndarray:
+    """Return degrees so that 3 of them are 0, and twice as many always make about the same difference."""
+    return np.log((np.minimum(degrees, _MOST) + _STILL) / _USUAL_DEGREES)
