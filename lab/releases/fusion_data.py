@@ -21,6 +21,7 @@ from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import read_shard
 from render.shared.files import atomic_path
 from render.shared.seeds import generator
+from sdps.core.estimate import Estimate
 from sdps.core.geometry import UNKNOWN, Camera, Rig
 from sdps.core.metrics import angle_degrees
 from sdps.data.sample_geometry import lay_out, place
@@ -30,6 +31,7 @@ from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.parse import parse
 from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
+from sdps.refinement.image_model import Refined
 from sdps.refinement.refine import RefineConfig
 
 PRESET = Path(__file__).parents[1] / "presets" / "fusion.yaml"
@@ -88,7 +90,7 @@ def answer(shown: Photographs, lit: Runner, unlit: Runner) -> dict[str, np.ndarr
         return float(angle_degrees(directions, shown.placed.directions).mean())
 
     kept = found.evidence.arrays() | {"truth": shown.normals[find_box(shown.mask)]}
-    pairs = {"lights_start": found.start, "lights_refined": found.refined}
+    pairs: dict[str, Estimate | Refined] = {"lights_start": found.start, "lights_refined": found.refined}
     measured = {name: off(lights.light_directions) for name, lights in pairs.items()}
     measured["rho"] = float(shown.placed.nearness.mean())
     expected = {} if found.trust.lights is None else {"lights_expected": float(found.trust.lights.mean())}
