@@ -51,8 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="files to use, in this order; one that begins with ! leaves files out")  # fmt: skip
     parser.add_argument("--discontinuities", action="store_true", help="let the depth jump where slopes disagree")
     parser.add_argument("--refine", action=argparse.BooleanOptionalAction, default=None,
-                        help="refine normals and lights until a simple model explains the photographs (default: where "
-                        "a network finds the normals)")  # fmt: skip
+                        help="refine normals and lights until a simple model explains the photographs, and join that "
+                        "with what the network says (default: where a network finds the normals)")  # fmt: skip
     parser.add_argument("--anyway", action="store_true",
                         help="go on where a check of the photographs stops (the report says which)")  # fmt: skip
     parser.add_argument("--scale", type=float, default=1.0, metavar="F",

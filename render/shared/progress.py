@@ -54,6 +54,22 @@ def repeat(number: int, count: int) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def retell(name: str, new: str) -> Iterator[None]:
+    """Report a stage inside under a new name, and no others."""
+    outer = _listener
+    if outer is None:
+        yield
+        return
+
+    def report(own: str, done: float) -> None:
+        if own == name:
+            outer(new, done)
+
+    with report_to(report):
+        yield
+
+
 def stage(name: str, done: float = 0, total: float = 1) -> None:
     """Say that `done` of `total` steps of a stage are done; costs nothing where nobody listens."""
     if _listener is not None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from render.records.shards import file_hash
 from render.shared.errors import InputError
+from render.shared.progress import retell
 from sdps.classical import registry as classical
 from sdps.classical.common.near_lamps import settle
 from sdps.core.estimate import Estimate, constant_estimate
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 _digest = cache(file_hash)
 _log = logging.getLogger(__name__)
+SECOND_LOOK = "second look"
+"""Stage in which a network looks again, under refined lights."""
 _PLACES = ("lighting", "normals")
 Found = dict[tuple[Hashable, ...], Estimate]
 """Estimated lights by what they depend on."""
@@ -217,7 +220,8 @@ class Runner:
             found.start.normals[:0, :0], refined.light_directions, refined.grey_intensities,
             nearness=near if are_near(near) else None,
         )  # fmt: skip
-        again = self.estimator.look_again(images, mask, lights, rig=rig)
+        with retell("normals", SECOND_LOOK):
+            again = self.estimator.look_again(images, mask, lights, rig=rig)
         return fuse(found, gather(mask, found.start, refined, again, found.trust, lit=lit), mask)
 
     def score(

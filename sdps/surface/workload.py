@@ -20,6 +20,7 @@ from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES
 from sdps.methods.on_box import estimate_bytes
 from sdps.methods.runner import Runner
 from sdps.models.base import NormalNetwork
+from sdps.models.registry import TRUE_LIGHTS
 from sdps.photos import Photographs
 from sdps.refinement import refine
 from sdps.surface.meshing import MOST_VERTICES
@@ -33,6 +34,8 @@ _GIB = 2.0**30
 _BASE = 0.45  # GiB: python, torch, weights, kernels
 _CONVOLUTION = 0.0103
 """Seconds of the convolution where the networks' `inference_seconds` were measured."""
+_NEAR_LAMPS = 1.3
+"""How many times as long refinement takes where it looks for near lamps: half of the first steps do."""
 _DECODED = {"JPEG": 12e-9}
 _DECODED_ELSE = 45e-9  # PNG, TIFF, EXR
 
@@ -155,9 +158,11 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
         seconds = _normal_network(runner).inference_seconds(images, size.pixels, size.box, views)
         found["normals"] = slower * seconds + once * _tile_count(size, runner)
     if runner.method.refined:
-        coarse = 1500 * (1.5e-3 + 2800 * (0.6e-6 + 55e-9 * images))
-        fine = 120 * size.pixels * (0.6e-6 + 55e-9 * images)
+        each = 0.6e-6 + 55e-9 * images * (_NEAR_LAMPS if runner.method.lighting != TRUE_LIGHTS else 1.0)
+        coarse, fine = 2000 * (1.5e-3 + 2800 * each), 120 * size.pixels * each
         found["refinement"] = (coarse + fine) / threads + 3 * once
+    if runner.method.fused:
+        found["second look"] = found["normals"] + 5e-6 * size.box
     found["depth"] = (1.2e-6 if size.pixels > LARGE else 5e-6) * size.pixels * (60 if discontinuities else 1)
     found["albedo"] = 4 * once * ceil(size.pixels / 2**22) + 60e-9 * images * size.pixels
     thin = size.box / ceil((size.box / 2**20) ** 0.5) ** 2

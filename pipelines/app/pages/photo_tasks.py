@@ -24,10 +24,11 @@ _EXAMPLE = {"shape": "bunny", "material": "red-phenolic", "lights": "near-unifor
 _THUMBNAIL, _PICTURE = 112, 640
 _CHECKING = {"reading": 2.0, "checks": 1.0, "pictures": 1.0}
 _INFERRING = {
-    "reading": 1.0, "lights": 5.0, "normals": 30.0, "refinement": 0.0, "albedo": 1.0, "depth": 1.0, "surface": 1.0,
-    "meshes": 1.0, "relit pictures": 1.0, "page": 1.0,
+    "reading": 1.0, "lights": 5.0, "normals": 30.0, "refinement": 0.0, "second look": 0.0, "albedo": 1.0, "depth": 1.0,
+    "surface": 1.0, "meshes": 1.0, "relit pictures": 1.0, "page": 1.0,
 }  # fmt: skip
 """Stages and about how long each takes with the recommended method."""
+_REFINING = {"refinement": 40.0, "second look": 20.0}
 
 
 def render_example(place: str) -> dict[str, Any]:
@@ -129,7 +130,7 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
     folder = Path(place)
     run = folder / "runs" / str(number)
     _remove_failed_runs(run)
-    shares = _INFERRING | ({"refinement": 40.0} if refine or method.endswith("+refine") else {})
+    shares = _INFERRING | (_REFINING if refine or method.endswith(("+refine", "+fuse")) else {})
     with share_out(shares), _shorten_paths(folder):
         stage("reading")
         photos = _load(folder, anyway=anyway, **options)
