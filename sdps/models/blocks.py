@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 SLOPE = 0.1
 LOG_USUAL = -2.0
@@ -61,3 +62,47 @@ def initialise(network: nn.Module) -> None:
 def parameter_count(network: nn.Module) -> int:
     """Return the number of trainable scalars."""
     return sum(parameter.numel() for parameter in network.parameters())
+
+
+class Exchange(nn.Module):
+    """A layer for each light of a pixel that also sees the mean and the maximum over its lights."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.own = nn.Linear(width, 2 * width)
+        self.shared = nn.Linear(2 * width, 2 * width, bias=False)
+        self.out = nn.Linear(2 * width, width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return tokens (N, Q, C) that have seen each other; their order does not matter."""
+        seen = self.norm(tokens)
+        shared = self.shared(pool(seen))[:, None]
+        return tokens + self.out(functional.leaky_relu(self.own(seen) + shared, SLOPE))
+
+
+class LightAttention(nn.Module):
+    """The lights of a pixel attend to each other: what one shows is read beside the others."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm = nn.LayerNorm(width)
+        self.ask, self.answer = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        nn.init.zeros_(self.answer.weight)
+        nn.init.zeros_(self.answer.bias)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return tokens (N, Q, C) that have seen each other; their order does not matter."""
+        query, key, value = self.ask(self.norm(tokens)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        if torch.is_grad_enabled():  # torch's own is slow backwards in bfloat16 on CPUs
+            shares = (query @ key.transpose(-1, -2) * key.shape[-1] ** -0.5).softmax(dim=-1)
+            heard = shares @ value
+        else:
+            heard = functional.scaled_dot_product_attention(query, key, value)
+        return tokens + self.answer(heard.transpose(1, 2).flatten(2))
+
+
+def pool(tokens: Tensor) -> Tensor:
+    """Return mean and maximum (N, 2 C) over the lights of tokens (N, Q, C)."""
+    return torch.cat([tokens.mean(dim=1), tokens.max(dim=1).values], dim=-1)

@@ -4,9 +4,9 @@ What a pixel of an isotropic material shows depends on the angles between its no
 nothing else. So each pixel's lights are turned into the frame of a first normal, found by robust least squares: z along
 it, the view in the plane of x and z. There all normals are near z, whatever way the surface faces, and one pixel
 teaches what others of another orientation need. Images of a pixel meet by their mean and maximum (as in Deep Sets,
-Zaheer et al., NeurIPS 2017), a few times over, without convolutions; convolutions see the fused map, once for a scene
-and not once for an image. The network is given the error to expect of each light: it may trust lights that were
-measured, and know better than lights that were estimated badly.
+Zaheer et al., NeurIPS 2017), and may attend to each other, a few times over, without convolutions; convolutions see the
+fused map, once for a scene and not once for an image. The network is given the error to expect of each light: it may
+trust lights that were measured, and know better than lights that were estimated badly.
 
 Near lamps light every pixel from a direction of its own, and a perspective camera sees it along a line of its own.
 Where pixels lie is given (`Placement`), and all is turned until the line of sight is z, for the convolutions too.
@@ -26,7 +26,7 @@ from sdps.core.first_normals import first_normals, frames, turn_to_sight
 from sdps.core.losses import NormalCriterion, expected_error_loss
 from sdps.core.symmetry import Symmetry
 from sdps.models.base import FusionNetwork, Observations, Placement, Truth
-from sdps.models.blocks import LOG_USUAL, SLOPE, chord_degrees, conv, deconv
+from sdps.models.blocks import LOG_USUAL, SLOPE, Exchange, LightAttention, chord_degrees, conv, deconv, pool
 
 FRAMES = ("normal", "camera")
 _SEEN, _KNOWN = 11, 7
@@ -41,23 +41,6 @@ _MAP = 32
 """Channels of the fused map, without the normals."""
 _STRIP = 2**13
 """Pixels times lights that are worked on at once in inference."""
-
-
-class Exchange(nn.Module):
-    """A layer for each light of a pixel that also sees the mean and the maximum over its lights."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.norm = nn.LayerNorm(width)
-        self.own = nn.Linear(width, 2 * width)
-        self.shared = nn.Linear(2 * width, 2 * width, bias=False)
-        self.out = nn.Linear(2 * width, width)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        """Return tokens (N, Q, C) that have seen each other; their order does not matter."""
-        seen = self.norm(tokens)
-        shared = self.shared(pool(seen))[:, None]
-        return tokens + self.out(functional.leaky_relu(self.own(seen) + shared, SLOPE))
 
 
 class Pixels(NamedTuple):
@@ -101,22 +84,31 @@ class FrameNet(FusionNetwork):
         width: C, channels of a light of a pixel.
         blocks: Layers in which the lights of a pixel exchange what they show.
         frame: `normal` for the frame of the first normal; `camera` leaves directions as they are, to compare.
+        heads: Of the attention across the lights of a pixel, after the last `attending` of the blocks; 0 for none.
+        attending: Layers of attention.
     """
+
+    added = ("attend",)
 
     needs_mask = True
     kept_bytes = 6
     equivariant = True
     sees_places = True
 
-    def __init__(self, *, width: int = 64, blocks: int = 4, frame: str = "normal") -> None:
+    def __init__(
+        self, *, width: int = 64, blocks: int = 4, frame: str = "normal", heads: int = 0, attending: int = 2
+    ) -> None:
         super().__init__()
         if blocks < 1 or width < 1:
             raise InputError(f"width and blocks must be at least 1, got {width} and {blocks}")
+        if heads < 0 or (heads and width % heads) or not 0 <= attending <= blocks:
+            raise InputError(f"heads must divide width, and attending be 0 to blocks, got {heads} and {attending}")
         if frame not in FRAMES:
             raise unknown("frame", str(frame), FRAMES)
         self.frame = frame
         self.seen, self.known = nn.Linear(_SEEN, width), nn.Linear(_KNOWN, width)
         self.exchange = nn.Sequential(*(Exchange(width) for _ in range(blocks)))
+        self.attend = nn.ModuleList(LightAttention(width, heads) for _ in range(attending if heads else 0))
         self.fuse = nn.Sequential(
             nn.Linear(2 * width + _KNOWN, 128), nn.LeakyReLU(SLOPE), nn.Linear(128, 128), nn.LeakyReLU(SLOPE)
         )
@@ -217,7 +209,11 @@ class FrameNet(FusionNetwork):
             axes = frames(first) if self.frame == "normal" else camera  # (N, 3, 3)
             start = (axes @ first[..., None])[..., 0]  # the first normal in the frame
             seen, known = pixel_inputs(pixels, axes, start, scale, residual)
-        tokens = self.exchange(self.seen(seen) + self.known(known)[:, None])  # (N, Q, C)
+        tokens = self.seen(seen) + self.known(known)[:, None]  # (N, Q, C)
+        for number, layer in enumerate(self.exchange, len(self.attend) - len(self.exchange)):
+            tokens = layer(tokens)
+            if number >= 0:
+                tokens = self.attend[number](tokens)
         fused = self.fuse(torch.cat([pool(tokens), known.to(tokens.dtype)], dim=-1))  # (N, 128)
         # Never under autocast: a normal rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
         with torch.autocast(fused.device.type, enabled=False):
@@ -243,11 +239,6 @@ def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor, Tensor]:
     nearness = torch.cat(near, dim=1) if near else torch.zeros_like(expected)
     kept = parts[0].images.dtype
     return directions.to(kept).float(), expected.to(kept).float(), nearness.float()
-
-
-def pool(tokens: Tensor) -> Tensor:
-    """Return mean and maximum (N, 2 C) over the lights of tokens (N, Q, C)."""
-    return torch.cat([tokens.mean(dim=1), tokens.max(dim=1).values], dim=-1)
 
 
 def object_pixels(seen: Observations) -> tuple[Tensor, Pixels]:

@@ -166,10 +166,31 @@ def test_a_mask_without_pixels_gives_a_map(trained):
         assert torch.isfinite(trained(empty)).all()
 
 
+def test_attention_begins_as_nothing_and_is_the_same_in_training_and_in_use(trained):
+    attending = FrameNet(width=16, blocks=2, heads=4).eval()
+    missing = attending.load_state_dict(trained.state_dict(), strict=False).missing_keys
+    assert missing and all(key.partition(".")[0] in FrameNet.added for key in missing)
+    seen = observations(9)
+    with torch.no_grad():
+        torch.testing.assert_close(attending(seen), trained(seen))
+    for layer in attending.attend:
+        torch.nn.init.normal_(layer.answer.weight, std=0.1)
+    order = torch.randperm(9)
+    shuffled = seen._replace(images=seen.images[:, order], directions=seen.directions[:, order])
+    with torch.no_grad():
+        used, other = attending(seen), attending(shuffled)
+    torch.testing.assert_close(attending(seen).detach(), used, atol=1e-4, rtol=0)
+    torch.testing.assert_close(other, used, atol=1e-4, rtol=0)
+    assert (used - trained(seen)).abs().max() > 1e-3
+
+
 def test_size_and_options():
     assert parameter_count(FrameNet()) == MODELS["frames"].parameters <= 3_000_000
     for options in ({"width": 0}, {"blocks": 0}):
         with pytest.raises(InputError, match="must be at least 1"):
+            FrameNet(**options)
+    for options in ({"heads": 5}, {"heads": 4, "attending": 9}):
+        with pytest.raises(InputError, match="heads must divide width"):
             FrameNet(**options)
     with pytest.raises(InputError, match="camera"):
         FrameNet(frame="camra")
