@@ -101,7 +101,7 @@ class FrameNet(FusionNetwork):
         super().__init__()
         if blocks < 1 or width < 1:
             raise InputError(f"width and blocks must be at least 1, got {width} and {blocks}")
-        if heads < 0 or (heads and width % heads) or not 0 <= attending <= blocks:
+        if heads < 0 or (heads and (width % heads or not 0 <= attending <= blocks)):
             raise InputError(f"heads must divide width, and attending be 0 to blocks, got {heads} and {attending}")
         if frame not in FRAMES:
             raise unknown("frame", str(frame), FRAMES)
