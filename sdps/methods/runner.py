@@ -201,7 +201,7 @@ class Runner:
         refined = refine(
             images, mask, estimate.normals, estimate.light_directions, begun,
             directions_given=lit, config=self.refining, stray=self.config.stray_light, saturation=saturation,
-            rig=rig,
+            rig=rig, nearness=estimate.nearness,
         )  # fmt: skip
         expected = trust(refined, mask, estimate, given=lit)
         chosen = choose(estimate, refined, expected)

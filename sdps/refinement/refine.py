@@ -34,6 +34,8 @@ START_NEARNESS = 0.03
 """What nearness that is to be found begins with."""
 _CLEARLY = 0.02
 """Share by which near lamps must lower the data term: 0.01 where they are distant, 0.04 or more at seven radii."""
+_TOLD, _NO_WORSE = 0.06, -0.05
+"""Nearness that a network finds only where lamps are near; then near lamps may even raise the data term so much."""
 _BRIGHTEST, _WHITENESS = 0.95, 0.3  # quantile of the brightest parts, and the albedo they start with
 TILE_BYTES = 3 * 2**29
 """Memory for the pixels that are refined at once; objects whose box fits are one tile."""
@@ -82,6 +84,7 @@ def refine(
     config: RefineConfig | None = None,
     stray: bool = True,
     saturation: float = np.inf,
+    nearness: np.ndarray | None = None,
 ) -> Refined:
     """Refine normals and lights.
 
@@ -92,6 +95,7 @@ def refine(
         rig: The camera, and the lamps' nearness where it is known; otherwise it is found.
         config, stray: Iterations and rates; whether stray light is subtracted.
         saturation: Radiance at which a channel is clipped; such observations are ignored.
+        nearness: (L,) of the lamps, as a method found it: what to begin with where it is to be found.
 
     Raises:
         InputError: fewer than four images, shapes that do not fit, or an object that is black.
@@ -105,13 +109,15 @@ def refine(
     values = gather_pixels(scene, scene.mask if len(parts) == 1 else grid.which)
     problem = build_problem(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
     problem = problem._replace(sites=None if rig.is_plain else grid.sites())
-    start = build_start(problem, normals[scene.rows, scene.columns][grid.which], lights, gains, rig.nearness)
+    first = START_NEARNESS if nearness is None else max(float(np.mean(nearness)), START_NEARNESS)
+    start = build_start(problem, normals[scene.rows, scene.columns][grid.which], lights, gains, rig.nearness, first)
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
     free, tries = _choose_free(directions_given, rig), 1 if rig.nearness is not None else 2
     with progress_bar(None, total=tries * before + config.iterations + fine * len(parts), desc="refine") as bar:
         move = partial(solve, boost=config.boost, weights=Weights(), on_step=_advance(bar))
         if before:
-            problem, found, free = _choose_lamps(problem, start, free, partial(move, iterations=before), rig)
+            clearly = _NO_WORSE if first >= _TOLD else _CLEARLY
+            problem, found, free = _choose_lamps(problem, start, free, partial(move, iterations=before), rig, clearly)
             problem, start = _trace_light(problem, start, found, config.bounces, grid)
         state = move(problem, start, free=free, iterations=config.iterations)
         if stride == 1:
@@ -167,9 +173,11 @@ def _check(
 
 def build_start(
     problem: Problem, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray,
-    nearness: np.ndarray | None = None,
+    nearness: np.ndarray | None = None, first: float = START_NEARNESS,
 ) -> State:  # fmt: skip
-    """Return the state that refinement starts from, given a method's normals and lights, and known nearness (L,)."""
+    """Return the state that refinement starts from, given a method's normals and lights; nearness (L,) is known, or is
+    `first` at first.
+    """
     count, rho = len(problem.images), np.ones(len(lights)) if nearness is None else nearness
     state = State(
         normals=torch.from_numpy(np.array(normals, np.float32)),
@@ -182,7 +190,7 @@ def build_start(
         log_intensities=torch.from_numpy(np.log(np.maximum(intensities, 1e-6)).astype(np.float32)),
         whiteness=torch.tensor(_WHITENESS),
         modes=torch.zeros(MODES),
-        log_nearness=torch.tensor(np.log(START_NEARNESS) if nearness is None else 0.0, dtype=torch.float32),
+        log_nearness=torch.tensor(np.log(first) if nearness is None else 0.0, dtype=torch.float32),
         uneven=torch.from_numpy(rho.astype(np.float32)).log(),
     )
     state.normals[:, 2].clamp_min_(1e-3)
@@ -197,12 +205,12 @@ def _choose_free(directions_given: bool, rig: Rig) -> frozenset[str]:
 
 
 def _choose_lamps(
-    problem: Problem, start: State, free: frozenset[str], move: Callable[..., State], rig: Rig
+    problem: Problem, start: State, free: frozenset[str], move: Callable[..., State], rig: Rig, clearly: float
 ) -> tuple[Problem, State, frozenset[str]]:
     """Return the problem, what the first steps find, and what moves from then on: of near lamps, or of distant ones.
 
     A model that misses something of the reflectance takes nearness for it (metals run to lamps that touch the object),
-    so near lamps must explain the photographs clearly better than distant ones do.
+    so near lamps must lower the data term by a share, `clearly`, below that of distant ones.
     """
     near = move(problem, start, free=free)
     if "log_nearness" not in free:
@@ -211,7 +219,7 @@ def _choose_lamps(
     begun = start._replace(log_nearness=torch.tensor(-torch.inf), uneven=torch.zeros_like(start.uneven))
     fixed = free - {"log_nearness", "uneven"}
     far = move(distant, begun, free=fixed)
-    if measure_fit(problem, near) < (1.0 - _CLEARLY) * measure_fit(distant, far):
+    if measure_fit(problem, near) < (1.0 - clearly) * measure_fit(distant, far):
         return problem, near, free
     return distant, far, fixed
 
