@@ -80,14 +80,19 @@ def test_distant_lamps_stay_distant() -> None:
     np.testing.assert_array_equal(found.normals, known.normals)  # and cost nothing
 
 
-@pytest.mark.parametrize(("near", "far", "kept"), [(0.97, 1.0, True), (0.99, 1.0, False), (1.03, 1.0, False)])
-def test_near_lamps_must_explain_clearly_more(near: float, far: float, kept: bool, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("near", "told", "kept"),
+    [(0.97, 0.0, True), (0.99, 0.0, False), (1.03, 0.05, False), (1.03, 0.1, True), (1.06, 0.1, False)],
+)
+def test_near_lamps_must_explain_clearly_more_unless_a_network_finds_them_near(
+    near: float, told: float, kept: bool, monkeypatch
+) -> None:
     normals, mask, heights = ball()
     images, lights = photograph(normals, mask, centred(heights, mask), np.full(12, 0.1))
-    answers = iter((near, far))
+    answers = iter((near, 1.0))
     monkeypatch.setattr("sdps.refinement.refine.measure_fit", lambda *_: next(answers))
     few = RefineConfig(coarse_pixels=300, iterations=3, iterations_before=2, fine_iterations=0)
-    found = refine(images, mask, normals, lights, np.ones(12), config=few)
+    found = refine(images, mask, normals, lights, np.ones(12), config=few, nearness=np.full(12, told))
     assert found.nearness.any() == kept
 
 
