@@ -32,7 +32,7 @@ from sdps.fusion.evidence import Evidence
 from sdps.fusion.fuse import join
 from sdps.fusion.network import FusionNet, Inputs, prepare
 
-_BATCH, _RATE, _DECAY, _WARM = 6, 2e-3, 0.02, 0.05
+_BATCH, _RATE, _DECAY, _WARM = 6, 1e-3, 0.05, 0.1
 _SIDE = 96
 _EXPECTED = 0.05
 _LOSS = 0.3  # degrees; what counts as losing

@@ -2,8 +2,8 @@
 
     python -m lab.releases.fusion_data out/fusion
 
-renders the scenes of `lab/presets/fusion.yaml` into `out/fusion/scenes` and answers them; `--part 0/2` answers every
-second one. Each becomes a file with the evidence, the truth and how far lights were off. What is there stays, so a run
+renders the scenes of `lab/presets/fusion_world.yaml` and `fusion_ship.yaml` and answers them; `--part 0/2` answers
+every second one. Each becomes a file with the evidence, the truth and how far lights were off. What is there stays, so a run
 that was stopped goes on. The photographs of a scene, 4 to 48 of them, have random intensities, bits, and clipping.
 """
 
@@ -34,7 +34,7 @@ from sdps.methods.runner import Runner
 from sdps.refinement.image_model import Refined
 from sdps.refinement.refine import RefineConfig
 
-PRESET = Path(__file__).parents[1] / "presets" / "fusion.yaml"
+PRESETS = tuple(Path(__file__).parents[1] / "presets" / f"fusion_{name}.yaml" for name in ("ship", "world"))
 _COUNTS, _SHARES = ((4, 12), (12, 32), (48, 48)), (0.3, 0.5, 0.2)
 """Numbers of photographs, evenly over their logarithm, and how often."""
 _LENS_KNOWN, _LIT = 0.75, 0.15
@@ -107,11 +107,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--networks", default="sdps-frames+fuse,true+frames+fuse", help="without and with lights")
     args = parser.parse_args(arguments)
     number, parts = (int(word) for word in args.part.split("/"))
-    folder = render_scenes(PRESET, args.out / "scenes")
+    rendered = [render_scenes(preset, args.out / preset.stem) for preset in PRESETS]
+    scenes = [(folder, spec) for folder in rendered for spec in read_manifest(folder)]
     find = finder(args.models)
     views = InferenceConfig(light_views=8, normal_views=8)
     unlit, lit = (Runner(parse(text, find), find, views, _QUICK) for text in args.networks.split(","))
-    for spec in tqdm(list(read_manifest(folder))[number::parts], disable=None, miniters=1):
+    for folder, spec in tqdm(scenes[number::parts], disable=None, miniters=1):
         path = args.out / "answers" / f"{spec.id.replace('/', '_')}.npz"
         if path.exists():
             continue

@@ -2,7 +2,7 @@
 
 It sees what either witness says of itself and of the object, and what surrounds a pixel under both: where they agree,
 which of them is integrable, where images are dark. Its answer is a mean of the two normals, weighted pixel by pixel,
-and a small correction; it begins as their plain mean.
+moved to the side by less than they are apart: where both agree, nothing is changed. It begins as their plain mean.
 
 Legend: B objects, H and W the sides of their boxes, multiples of 8.
 """
@@ -22,8 +22,10 @@ MULTIPLE = 8
 _MAPS, _NUMBERS = 20, 9
 REACH = 96
 """Pixels around a pixel that its answer depends on, at most."""
-_STILL, _FAINT, _DARK = 0.3, 0.003, 0.03  # added to degrees, residuals and albedo before the logarithm
+_STILL, _FAINT, _DARK, _MATT = 0.3, 0.003, 0.03, 0.1  # added to degrees, residuals, albedo, gloss before the logarithm
 _MOST = 90.0
+_BESIDE = 0.5
+"""How far the answer may lie beside both normals, as a share of what lies between them."""
 _USUAL_DEGREES, _USUAL_RESIDUAL, _USUAL_IMAGES = 3.3, 0.03, 32.0  # inputs of such are 0
 _ALL = slice(None), slice(None)
 
@@ -96,7 +98,8 @@ class FusionNet(nn.Module):
         found = self.out(torch.cat([self.leave(torch.cat([back, half], dim=1)), near], dim=1))
         share = torch.sigmoid(found[:, :1])
         mean = share * given.refined + (1.0 - share) * given.network
-        normals = functional.normalize(mean + found[:, 1:4], dim=1)
+        apart = (given.refined - given.network).norm(dim=1, keepdim=True)
+        normals = functional.normalize(mean + _BESIDE * apart * found[:, 1:4].tanh(), dim=1)
         return Joined(normals * mask, (found[:, 4:] + LOG_USUAL).exp())
 
 
@@ -108,7 +111,7 @@ def prepare(evidence: Evidence, part: tuple[slice, slice] = _ALL) -> Inputs:
         *(_log_degrees(each) for each in (own.told, own.told_first, own.expected,
                                           _between(own.network, own.refined), _between(own.start, own.network))),
         np.log((residual + _FAINT) / _USUAL_RESIDUAL), np.log((residual + _FAINT) / (mean + _FAINT)),
-        np.log(own.albedo + _DARK), own.gloss, own.used,
+        np.log(own.albedo + _DARK), np.log(own.gloss + _MATT), own.used,
     ]  # fmt: skip
     stacked = np.stack([np.where(inside, each, 0.0) for each in maps] + [inside.astype(np.float32)])
     pictures = [each.transpose(2, 0, 1) for each in (own.network, own.refined, own.start)]
