@@ -6,7 +6,7 @@ cd "$(dirname "$0")/.."
 MISSING='mitsuba drjit openexr pyamg trimesh'  # of what pyproject.toml asks for; the rest is there
 PLUGINS='area|bitmap|box|conductor|constant|d65|diffuse|directional|gaussian|hdrfilm|independent|irregular|measured|merge'
 PLUGINS+='|obj|orthographic|path|perspective|ply|point|rectangle|regular|serialized|sphere|srgb|twosided|uniform'
-CALL_BYTES=$((63 << 20))  # that travel in a call, the working tree included
+: "${CALL_BYTES:=$((63 << 20))}"  # that travel in a call, the working tree included
 : "${LIGHTSET:=assets/weights/lightset.safetensors}" "${FRAMES:=assets/weights/frames.safetensors}"  # training starts there
 PYTHON=.venv/bin/python
 
