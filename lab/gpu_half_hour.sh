@@ -12,17 +12,19 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 # The plan of the half hour; all can be set from outside: RENDER_MINUTES=8 lab/gpu_half_hour.sh go
-: "${RENDER_MINUTES:=6}" "${LIGHTSET_MINUTES:=8}" "${FRAMES_MINUTES:=8}"
+: "${RENDER_MINUTES:=6}" "${LIGHTSET_MINUTES:=8}" "${FRAMES_MINUTES:=8}" "${BRING_SECONDS:=120}"
 : "${LIGHTSET:=assets/weights/lightset.safetensors}" "${FRAMES:=assets/weights/frames.safetensors}"  # training starts there
 : "${SEED:=20261501}"  # of the scenes: another for every half hour
 : "${ROUNDS:=10}"  # parts of the plan, each with its share of every family; the first two compare GPU and CPU
 : "${COMPARE_SECONDS:=50}"  # of each at most
 : "${GPU_WORKERS:=12}" "${CPU_WORKERS:=$(nproc --all)}"  # shapes are made on the CPU: several processes keep one GPU busy
 DATA=("data.seed=$SEED" data.prefix=g1- 'data.families={composition: 700, sculpture: 500, blobby: 300}')  # 6,000 scenes
-TRAINING='steps: null, skip_missing: true, cooldown: 0.7, warmup: 0.02, clip_gradient: 1.0, validation_images: 32, validate_every: 100,
-  checkpoint_minutes: 1, workers: 14, learning_rate: 3e-3'  # 2e-3 was right for a sixth to a quarter of these batches
+# Loading binds: a core makes about eight samples a second, 15 processes two to four steps. Validation is rare, since one
+# process loads it. Rates of 2e-3 were right for a quarter of these batches.
+TRAINING='steps: null, skip_missing: true, cooldown: 0.7, warmup: 0.02, clip_gradient: 1.0, learning_rate: 3e-3, workers: 15,
+  validation_images: 32, validation_scenes: 24, validate_every: 400, checkpoint_minutes: 1'
 LIGHTSET_RUN='base: lightset, seed: 41, size: 64, images: 24, batch_scenes: 48, options: {nearness: true}'
-FRAMES_RUN='base: frames, seed: 42, crop: 48, images: 20, batch_scenes: 32, accumulate: 2, loss: chord, light_blend: 1.5,
+FRAMES_RUN='base: frames, seed: 42, crop: 48, images: 20, batch_scenes: 32, accumulate: 4, loss: chord, light_blend: 1.5,
   light_error: 0.0, start_share: 0.5, lights: lightset-gpu'
 
 : "${WORK:=/tmp/gpu}" "${OUT:=out/gpu_half_hour}" "${PYTHON:=python3}"  # WORK lies outside the checkout there
@@ -36,7 +38,7 @@ go() { # SECONDS
   local code=0
   END=$(($(date +%s) + $1))
   mkdir -p "$OUT" "$WORK/logs" "$WORK/in" "$WORK/run"
-  (while sleep 120; do bring; done) > /dev/null 2>&1 &
+  (while sleep "$BRING_SECONDS"; do bring; done) > /dev/null 2>&1 &
   BRINGING=$!
   trap 'kill "$BRINGING" 2> /dev/null || true; bring' EXIT
   take
@@ -63,17 +65,23 @@ tarfile.open(fileobj=sys.stdin.buffer, mode='r|xz').extractall('$WORK/$name.new'
   done
 }
 
-set_up() { # Dr.Jit and OptiX look for the driver's files where most machines have them
-  local driver
+set_up() { # Dr.Jit and OptiX look for the driver's files where most machines have them, this one perhaps not
+  local name file
   export PYTHONPATH=$PWD:$WORK/site SDPS_CACHE=$WORK
   cp -n "$WORK/site/StanfordBunny.ply" "$WORK" 2> /dev/null || true
-  driver=$(find -L /usr/local/nvidia /usr/lib/x86_64-linux-gnu -maxdepth 2 -name 'libnvoptix.so*' 2> /dev/null | sort | head -1 || true)
-  if [[ $driver ]]; then
-    export DRJIT_LIBOPTIX_PATH=$driver DRJIT_LIBCUDA_PATH=${driver%/*}/libcuda.so.1
-    export LD_LIBRARY_PATH=${driver%/*}${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}
-  fi
-  say "OptiX: ${driver:-not found}; $("$PYTHON" -c 'from render.backend import variant; print(variant.choose())' 2>&1 | tail -1)"
-  nvidia-smi -L 2> /dev/null || say "no GPU here"
+  for name in LIBCUDA:libcuda.so LIBOPTIX:libnvoptix.so; do
+    file=$({ find -L /usr/local/nvidia /usr/lib/x86_64-linux-gnu -maxdepth 2 -name "${name#*:}*" || true; } 2> /dev/null |
+      sort | head -1)
+    [[ ! $file ]] || export "DRJIT_${name%:*}_PATH=$file" LD_LIBRARY_PATH="${file%/*}:${LD_LIBRARY_PATH:-}"
+    say "${name#*:}: ${file:-not found}"
+  done
+  file=$(find -L /usr/local/nvidia -name nvoptix.bin 2> /dev/null | head -1 || true)
+  [[ ! $file || -e /usr/share/nvidia/nvoptix.bin ]] || { mkdir -p /usr/share/nvidia && ln -s "$file" /usr/share/nvidia/; }
+  file=$("$PYTHON" -c "import mitsuba as mi; mi.set_variant('cuda_ad_rgb')
+scene = mi.load_dict({'type': 'scene', 'sphere': {'type': 'sphere'}})
+print('works:', scene.ray_test(mi.Ray3f([0, 0, 5], [0, 0, -1])))" 2>&1 | tail -n 1 || true)
+  say "OptiX: $file"
+  say "$(nvidia-smi -L 2> /dev/null || echo "no GPU here")"
 }
 
 until_then() { # SECOND COMMAND: ends it when `date +%s` says SECOND; it has half a minute to save what it has
@@ -146,7 +154,7 @@ PY
 make_tiny() { # the same code with other numbers, on what is here
   local name
   PYTHON=$PWD/.venv/bin/python WORK=${TRY_WORK:-/tmp/gpu_try} RENDER_MINUTES=1 LIGHTSET_MINUTES=0.3 FRAMES_MINUTES=0.3
-  ROUNDS=3 COMPARE_SECONDS=30
+  ROUNDS=3 COMPARE_SECONDS=30 BRING_SECONDS=20
   DATA+=('data.families={composition: 1, sculpture: 3, blobby: 4}' data.spp=2 data.light_count=6 data.size=64 data.views=1
     data.validation=0.3)
   for name in workers=0 images=4 batch_scenes=2 accumulate=1 validation_scenes=2 validation_images=4 validate_every=5; do

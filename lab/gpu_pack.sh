@@ -51,7 +51,8 @@ leave_out_the_unused() { # other variants, plugins, headers, tests: two thirds o
 loads() { # .gpu/1, .gpu/2, ...: pieces of the archives, each named ARCHIVE.PIECEofPIECES
   local tree room load=1 used=0 name piece count size
   rm -rf .gpu/[0-9]*
-  tree=$(git ls-files -z --cached --others --exclude-standard | xargs -0 stat -c %s 2> /dev/null | awk '{n += $1} END {print n}' || true)
+  tree=$({ git ls-files -z --cached --others --exclude-standard | xargs -0 stat -c %s || true; } 2> /dev/null |
+    awk '{n += $1} END {print n}')
   room=$((CALL_BYTES - tree))
   ((room > 5000000)) || { echo "the working tree (${tree} bytes) leaves no room in a call" >&2; return 2; }
   for name in site llvm; do
@@ -64,7 +65,7 @@ loads() { # .gpu/1, .gpu/2, ...: pieces of the archives, each named ARCHIVE.PIEC
       mkdir -p ".gpu/$load" && mv "$piece" ".gpu/$load/$name.${piece##*piece}of$count"
     done
   done
-  echo "The working tree has $((tree >> 20)) MiB of the 64 in a call. One call after the other, each within 30 s, timeout_s 600:"
+  echo "The working tree has $((tree >> 20)) MiB of the 64 in a call. Call after call, within 30 s, timeout_s 600:"
   for name in $(seq "$load"); do
     echo "  carry [\".gpu/$name\"] ($(du -sm ".gpu/$name" | cut -f1) MiB)  command: bash lab/gpu_half_hour.sh go"
   done
