@@ -168,7 +168,7 @@ test-slow: $(ASSETS_READY)
 	$(VENV)/bin/python -m pytest -m "slow and not gpu"
 
 test-gpu: $(ASSETS_READY)
-	$(VENV)/bin/python -m pytest -m gpu
+	$(VENV)/bin/python -m pytest -m gpu tests/test_gpu.py
 
 # Mutated files into every reader, in child processes; stopped, it goes on where it was.
 fuzz: OUT = out/fuzz
