@@ -75,12 +75,12 @@ def infer(
             `auto` for the best there is: a pretrained network, or a classical method where there is none.
         models: Folder of trained runs (`out` of `train`) to take weights from before the pretrained ones.
         config: How networks are used; the defaults are those of every command.
-        refine: Refine normals and lights by inverse rendering (`sdps.refinement`), and join that with what the network
-            says (`sdps.fusion`) where it tells its errors; the same as `+fuse` at the end of `method`, or else
-            `+refine`. None: where a network finds the normals and the images are enough.
+        refine: Refine by inverse rendering (`sdps.refinement`), and join that with what the network says where it tells
+            its errors (`sdps.methods.fusion`): `+fuse` after a method, or else `+refine`. None: where a network finds
+            the normals and the images are enough.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
-        anyway: Go on where the checks found an error. The method may still find that it cannot.
+        anyway: Go on where the checks found an error.
 
     Returns:
         Normals (H, W, 3), light directions (L, 3) and intensities (L,), and what follows from them: depth, albedo,
@@ -100,10 +100,9 @@ def infer(
         intensities, more = _question_lights(photos, models, config)
         findings = (*findings, *more)
         _stop(photos, findings, anyway)
-    found = runner.estimate(
-        photos, photos.mask, photos.light_directions, intensities, saturation=photos.saturation,
-        rig=Rig(photos.camera, photos.light_nearness, photos.nearness_each),
-    )  # fmt: skip
+    rig = Rig(photos.camera, photos.light_nearness, photos.nearness_each)
+    given = photos.light_directions, intensities
+    found = runner.estimate(photos, photos.mask, *given, saturation=photos.saturation, rig=rig)
     seconds = time.perf_counter() - began
     return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
 

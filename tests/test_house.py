@@ -25,7 +25,7 @@ FOLDERS = [
     "render",
     *(f"sdps.{name}" for name in (
         "core", "data", "models", "training", "publishing", "inference", "refinement", "classical.common", "classical",
-        "methods", "photos.light_files", "photos.pictures", "photos.analysis", "photos",
+        "methods.fusion", "methods", "photos.light_files", "photos.pictures", "photos.analysis", "photos",
         "surface",
     )),
     "sdps",

@@ -28,9 +28,9 @@ from render.shared.imaging.vectors import unit
 from sdps.core.losses import expected_error_loss
 from sdps.core.metrics import angle_degrees
 from sdps.core.symmetry import SYMMETRIES
-from sdps.fusion.evidence import Evidence
-from sdps.fusion.fuse import join
-from sdps.fusion.network import FusionNet, Inputs, prepare
+from sdps.methods.fusion.evidence import Evidence
+from sdps.methods.fusion.fuse import join
+from sdps.methods.fusion.network import FusionNet, Inputs, prepare
 
 _BATCH, _RATE, _DECAY, _WARM = 6, 1e-3, 0.05, 0.1
 _SIDE = 96

@@ -3,8 +3,8 @@
     python -m lab.releases.fusion_data out/fusion
 
 renders the scenes of `lab/presets/fusion_world.yaml` and `fusion_ship.yaml` and answers them; `--part 0/2` answers
-every second one. Each becomes a file with the evidence, the truth and how far lights were off. What is there stays, so a run
-that was stopped goes on. The photographs of a scene, 4 to 48 of them, have random intensities, bits, and clipping.
+every second one. Each becomes a file with the evidence, the truth and how far lights were off. What is there stays, so
+a run that was stopped goes on. The photographs of a scene, 4 to 48, have random intensities, bits, and clipping.
 """
 
 import argparse
@@ -25,9 +25,9 @@ from sdps.core.estimate import Estimate
 from sdps.core.geometry import UNKNOWN, Camera, Rig
 from sdps.core.metrics import angle_degrees
 from sdps.data.sample_geometry import lay_out, place
-from sdps.fusion.evidence import find_box
-from sdps.fusion.fuse import FusedEstimate
 from sdps.inference.inference_config import InferenceConfig
+from sdps.methods.fusion.evidence import find_box
+from sdps.methods.fusion.fuse import FusedEstimate
 from sdps.methods.parse import parse
 from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner

@@ -32,7 +32,7 @@ class Method:
             None for one.
         normal_views: The same for normals.
         refined: Refine what it finds by inverse rendering (`sdps.refinement`).
-        fused: Then ask its network again and join both answers (`sdps.fusion`).
+        fused: Then ask its network again and join both answers (`sdps.methods.fusion`).
         paper: Row of the paper's table.
     """
 

@@ -91,7 +91,7 @@ def with_refinement(method: Method) -> Method:
 
 
 def with_fusion(method: Method) -> Method:
-    """Return a method whose answer is joined from its network's and from refinement's (`sdps.fusion`).
+    """Return a method whose answer is joined from its network's and from refinement's (`sdps.methods.fusion`).
 
     Raises:
         InputError: its normals are not those of a network that tells the error to expect.

@@ -90,7 +90,7 @@ class Runner:
 
     def _fusion(self) -> list[str]:
         """Return a digest of the weights that join, where they do."""
-        from sdps.fusion.fuse import WEIGHTS
+        from sdps.methods.fusion.fuse import WEIGHTS
 
         return [_digest(WEIGHTS)] if self.method.fused and WEIGHTS.is_file() else []
 
@@ -211,8 +211,8 @@ class Runner:
         self, images: ImageSource, mask: np.ndarray, found: "RefinedEstimate", lit: bool, rig: Rig
     ) -> Estimate:  # fmt: skip
         """Ask the network again under refined lights, and join its answer with that of refinement."""
-        from sdps.fusion.evidence import gather
-        from sdps.fusion.fuse import fuse
+        from sdps.methods.fusion.evidence import gather
+        from sdps.methods.fusion.fuse import fuse
 
         assert self.estimator is not None  # the method has a network
         refined, near = found.refined, found.refined.nearness

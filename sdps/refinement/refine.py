@@ -73,23 +73,14 @@ class RefineConfig:
 
 
 def refine(
-    images: ImageSource,
-    mask: np.ndarray,
-    normals: np.ndarray,
-    lights: np.ndarray,
-    intensities: np.ndarray,
-    *,
-    directions_given: bool = False,
-    rig: Rig = UNKNOWN,
-    config: RefineConfig | None = None,
-    stray: bool = True,
-    saturation: float = np.inf,
-    nearness: np.ndarray | None = None,
-) -> Refined:
+    images: ImageSource, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray, *,
+    directions_given: bool = False, rig: Rig = UNKNOWN, config: RefineConfig | None = None, stray: bool = True,
+    saturation: float = np.inf, nearness: np.ndarray | None = None,
+) -> Refined:  # fmt: skip
     """Refine normals and lights.
 
     Args:
-        images, mask: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time; (H, W) bool.
+        images, mask: (L, H, W, 3) linear radiance, an array or what reads it a few at a time; (H, W) bool.
         normals, lights, intensities: As a method found them; (H, W, 3) and (L, 3), unit, and (L,) or (L, 3).
         directions_given: Leave directions as they are. Intensities always move: they also absorb what the model misses.
         rig: The camera, and the lamps' nearness where it is known; otherwise it is found.
@@ -109,15 +100,14 @@ def refine(
     values = gather_pixels(scene, scene.mask if len(parts) == 1 else grid.which)
     problem = build_problem(values, scene.mask, stride, gains, full := saturation - scene.stray.T)
     problem = problem._replace(sites=None if rig.is_plain else grid.sites())
-    first = START_NEARNESS if nearness is None else max(float(np.mean(nearness)), START_NEARNESS)
+    first = max(START_NEARNESS, 0.0 if nearness is None else float(np.mean(nearness)))
     start = build_start(problem, normals[scene.rows, scene.columns][grid.which], lights, gains, rig.nearness, first)
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
     free, tries = _choose_free(directions_given, rig), 1 if rig.nearness is not None else 2
     with progress_bar(None, total=tries * before + config.iterations + fine * len(parts), desc="refine") as bar:
         move = partial(solve, boost=config.boost, weights=Weights(), on_step=_advance(bar))
         if before:
-            clearly = _NO_WORSE if first >= _TOLD else _CLEARLY
-            problem, found, free = _choose_lamps(problem, start, free, partial(move, iterations=before), rig, clearly)
+            problem, found, free = _choose_lamps(problem, start, free, partial(move, iterations=before), rig, first)
             problem, start = _trace_light(problem, start, found, config.bounces, grid)
         state = move(problem, start, free=free, iterations=config.iterations)
         if stride == 1:
@@ -205,13 +195,14 @@ def _choose_free(directions_given: bool, rig: Rig) -> frozenset[str]:
 
 
 def _choose_lamps(
-    problem: Problem, start: State, free: frozenset[str], move: Callable[..., State], rig: Rig, clearly: float
+    problem: Problem, start: State, free: frozenset[str], move: Callable[..., State], rig: Rig, told: float
 ) -> tuple[Problem, State, frozenset[str]]:
     """Return the problem, what the first steps find, and what moves from then on: of near lamps, or of distant ones.
 
     A model that misses something of the reflectance takes nearness for it (metals run to lamps that touch the object),
-    so near lamps must lower the data term by a share, `clearly`, below that of distant ones.
+    so near lamps must explain the photographs clearly better than distant ones do, or be what a network found (`told`).
     """
+    clearly = _NO_WORSE if told >= _TOLD else _CLEARLY
     near = move(problem, start, free=free)
     if "log_nearness" not in free:
         return problem, near, free

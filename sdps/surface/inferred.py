@@ -20,10 +20,10 @@ from sdps.core.estimate import Estimate
 from sdps.core.geometry import Capture, are_near
 from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import angle_degrees
-from sdps.fusion.evidence import find_box
-from sdps.fusion.fuse import FusedEstimate
 from sdps.inference.tiles import release_memory
 from sdps.methods import pretrained
+from sdps.methods.fusion.evidence import find_box
+from sdps.methods.fusion.fuse import FusedEstimate
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
 from sdps.refinement.trust import RefinedEstimate

@@ -12,9 +12,9 @@ from sdps.core.estimate import Estimate
 from sdps.core.geometry import Rig
 from sdps.core.metrics import angle_degrees
 from sdps.core.symmetry import SYMMETRIES, Symmetry
-from sdps.fusion import fuse as fusing
-from sdps.fusion.evidence import ROOM, Evidence, find_box
-from sdps.fusion.network import REACH, FusionNet, describe, prepare
+from sdps.methods.fusion import fuse as fusing
+from sdps.methods.fusion.evidence import ROOM, Evidence, find_box
+from sdps.methods.fusion.network import REACH, FusionNet, describe, prepare
 from sdps.methods.parse import parse
 from sdps.methods.pretrained import require
 from sdps.methods.runner import Runner

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sdps.core.symmetry import Symmetry
-from sdps.fusion.evidence import Evidence
+from sdps.methods.fusion.evidence import Evidence
 from sdps.models.blocks import LOG_USUAL, SLOPE, conv, deconv
 
 MULTIPLE = 8

@@ -10,9 +10,9 @@ import torch
 from safetensors.torch import load_file
 
 from render.shared.progress import stage
-from sdps.fusion.evidence import Evidence, find_box
-from sdps.fusion.network import MULTIPLE, REACH, FusionNet, prepare
 from sdps.inference.tiles import release_memory, tiles
+from sdps.methods.fusion.evidence import Evidence, find_box
+from sdps.methods.fusion.network import MULTIPLE, REACH, FusionNet, prepare
 from sdps.models.blocks import chord_degrees
 from sdps.refinement.trust import RefinedEstimate
 
