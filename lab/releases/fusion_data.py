@@ -11,27 +11,22 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
+from lab.shared.answered_scenes import keep
 from lab.studies.refinement_study import render_scenes
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import read_shard
-from render.shared.files import atomic_path
 from render.shared.seeds import generator
 from sdps.core.estimate import Estimate
 from sdps.core.geometry import UNKNOWN, Camera, Rig
-from sdps.core.metrics import angle_degrees
 from sdps.data.sample_geometry import lay_out, place
 from sdps.inference.inference_config import InferenceConfig
-from sdps.methods.fusion.evidence import find_box
-from sdps.methods.fusion.fuse import FusedEstimate
 from sdps.methods.parse import parse
 from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
-from sdps.refinement.image_model import Refined
 from sdps.refinement.refine import RefineConfig
 
 PRESETS = tuple(Path(__file__).parents[1] / "presets" / f"fusion_{name}.yaml" for name in ("ship", "world"))
@@ -78,24 +73,12 @@ def quantise(radiance: np.ndarray, bits: int) -> np.ndarray:
     return np.round(radiance * steps) / steps
 
 
-def answer(shown: Photographs, lit: Runner, unlit: Runner) -> dict[str, np.ndarray]:
-    """Return the evidence of a scene, its true normals, and degrees by which lights are off, before and after."""
+def answer(shown: Photographs, lit: Runner, unlit: Runner) -> Estimate:
+    """Return what is found in a scene's photographs."""
     lights, gains = (shown.placed.directions, shown.gains) if shown.lit else (None, None)
     rig = Rig(shown.rig.camera, shown.placed.nearness) if shown.lit and shown.placed.nearness.any() else shown.rig
-    found = (lit if shown.lit else unlit).estimate(shown.images, shown.mask, lights, gains, saturation=1.0, rig=rig)
-    if not isinstance(found, FusedEstimate):
-        return {}
-
-    def off(directions: np.ndarray) -> float:
-        return float(angle_degrees(directions, shown.placed.directions).mean())
-
-    kept = found.evidence.arrays() | {"truth": shown.normals[find_box(shown.mask)]}
-    pairs: dict[str, Estimate | Refined] = {"lights_start": found.start, "lights_refined": found.refined}
-    measured = {name: off(lights.light_directions) for name, lights in pairs.items()}
-    measured["rho"] = float(shown.placed.nearness.mean())
-    expected = {} if found.trust.lights is None else {"lights_expected": float(found.trust.lights.mean())}
-    doubt = {"doubt": found.trust.doubt, "of_start": found.trust.start}
-    return {name: np.asarray(value) for name, value in (kept | measured | expected | doubt).items()}
+    method = lit if shown.lit else unlit
+    return method.estimate(shown.images, shown.mask, lights, gains, saturation=1.0, rig=rig)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -116,12 +99,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         path = args.out / "answers" / f"{spec.id.replace('/', '_')}.npz"
         if path.exists():
             continue
-        kept = answer(Photographs(folder, spec), lit, unlit)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        thin: dict[str, Any] = {name: value.astype(np.float16) if value.ndim > 1 and value.dtype != bool else value
-                for name, value in kept.items()}  # fmt: skip
-        with atomic_path(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **thin, held_out=np.asarray(spec.split == "val"))
+        shown = Photographs(folder, spec)
+        found, held_out = answer(shown, lit, unlit), spec.split == "val"
+        keep(path, found, shown.normals, shown.placed.directions, held_out=held_out)
     return 0
 
 

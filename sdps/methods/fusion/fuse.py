@@ -59,9 +59,9 @@ def join(evidence: Evidence, network: FusionNet) -> tuple[np.ndarray, np.ndarray
 
 
 @cache
-def load_fusion() -> FusionNet:
-    """Return the network with the weights shipped with the package; without them, what it begins as: the plain mean."""
+def load_fusion(file: Path = WEIGHTS) -> FusionNet:
+    """Return the network with its weights, those shipped with the package; without them, what it begins as."""
     network = FusionNet().eval()
-    if WEIGHTS.is_file():
-        network.load_state_dict({name: value.float() for name, value in load_file(WEIGHTS).items()})
+    if file.is_file():
+        network.load_state_dict({name: value.float() for name, value in load_file(file).items()})
     return network

@@ -71,7 +71,9 @@ class FusionNet(nn.Module):
         width: Channels of a pixel.
     """
 
-    def __init__(self, *, width: int = 32) -> None:
+    WIDTH = 32
+
+    def __init__(self, *, width: int = WIDTH) -> None:
         super().__init__()
         wide = 2 * width
         self.enter = nn.Conv2d(_MAPS, width, 1)

@@ -1,0 +1,108 @@
+"""Scenes that networks and refinement answered: kept in files, read back, and measured against the truth."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.shared.text_tables import render_text
+from render.shared.files import atomic_path
+from render.shared.imaging.vectors import unit
+from sdps.core.metrics import angle_degrees
+from sdps.methods.fusion.evidence import Evidence, find_box
+from sdps.methods.fusion.fuse import FusedEstimate, join
+from sdps.methods.fusion.network import FusionNet
+
+_LOSS = 0.3  # degrees; what counts as losing
+_HEAD = ("scenes", "", "first", "second look", "refined", "mean", "fused", "expected", "refined loses", "fused loses",
+         "lights first", "refined")  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Answered:
+    """A scene that was answered.
+
+    Attributes:
+        name: Of the scene.
+        evidence: What was found.
+        truth: (h, w, 3) normals.
+        held_out: It is measured, not learned.
+        lights: Degrees by which lights were off at the start and refined.
+    """
+
+    name: str
+    evidence: Evidence
+    truth: np.ndarray
+    held_out: bool
+    lights: tuple[float, float]
+
+
+def keep(file: Path, found: object, normals: np.ndarray, directions: np.ndarray, *, held_out: bool) -> None:
+    """Write what was found of a scene; of one that refinement says nothing about, that.
+
+    Args:
+        file: Where.
+        found: An estimate of a method that ends in `+fuse`.
+        normals: (H, W, 3) the truth.
+        directions: (L, 3) the true lights.
+        held_out: It is to be measured, not learned.
+    """
+    kept: dict[str, Any] = {"held_out": np.asarray(held_out)}
+    if isinstance(found, FusedEstimate):
+        whole = np.abs(found.normals).any(axis=-1)
+        kept |= found.evidence.arrays() | {"truth": normals[find_box(whole)]}
+        for name, lights in (("lights_start", found.start), ("lights_refined", found.refined)):
+            kept[name] = np.asarray(angle_degrees(lights.light_directions, directions).mean())
+    file.parent.mkdir(parents=True, exist_ok=True)
+    thin = {name: value.astype(np.float16) if value.ndim > 1 and value.dtype != bool else value
+            for name, value in kept.items()}  # fmt: skip
+    with atomic_path(file) as temporary, temporary.open("wb") as handle:
+        np.savez_compressed(handle, allow_pickle=False, **thin)
+
+
+def read(file: Path) -> Answered | None:
+    """Read a scene; None of one that refinement says nothing about."""
+    with np.load(file) as kept:
+        if "truth" not in kept:
+            return None
+        values = {field.name: kept[field.name] for field in fields(Evidence)}
+        evidence = Evidence(**{
+            name: value if value.dtype == bool else float(value) if value.ndim == 0 else value.astype(np.float32)
+            for name, value in values.items()
+        })  # type: ignore[arg-type]  # fmt: skip
+        return Answered(
+            name=file.stem, evidence=evidence, truth=kept["truth"].astype(np.float32), held_out=bool(kept["held_out"]),
+            lights=(float(kept["lights_start"]), float(kept["lights_refined"])),
+        )  # fmt: skip
+
+
+def read_all(folder: Path) -> list[Answered]:
+    """Return the scenes of a folder."""
+    return [scene for file in sorted(folder.glob("*.npz")) if (scene := read(file)) is not None]
+
+
+def measure(scene: Answered, network: FusionNet) -> list[float]:
+    """Return mean degrees of the network's first and second look, of refinement, of their plain mean and of fusion; and
+    what fusion expects.
+    """
+    evidence = scene.evidence
+    mask, truth = evidence.mask, scene.truth[evidence.mask]
+    normals, expected = join(evidence, network)
+    mean = unit(evidence.network[mask] + evidence.refined[mask])
+    tried = (evidence.start[mask], evidence.network[mask], evidence.refined[mask], mean, normals[mask])
+    return [*(float(angle_degrees(each, truth).mean()) for each in tried), float(expected[mask].mean())]
+
+
+def tabulate(groups: Mapping[str, Sequence[Answered]], network: FusionNet) -> Iterator[str]:
+    """Yield a table with a line a group, degrees; losing is against the network's first look."""
+    lines = []
+    for name, scenes in groups.items():
+        if scenes:
+            some = np.array([measure(scene, network) for scene in scenes])
+            lost = [str(int((some[:, k] > some[:, 0] + _LOSS).sum())) for k in (2, 4)]
+            lights = np.array([scene.lights for scene in scenes if not scene.evidence.lit] or [(np.nan, np.nan)])
+            means, off = ([f"{value:.2f}" for value in values.mean(axis=0)] for values in (some, lights))
+            lines.append([name, str(len(some)), *means, *lost, *off])
+    yield render_text(f"Normals and lights, degrees; a loss is over {_LOSS}", _HEAD, lines)
