@@ -204,8 +204,10 @@ class Runner:
             rig=rig, nearness=estimate.nearness,
         )  # fmt: skip
         expected = trust(refined, mask, estimate, given=lit)
-        chosen = choose(estimate, refined, expected)
-        return self._fuse(images, mask, chosen, lit, rig) if self.method.fused and not expected.blind else chosen
+        if not self.method.fused or expected.blind:
+            return choose(estimate, refined, expected)
+        # What is doubted of the normals, joining weighs pixel by pixel; refined lights are better even then.
+        return self._fuse(images, mask, choose(estimate, refined, expected._replace(doubt="")), lit, rig)
 
     def _fuse(
         self, images: ImageSource, mask: np.ndarray, found: "RefinedEstimate", lit: bool, rig: Rig
