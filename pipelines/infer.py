@@ -187,7 +187,9 @@ def _section(result: "Inference") -> SectionWriter:
     relit = [(name.replace("-", " "), pictures.tone_map(result.relit_view(name, box))) for name in RELIT]
     writer.strip("Under lights of our choice (matt, with cast shadows)", relit)
     if result.refinement is not None:
-        writer.strip("Refinement", _refinement_pictures(result.refinement, box, mask[box]))
+        assert result.expected_error is not None  # refinement tells its own
+        tiles = _refinement_pictures(result.refinement, result.expected_error[box], box, mask[box])
+        writer.strip("Refinement", tiles)
     elif result.expected_error is not None:
         writer.strip("How sure the network is", [_draw_expected_errors(result.expected_error[box], mask[box])])
     return writer
@@ -202,15 +204,20 @@ def _box(mask: np.ndarray) -> tuple[slice, slice]:
     return rows, columns
 
 
-def _refinement_pictures(found: "RefinedEstimate", box: tuple[slice, slice], mask: np.ndarray) -> list[Tile]:
-    """Return how far normals moved, the error to expect, and what the model did not explain."""
+def _refinement_pictures(
+    found: "RefinedEstimate", expected: np.ndarray, box: tuple[slice, slice], mask: np.ndarray
+) -> list[Tile]:
+    """Return the normals before and refined, how far they moved, the error to expect of the answer, and what the model
+    did not explain.
+    """
     from sdps.core.metrics import angle_degrees
 
     moved = angle_degrees(found.refined.normals[box], found.start.normals[box])
-    residual, expected = found.refined.pixel_residual[box], found.trust.normals[box]
+    residual = found.refined.pixel_residual[box]
     most = float(np.percentile(residual[mask], 99))
     return [
         Tile("normals before", pictures.normal_map(found.start.normals[box], mask), "normals"),
+        Tile("refined", pictures.normal_map(found.refined.normals[box], mask), "normals"),
         Tile("moved (yellow: 20 degrees)", pictures.error_map(np.where(mask, moved, np.nan), 20.0)),
         _draw_expected_errors(expected, mask),
         Tile(f"not explained (yellow: {most:.2f})", pictures.error_map(np.where(mask, residual, np.nan), most)),
