@@ -1,0 +1,78 @@
+"""What fusion learns from is kept as it was, and the network learns whom to believe."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.releases import fusion
+from lab.releases.fusion_data import quantise
+from lab.shared.answered_scenes import Answered, keep, measure, read, read_all, tabulate
+from sdps.core.estimate import Estimate
+from sdps.methods.fusion.evidence import Evidence, find_box
+from sdps.methods.fusion.fuse import FusedEstimate
+from sdps.methods.fusion.network import FusionNet
+
+
+def ball(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return normals (side, side, 3) and mask of a ball."""
+    y, x = np.mgrid[1 : -1 : side * 1j, -1 : 1 : side * 1j]
+    mask = x**2 + y**2 < 0.8
+    normals = np.stack([x, y, np.sqrt(np.maximum(1.0 - x**2 - y**2, 0.0))], axis=-1)
+    return (normals * mask[..., None]).astype(np.float32), mask
+
+
+def answered(seed: int, held_out: bool = False) -> Answered:
+    """Return a ball of which the network knows the truth, and refinement something else that it believes itself."""
+    rng, (normals, mask) = np.random.default_rng(seed), ball(24)
+    off = normals + mask[..., None] * rng.normal(0.0, 0.2, 3)
+    wrong = (off / np.maximum(np.linalg.norm(off, axis=-1, keepdims=True), 1e-9)).astype(np.float32)
+    flat = {name: np.where(mask, value, 0.0).astype(np.float32) for name, value in
+            {"told": 2.0, "told_first": 3.0, "expected": 3.0, "residual": 0.05, "albedo": 1.0, "gloss": 1.0,
+             "used": 0.9}.items()}  # fmt: skip
+    evidence = Evidence(
+        mask=mask, network=normals, refined=wrong, start=normals, images=32.0, spread=0.5, nearness=0.0, turned=2.0,
+        lit=0.0, **flat,
+    )  # fmt: skip
+    return Answered(name=str(seed), evidence=evidence, truth=normals, held_out=held_out, lights=(3.0, 2.0))
+
+
+def test_fusion_learns_whom_to_believe(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fusion, "_SIDE", 24)
+    monkeypatch.setattr(fusion, "_RATE", 1e-2)
+    scenes = [answered(seed) for seed in range(6)]
+    other = answered(9, held_out=True)
+    before, after = (measure(other, net) for net in (FusionNet().eval(), fusion.train(scenes, 60, 16, 0)))
+    assert before[4] == pytest.approx(before[3], abs=0.1)  # the plain mean
+    assert after[4] < 0.5 * before[4]
+    assert list(fusion.group([*scenes, other]))[:2] == ["learned from", "held out"]
+    assert "held out" in "".join(tabulate(fusion.group([*scenes, other]), FusionNet().eval()))
+
+
+def test_an_answered_scene_is_read_back(tmp_path: Path) -> None:
+    scene = answered(3)
+    mask, box = scene.evidence.mask, find_box(scene.evidence.mask)
+    lights = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (4, 1))
+    start = Estimate(scene.truth, lights, np.ones(4, np.float32))
+    found = FusedEstimate(
+        scene.truth, lights, np.ones(4, np.float32), refined=replace(start), start=start, trust=None,  # type: ignore[arg-type]
+        evidence=replace(scene.evidence, **{name: each[box] for name, each in scene.evidence.arrays().items()
+                                            if each.ndim > 1}),
+    )  # fmt: skip
+    keep(tmp_path / "a.npz", found, scene.truth, lights, held_out=True)
+    keep(tmp_path / "b.npz", start, scene.truth, lights, held_out=False)
+    (back,) = read_all(tmp_path)
+    assert back.held_out and back.name == "a" and read(tmp_path / "b.npz") is None
+    assert back.lights == pytest.approx((0.0, 0.0), abs=0.1)
+    np.testing.assert_array_equal(back.evidence.mask, mask[box])
+    np.testing.assert_allclose(back.truth, scene.truth[box], atol=1e-3)
+    np.testing.assert_allclose(back.evidence.refined, scene.evidence.refined[box], atol=1e-3)
+    assert back.evidence.numbers == scene.evidence.numbers
+
+
+@pytest.mark.parametrize(("bits", "off"), [(8, 0.004), (12, 2e-4), (16, 1e-5)])
+def test_photographs_keep_so_many_bits(bits: int, off: float) -> None:
+    radiance = np.linspace(0.0, 1.0, 1001)
+    kept = quantise(radiance, bits)
+    assert np.abs(kept - radiance).max() < off and len(np.unique(kept)) <= 2**bits
