@@ -71,7 +71,7 @@ class FusionNet(nn.Module):
         width: Channels of a pixel.
     """
 
-    WIDTH = 32
+    WIDTH = 24
 
     def __init__(self, *, width: int = WIDTH) -> None:
         super().__init__()
