@@ -3,7 +3,7 @@
 import pytest
 
 from render.shared import progress
-from render.shared.progress import bars, repeat, report_to, share, share_out, stage
+from render.shared.progress import bars, repeat, report_to, retell, share, share_out, stage
 
 
 def test_stages_are_reported_to_who_listens_and_to_nobody_else() -> None:
@@ -38,6 +38,16 @@ def test_parts_of_a_stage_may_be_nested() -> None:
             stage("normals", 1, 1)
     stage("normals")
     assert reported == [("normals", 0.25 + 0.25 * 0.375), ("normals", 0.5)]
+
+
+def test_a_stage_that_comes_again_has_a_name_of_its_own() -> None:
+    reported: list[tuple[str, float]] = []
+    with report_to(lambda name, done: reported.append((name, done))), retell("normals", "second look"):
+        stage("survey", 1, 1)
+        stage("normals", 1, 2)
+    with retell("normals", "second look"):  # nobody listens
+        stage("normals", 1, 2)
+    assert reported == [("second look", 0.5)]
 
 
 def test_long_stages_have_a_bar_with_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

@@ -141,5 +141,7 @@ def test_the_fused_answer_lies_between_both_witnesses(lit: bool) -> None:
     assert max(away) < apart + 5.0 and evidence.lit == float(lit)
     assert found.expected_error is not None and found.expected_error[mask].min() > 0.0
     assert np.allclose(np.linalg.norm(found.normals[mask], axis=-1), 1.0, atol=1e-4)
+    np.testing.assert_array_equal(found.light_directions, found.refined.light_directions)
+    assert not found.trust.doubt
     plain = Runner(replace(runner.method, fused=False), require, refining=quick)
     assert plain.identity() != runner.identity()
