@@ -1,4 +1,4 @@
-"""Repeat the figures of docs/studies/refinement.md#joined-answers: the network, refinement and their joined answer on rendered scenes.
+"""Repeat the figures of joined answers in docs/studies/refinement.md, on rendered scenes.
 
     python -m lab.studies.fusion_study out/study                                   # shapes no network was trained on
     python -m lab.studies.fusion_study out/study --images 4 8 16 32 --every 3
