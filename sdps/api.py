@@ -32,14 +32,15 @@ from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
 from sdps.methods.light_witness import question_lights, see_lights
-from sdps.methods.method import Method
-from sdps.methods.parse import AFTER, can_fuse, parse, uses_networks, with_fusion, with_refinement
+from sdps.methods.method import AFTER, FUSE, REFINE, Method
+from sdps.methods.parse import can_fuse, finish, parse, uses_networks
 from sdps.methods.runner import Runner
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load
 from sdps.photos.faults import ANYWAY
 from sdps.photos.light_files.light_advice import advise
-from sdps.refinement.trust import FEWEST_IMAGES, FEWEST_TO_FUSE
+from sdps.refinement.refine import FEWEST
+from sdps.refinement.trust import FEWEST_IMAGES
 from sdps.surface.inferred import Inference, check_out
 from sdps.surface.workload import Workload, workload
 from sdps.training.trainer import TrainingResult
@@ -80,7 +81,7 @@ def infer(
             the normals and the images are enough.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
-        anyway: Go on where the checks found an error.
+        anyway: Go on where the checks found an error. The method may still find that it cannot.
 
     Returns:
         Normals (H, W, 3), light directions (L, 3) and intensities (L,), and what follows from them: depth, albedo,
@@ -278,12 +279,11 @@ def _runner(
     plain = plain if after in AFTER else method
     chosen = _adapt(_automatic(known[0], find) if plain == AUTO else plain, known, find)
     if plain != method:
-        return Runner(AFTER[after](chosen), find, config)
-    fuses = can_fuse(chosen)
+        return Runner(finish(chosen, after, find), find, config)
+    fuses = can_fuse(chosen, find)
     if refine is None:
-        refine = uses_networks(chosen) and images >= (FEWEST_TO_FUSE if fuses else FEWEST_IMAGES)
-    finish = with_fusion if fuses else with_refinement
-    return Runner(finish(chosen) if refine else chosen, find, config)
+        refine = uses_networks(chosen) and images >= (FEWEST if fuses else FEWEST_IMAGES)
+    return Runner(finish(chosen, FUSE if fuses else REFINE, find) if refine else chosen, find, config)
 
 
 def _adapt(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> Method:

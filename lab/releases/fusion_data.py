@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lab.shared.answered_scenes import keep
+from lab.shared.answered_scenes import answer, keep
 from lab.studies.refinement_study import render_scenes
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import read_shard
 from render.shared.seeds import generator
-from sdps.core.estimate import Estimate
-from sdps.core.geometry import UNKNOWN, Camera, Rig
+from sdps.core.geometry import ORTHOGRAPHIC, Camera, Rig
 from sdps.data.sample_geometry import lay_out, place
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.parse import parse
@@ -61,8 +60,9 @@ class Photographs:
         self.gains = gains * self.placed.irradiance
         lens = spec.view.camera_distance
         known = lens is not None and rng.random() < _LENS_KNOWN
-        self.rig = Rig(Camera(lens * shard.mask.shape[1] / 2)) if known else UNKNOWN
+        camera = Camera(lens * shard.mask.shape[1] / 2) if known else ORTHOGRAPHIC
         self.lit = bool(rng.random() < _LIT)
+        self.rig = Rig(camera, self.placed.nearness if self.lit and self.placed.nearness.any() else None)
 
 
 def quantise(radiance: np.ndarray, bits: int) -> np.ndarray:
@@ -73,21 +73,13 @@ def quantise(radiance: np.ndarray, bits: int) -> np.ndarray:
     return np.round(radiance * steps) / steps
 
 
-def answer(shown: Photographs, lit: Runner, unlit: Runner) -> Estimate:
-    """Return what is found in a scene's photographs."""
-    lights, gains = (shown.placed.directions, shown.gains) if shown.lit else (None, None)
-    rig = Rig(shown.rig.camera, shown.placed.nearness) if shown.lit and shown.placed.nearness.any() else shown.rig
-    method = lit if shown.lit else unlit
-    return method.estimate(shown.images, shown.mask, lights, gains, saturation=1.0, rig=rig)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Render and answer."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--part", default="0/1", metavar="K/N", help="every N-th scene, from the K-th on")
     parser.add_argument("--models", type=Path, help="folder of runs with networks to take before the shipped ones")
-    parser.add_argument("--networks", default="sdps-frames+fuse,true+frames+fuse", help="without and with lights")
+    parser.add_argument("--networks", default="sdps-frames+refine,true+frames+refine", help="without and with lights")
     args = parser.parse_args(arguments)
     number, parts = (int(word) for word in args.part.split("/"))
     rendered = [render_scenes(preset, args.out / preset.stem) for preset in PRESETS]
@@ -100,8 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if path.exists():
             continue
         shown = Photographs(folder, spec)
-        found, held_out = answer(shown, lit, unlit), spec.split == "val"
-        keep(path, found, shown.normals, shown.placed.directions, held_out=held_out)
+        runner, lights, gains = (lit, shown.placed.directions, shown.gains) if shown.lit else (unlit, None, None)
+        answered = answer(runner, shown.images, shown.mask, lights, gains, 1.0, shown.rig)
+        keep(path, answered, shown.normals, shown.placed.directions, held_out=spec.split == "val")
     return 0
 
 

@@ -10,10 +10,13 @@ import numpy as np
 from pipelines.shared.text_tables import render_text
 from render.shared.files import atomic_path
 from render.shared.imaging.vectors import unit
+from sdps.core.geometry import UNKNOWN, Rig
 from sdps.core.metrics import angle_degrees
-from sdps.methods.fusion.evidence import Evidence, find_box
-from sdps.methods.fusion.fuse import FusedEstimate, join
+from sdps.methods.fusion.evidence import Evidence, find_place
+from sdps.methods.fusion.fuse import join
 from sdps.methods.fusion.network import FusionNet
+from sdps.methods.runner import Runner
+from sdps.refinement.trust import RefinedEstimate, choose
 
 _LOSS = 0.3  # degrees; what counts as losing
 _HEAD = ("scenes", "", "first", "second look", "refined", "mean", "fused", "expected", "refined loses", "fused loses",
@@ -39,20 +42,36 @@ class Answered:
     lights: tuple[float, float]
 
 
-def keep(file: Path, found: object, normals: np.ndarray, directions: np.ndarray, *, held_out: bool) -> None:
-    """Write what was found of a scene; of one that refinement says nothing about, that.
+def answer(
+    runner: Runner, images: np.ndarray, mask: np.ndarray, lights: np.ndarray | None, gains: np.ndarray | None,
+    saturation: float = np.inf, rig: Rig = UNKNOWN,
+) -> tuple[RefinedEstimate, Evidence | None]:  # fmt: skip
+    """Return what a method that ends in `+refine` finds, and the evidence that is joined; None: refinement is blind."""
+    found = runner.estimate(images, mask, lights, gains, saturation=saturation, rig=rig)
+    assert isinstance(found, RefinedEstimate)
+    if found.trust.blind:
+        return found, None
+    found = choose(found.start, found.refined, found.trust._replace(doubt=""))
+    return found, runner.ask_again(images, mask, found, lit=lights is not None, rig=rig)
+
+
+def keep(
+    file: Path, answered: tuple[RefinedEstimate, Evidence | None], normals: np.ndarray, directions: np.ndarray, *,
+    held_out: bool,
+) -> None:  # fmt: skip
+    """Write what was found of a scene; of one whose evidence is None, that.
 
     Args:
         file: Where.
-        found: An estimate of a method that ends in `+fuse`.
+        answered: Of `answer`.
         normals: (H, W, 3) the truth.
         directions: (L, 3) the true lights.
         held_out: It is to be measured, not learned.
     """
+    found, evidence = answered
     kept: dict[str, Any] = {"held_out": np.asarray(held_out)}
-    if isinstance(found, FusedEstimate):
-        whole = np.abs(found.normals).any(axis=-1)
-        kept |= found.evidence.arrays() | {"truth": normals[find_box(whole)]}
+    if evidence is not None:
+        kept |= evidence.arrays() | {"truth": normals[find_place(np.abs(normals).sum(axis=-1) > 0.0)]}
         for name, lights in (("lights_start", found.start), ("lights_refined", found.refined)):
             kept[name] = np.asarray(angle_degrees(lights.light_directions, directions).mean())
     file.parent.mkdir(parents=True, exist_ok=True)

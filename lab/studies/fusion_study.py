@@ -16,7 +16,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from lab.shared.answered_scenes import keep, read_all, tabulate
+from lab.shared.answered_scenes import answer, keep, read_all, tabulate
 from lab.studies.refinement_study import PRESET, Scene, render_scenes
 from render.records.manifest import read_manifest
 from sdps.inference.inference_config import InferenceConfig
@@ -34,13 +34,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--lights", action="store_true", help="lights are given")
     parser.add_argument("--every", type=int, default=1, help="take every so many scenes")
     parser.add_argument("--merltest", type=Path, help="folder with the scenes of `sdps evaluate merltest`")
-    parser.add_argument("--method", default="", help="such as lightset+frames+fuse")
+    parser.add_argument("--method", default="", help="such as lightset+frames+refine")
     parser.add_argument("--models", type=Path, help="folder of runs")
     parser.add_argument("--weights", type=Path, default=WEIGHTS, help="that join")
     args = parser.parse_args(arguments)
     folder = args.merltest or render_scenes(PRESET, args.out / "scenes")
     find = finder(args.models)
-    method = args.method or ("true+frames+fuse" if args.lights else "sdps-frames+fuse")
+    method = args.method or ("true+frames+refine" if args.lights else "sdps-frames+refine")
     runner = Runner(parse(method, find), find, InferenceConfig(light_views=8, normal_views=8))
     groups = {}
     for images in args.images:
@@ -52,8 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             narrow = not args.merltest and number % 2 == 1
             scene = Scene(folder, spec, narrow, images, args.merltest is not None)
             given = (scene.lights, scene.gains) if args.lights else (None, None)
-            found = runner.estimate(scene.images, scene.mask, *given)
-            keep(file, found, scene.normals, scene.lights, held_out=True)
+            keep(file, answer(runner, scene.images, scene.mask, *given), scene.normals, scene.lights, held_out=True)
         groups[f"{images or 'all'} images"] = read_all(place)
     for line in tabulate(groups, load_fusion(args.weights)):
         sys.stdout.write(line)

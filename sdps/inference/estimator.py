@@ -28,6 +28,8 @@ from sdps.models.base import FusionNetwork, LightingNetwork, Lights, NormalNetwo
 from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.lcnet import INPUT_SIZE, resize_input
 
+AGAIN_SHARE = 0.5
+"""Of the memory for a part of an object, when it is looked at again: what was found before is kept beside it."""
 _NEAR = 0.04
 """Nearness below which a network's word is not worth the second look that near lamps need."""
 _ROLES = {"lighting": ("lighting",), "normals": ("normals", "pixels")}
@@ -62,6 +64,7 @@ class Estimator(InferenceConfig):
         device: Where all networks are.
         chunk_pixels: Image pixels a network encodes at once; bounds memory for any number of images. None: what
             suits the device.
+        tile_share: Of the memory for what a network makes of a part of an object, how much it takes.
 
     Raises:
         InputError: a model of another role than its place, or an option out of range.
@@ -71,6 +74,7 @@ class Estimator(InferenceConfig):
     normals: TrainedModel | None
     device: torch.device
     chunk_pixels: int | None = None
+    tile_share: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -162,7 +166,8 @@ class Estimator(InferenceConfig):
         scaled = scale_to_mean(lit.intensities.astype(np.float64), self._mean_intensity()).astype(np.float32)
         errors = np.zeros(len(images), np.float32) if lit.expected_light_error is None else lit.expected_light_error
         found = replace(lit, intensities=scaled, expected_light_error=errors, seconds=0.0)
-        return self.estimate(images, mask, found=found, rig=replace(rig, nearness=lit.nearness))
+        less = replace(self, tile_share=AGAIN_SHARE)
+        return less.estimate(images, mask, found=found, rig=replace(rig, nearness=lit.nearness))
 
     @torch.inference_mode()
     def estimate_lights(self, images: ImageSource, mask: np.ndarray, intensities: np.ndarray | None = None) -> Estimate:
@@ -300,7 +305,7 @@ class Estimator(InferenceConfig):
     def _tiling(self, images: int) -> tuple[int, int, int]:
         """Return of which multiple tiles are, how wide their halo is, and how many pixels they have at most."""
         network = cast(NormalNetwork, self._normal_model().network)
-        most = TILE_BYTES // (PIXEL_BYTES + images * network.kept_bytes)
+        most = int(self.tile_share * TILE_BYTES) // (PIXEL_BYTES + images * network.kept_bytes)
         return network.size_multiple, network.reach, most
 
     def _run_lighting(self, network: LightingNetwork, read: View) -> Lights:

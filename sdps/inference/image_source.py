@@ -124,7 +124,7 @@ def survey(source: ImageSource, mask: np.ndarray, margin: int | None, *, stray: 
         if not np.isfinite(inside).all():
             raise InputError("the images contain NaN or infinite values inside the mask; repair them first")
         sample[start:stop] = inside[:, chosen]
-    rows, columns = (_box(np.any(mask, axis=axis), margin) for axis in (1, 0))
+    rows, columns = find_box(mask, margin)
     level = stray_light(sample) if stray else np.zeros((len(source), 3), np.float32)
     return ObjectImages(source, rows, columns, mask[rows, columns], shape, level, remove_stray_light(sample, level))
 
@@ -242,9 +242,11 @@ def _sample_pixels(pixels: int, images: int) -> np.ndarray:
     return np.sort(generator(0, "exposure").choice(pixels, wanted, replace=False))
 
 
-def _box(occupied: np.ndarray, margin: int | None) -> slice:
-    """Return the range of the true values of (N,) bool, `margin` wider and inside [0, N); all of that without one."""
-    if margin is None:
-        return slice(0, len(occupied))
-    inside = np.flatnonzero(occupied)
-    return slice(max(int(inside[0]) - margin, 0), min(int(inside[-1]) + 1 + margin, len(occupied)))
+def find_box(mask: np.ndarray, margin: int | None) -> tuple[slice, slice]:
+    """Return rows and columns of the box around an object (H, W), `margin` wider and inside; of all without one."""
+    found = []
+    for axis, length in ((1, mask.shape[0]), (0, mask.shape[1])):
+        inside = np.flatnonzero(mask.any(axis=axis))
+        room = length if margin is None else margin
+        found.append(slice(max(int(inside[0]) - room, 0), min(int(inside[-1]) + 1 + room, length)))
+    return found[0], found[1]

@@ -15,6 +15,7 @@ CONSTANT = "constant"
 CLASSICAL = (*classical.METHODS, CONSTANT)
 REFINE, FUSE = "refine", "fuse"
 """Last part of an expression: refine what the parts before it find, or join that with what the network says then."""
+AFTER = (REFINE, FUSE)
 VIEWS = ("light_views", "normal_views")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.methods import pretrained
-from sdps.methods.method import CLASSICAL, CONSTANT, FUSE, NONE, REFINE, Method, join, label, stem
+from sdps.methods.method import AFTER, CLASSICAL, CONSTANT, FUSE, NONE, REFINE, Method, join, label, stem
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 
 
@@ -59,7 +59,7 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
     if last in AFTER:
         if len(parts) == 1:
             raise InputError(f"method {text}: say what is refined, as in sdps-frames+{last}")
-        return AFTER[last](parse("+".join(parts[:-1]), find))
+        return finish(parse("+".join(parts[:-1]), find), last, find)
     if not all(parts) or len(parts) > 2:
         raise InputError(f"method {text!r}: want METHOD or LIGHTS+NORMALS, either with +{REFINE} or +{FUSE}")
     if len(parts) == 2:
@@ -79,37 +79,26 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
     return combine(None, name, None, find)
 
 
-def with_refinement(method: Method) -> Method:
-    """Return a method whose normals and lights are refined by inverse rendering (`sdps.refinement`).
+def finish(method: Method, last: str, find: Callable[[str], Path]) -> Method:
+    """Return a method that goes on with what the last part of an expression says, one of `AFTER`.
 
     Raises:
-        InputError: it gives no normals.
+        InputError: it gives no normals to refine, or, to be joined, not those of a network that tells its errors.
     """
     if method.normals in (NONE, CONSTANT):
-        raise InputError(f"method {method.name}+{REFINE}: refinement needs a method that gives normals")
-    return replace(method, name=f"{method.name}, refined", refined=True, paper="")
-
-
-def with_fusion(method: Method) -> Method:
-    """Return a method whose answer is joined from its network's and from refinement's (`sdps.methods.fusion`).
-
-    Raises:
-        InputError: its normals are not those of a network that tells the error to expect.
-    """
-    if not can_fuse(method):
-        raise InputError(
-            f"method {method.name}+{FUSE}: needs a network that tells its errors, as in sdps-frames+{FUSE}"
-        )
+        raise InputError(f"method {method.name}+{last}: refinement needs a method that gives normals")
+    if last == REFINE:
+        return replace(method, name=f"{method.name}, refined", refined=True, paper="")
+    if not can_fuse(method, find):
+        raise InputError(f"method {method.name}+{last}: want a network that tells its errors, as sdps-frames+{last}")
     return replace(method, name=f"{method.name}, fused", refined=True, fused=True, paper="")
 
 
-def can_fuse(method: Method) -> bool:
-    """Return whether the normals are those of a network that tells the error to expect."""
-    return stem(method.normals).removeprefix(pretrained.SHIPPED).startswith("frames")
-
-
-AFTER = {REFINE: with_refinement, FUSE: with_fusion}
-"""What the last part of an expression does to the method before it."""
+def can_fuse(method: Method, find: Callable[[str], Path]) -> bool:
+    """Return whether the normals are those of a network that tells the errors to expect of them."""
+    if method.normals in (NONE, *CLASSICAL):
+        return False
+    return getattr(MODELS[model_of(method.normals, find)].build, "tells_errors", False)
 
 
 def uses_networks(method: Method) -> bool:

@@ -27,14 +27,13 @@ from sdps.methods.on_box import Box
 from sdps.models.registry import TRUE_LIGHTS
 
 if TYPE_CHECKING:
+    from sdps.methods.fusion.evidence import Evidence
     from sdps.models.checkpoint import TrainedModel
     from sdps.refinement.refine import RefineConfig
     from sdps.refinement.trust import RefinedEstimate
 
 _digest = cache(file_hash)
 _log = logging.getLogger(__name__)
-SECOND_LOOK = "second look"
-"""Stage in which a network looks again, under refined lights."""
 _PLACES = ("lighting", "normals")
 Found = dict[tuple[Hashable, ...], Estimate]
 """Estimated lights by what they depend on."""
@@ -81,18 +80,16 @@ class Runner:
         """Return a digest of what results depend on besides images and code: weights, settings and arithmetic."""
         method = self.method
         names = {place: getattr(method, place) for place in _PLACES}
-        parts: list[Any] = [method.intensities, method.refined, method.fused, self.refining, *self._fusion()]
+        parts: list[Any] = [method.intensities, method.refined, self.refining]
+        if method.fused:
+            from sdps.methods.fusion.fuse import WEIGHTS
+
+            parts.append(_digest(WEIGHTS))
         parts += [(place, _digest(self.files[name]) if name in self.files else name) for place, name in names.items()]
         if self.estimator is not None:
             used = self.config.options() | {"precision": self.estimator.arithmetic.precision}
             parts += [used, str(self.estimator.device)]
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
-
-    def _fusion(self) -> list[str]:
-        """Return a digest of the weights that join, where they do."""
-        from sdps.methods.fusion.fuse import WEIGHTS
-
-        return [_digest(WEIGHTS)] if self.method.fused and WEIGHTS.is_file() else []
 
     def estimate(
         self,
@@ -207,24 +204,28 @@ class Runner:
         if not self.method.fused or expected.blind:
             return choose(estimate, refined, expected)
         # What is doubted of the normals, joining weighs pixel by pixel; refined lights are better even then.
-        return self._fuse(images, mask, choose(estimate, refined, expected._replace(doubt="")), lit, rig)
-
-    def _fuse(
-        self, images: ImageSource, mask: np.ndarray, found: "RefinedEstimate", lit: bool, rig: Rig
-    ) -> Estimate:  # fmt: skip
-        """Ask the network again under refined lights, and join its answer with that of refinement."""
-        from sdps.methods.fusion.evidence import gather
         from sdps.methods.fusion.fuse import fuse
 
+        found = choose(estimate, refined, expected._replace(doubt=""))
+        return fuse(found, self.ask_again(images, mask, found, lit=lit, rig=rig), mask)
+
+    def ask_again(
+        self, images: ImageSource, mask: np.ndarray, found: "RefinedEstimate", *, lit: bool, rig: Rig = UNKNOWN
+    ) -> "Evidence":
+        """Ask the network again under refined lights; return what it and refinement say.
+
+        Args:
+            images, mask, rig: As in `estimate`.
+            found: By this method, and not doubted.
+            lit: Light directions were given.
+        """
+        from sdps.methods.fusion.evidence import gather
+
         assert self.estimator is not None  # the method has a network
-        refined, near = found.refined, found.refined.nearness
-        lights = Estimate(
-            found.start.normals[:0, :0], refined.light_directions, refined.grey_intensities,
-            nearness=near if are_near(near) else None,
-        )  # fmt: skip
-        with retell("normals", SECOND_LOOK):
+        lights = Estimate(found.normals, found.light_directions, found.intensities, nearness=found.nearness)
+        with retell("normals", "second look"):
             again = self.estimator.look_again(images, mask, lights, rig=rig)
-        return fuse(found, gather(mask, found.start, refined, again, found.trust, lit=lit), mask)
+        return gather(mask, found.start, found.refined, again, found.trust, lit=lit)
 
     def score(
         self,

@@ -112,6 +112,7 @@ class NormalNetwork(nn.Module):
         reach: Pixels around a pixel that its normal depends on, at most: the halo of tiles.
         kept_bytes: Memory per pixel and image for what is kept until all images were seen.
         equivariant: Its feature of a turned scene is that of the scene, turned (`FusionNetwork.turn`).
+        tells_errors: It predicts the errors to expect of its normals.
     """
 
     needs_lights: bool = True
@@ -120,6 +121,7 @@ class NormalNetwork(nn.Module):
     reach: int = 0
     kept_bytes: int = 0
     equivariant: bool = False
+    tells_errors: bool = False
 
     def inference_seconds(self, images: int, pixels: float, box: float, views: int) -> float:
         """Return about how long inference takes on one core of a server (AMD EPYC, AVX-512).

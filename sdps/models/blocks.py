@@ -1,4 +1,4 @@
-"""The layers both networks are made of (SDPS-Net, supplement; no normalisation layer anywhere)."""
+"""Layers that networks are made of. Those of SDPS-Net (supplement) have no normalisation."""
 
 import torch
 from torch import Tensor, nn

@@ -94,6 +94,7 @@ class FrameNet(FusionNetwork):
     kept_bytes = 6
     equivariant = True
     sees_places = True
+    tells_errors = True
 
     def __init__(
         self, *, width: int = 64, blocks: int = 4, frame: str = "normal", heads: int = 0, attending: int = 2
@@ -210,10 +211,11 @@ class FrameNet(FusionNetwork):
             start = (axes @ first[..., None])[..., 0]  # the first normal in the frame
             seen, known = pixel_inputs(pixels, axes, start, scale, residual)
         tokens = self.seen(seen) + self.known(known)[:, None]  # (N, Q, C)
-        for number, layer in enumerate(self.exchange, len(self.attend) - len(self.exchange)):
+        alone = len(self.exchange) - len(self.attend)  # layers without attention
+        for number, layer in enumerate(self.exchange):
             tokens = layer(tokens)
-            if number >= 0:
-                tokens = self.attend[number](tokens)
+            if number >= alone:
+                tokens = self.attend[number - alone](tokens)
         fused = self.fuse(torch.cat([pool(tokens), known.to(tokens.dtype)], dim=-1))  # (N, 128)
         # Never under autocast: a normal rounded to bfloat16's 8 bits moves in steps of a fifth of a degree.
         with torch.autocast(fused.device.type, enabled=False):

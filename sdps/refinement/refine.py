@@ -26,7 +26,8 @@ from sdps.refinement.reflectance import LOBES, MODES, SHAPES
 from sdps.refinement.sites import Grid, Sites
 from sdps.refinement.transport import trace
 
-_FEWEST = 4
+FEWEST = 4
+"""With fewer images nothing is refined."""
 _OF_PIXELS = frozenset({"normals", "log_albedo", "log_strength"})
 _SHARPEST, _BROADEST = 300.0, 10.0
 _START_HEIGHT = -4.0
@@ -150,8 +151,8 @@ def _check(
     count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray
 ) -> np.ndarray:
     """Return the intensities (L, 3), if all sizes fit."""
-    if count < _FEWEST:
-        raise InputError(f"refinement needs at least {_FEWEST} images, got {count}")
+    if count < FEWEST:
+        raise InputError(f"refinement needs at least {FEWEST} images, got {count}")
     if normals.shape != (*mask.shape, 3):
         raise InputError(
             f"refinement: mask {mask.shape} and normals {normals.shape} do not fit; give normals per pixel"

@@ -18,8 +18,6 @@ from sdps.refinement.image_model import Refined
 
 FEWEST_IMAGES = 8
 """With fewer, what a method found is kept."""
-FEWEST_TO_FUSE = 4
-"""With fewer, there is nothing to join: refinement wants so many."""
 _PLANE = 0.08
 """Lights are taken to lie in one plane with the object if they leave it by less, root mean square."""
 _FLAT = 0.1
@@ -78,8 +76,10 @@ class RefinedEstimate(Estimate):
 
 
 def choose(start: Estimate, refined: Refined, expected: Trust) -> RefinedEstimate:
-    """Return what refinement found, or its start where there is a doubt."""
+    """Return what refinement found, or its start where there is a doubt; and the error to expect of it."""
     values = vars(start) | {"start": start, "refined": refined, "trust": expected}
+    if not expected.doubt or start.expected_error is None:
+        values["expected_error"] = expected.normals
     if not expected.doubt:
         values["normals"], values["light_directions"] = refined.normals, refined.light_directions
         values["intensities"] = refined.grey_intensities

@@ -22,7 +22,6 @@ from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import angle_degrees
 from sdps.inference.tiles import release_memory
 from sdps.methods import pretrained
-from sdps.methods.fusion.evidence import find_box
 from sdps.methods.fusion.fuse import FusedEstimate
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
@@ -133,9 +132,7 @@ class Inference:
         """Angle to the true normals to expect, (H, W) float32 in degrees; None where neither network nor refinement
         predicts it. Where refinement was not kept it is the network's, if there is one.
         """
-        found, own = self.refinement, self.estimate.expected_error
-        kept = found is not None and not found.trust.doubt and not isinstance(found, FusedEstimate)
-        return found.trust.normals if found is not None and (kept or own is None) else own
+        return self.estimate.expected_error
 
     @cached_property
     def verdict(self) -> str:
@@ -218,7 +215,8 @@ class Inference:
         if self.refinement is not None:
             facts["refined"] = _about_refined(self.refinement, photos)
         if isinstance(self.estimate, FusedEstimate):
-            facts["fused"] = _about_fused(self.estimate, photos.mask)
+            from_network, from_refinement = (round(degrees, 2) for degrees in self.estimate.moved)
+            facts["fused"] = {"from_network_degrees": from_network, "from_refinement_degrees": from_refinement}
         if self.residuals is not None:
             facts["lambertian_residual"] = round(self.residuals.overall, 4)
         return facts
@@ -326,16 +324,6 @@ def _about_refined(found: RefinedEstimate, photos: Photographs) -> dict[str, Any
         "body": refined.body.round(4).tolist(),
         "modes": refined.modes.round(4).tolist(),
         "lobes": {"amplitudes": refined.amplitudes.round(4).tolist(), "sharpness": refined.sharpness.round(1).tolist()},
-    }
-
-
-def _about_fused(found: FusedEstimate, mask: np.ndarray) -> dict[str, float]:
-    """Say how far the joined normals are from both witnesses, in degrees; JSON ready."""
-    box, evidence = find_box(mask), found.evidence
-    pairs = {"network": evidence.network, "refinement": evidence.refined}
-    return {
-        f"from_{name}_degrees": round(_mean_angle(found.normals[box], normals, evidence.mask), 2)
-        for name, normals in pairs.items()
     }
 
 

@@ -16,7 +16,9 @@ import torch
 from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.core.integration import LARGE
+from sdps.inference.estimator import AGAIN_SHARE
 from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES
+from sdps.methods.fusion.fuse import TILE_PIXELS
 from sdps.methods.on_box import estimate_bytes
 from sdps.methods.runner import Runner
 from sdps.models.base import NormalNetwork
@@ -198,6 +200,12 @@ def _memory(size: Size, runner: Runner) -> float:
         kept += 44.0 * size.frame
         each = 1200 + 20 * size.pictures
         stages.append(kept + min(each * size.box, refine.TILE_BYTES) + 12 * size.pixels)
+    if runner.method.fused:
+        kept += 4.0 * size.frame
+        again = 32.0 * size.frame  # the second look, or the joined answer beside it
+        tile = size.box * TILE_BYTES / _tile_pixels(size, runner)
+        stages.append(kept + again + min(tile, AGAIN_SHARE * TILE_BYTES))
+        stages.append(kept + again + 16.0 * size.box + 1200.0 * min(size.box, TILE_PIXELS))
     stages.append(kept + (700 if size.pixels <= LARGE else 80) * size.pixels)
     kept += 25.0 * size.frame  # depth and albedo
     stages.append(kept + 55 * size.pixels)

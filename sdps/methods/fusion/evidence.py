@@ -9,10 +9,11 @@ import numpy as np
 
 from sdps.core.estimate import Estimate
 from sdps.core.metrics import angle_degrees
+from sdps.inference.image_source import find_box
 from sdps.refinement.image_model import Refined
 from sdps.refinement.trust import Trust, measure_spread
 
-ROOM = 4
+_ROOM = 4
 """Pixels kept around the object."""
 
 
@@ -61,11 +62,6 @@ class Evidence:
         """What is one number of the whole object."""
         return self.images, self.spread, self.nearness, self.turned, self.lit
 
-    @property
-    def mean_residual(self) -> float:
-        """What refinement did not explain of the whole object."""
-        return float(self.residual[self.mask].mean())
-
     def part(self, rows: slice, columns: slice) -> "Evidence":
         """Return the evidence of a part of the box."""
         values = {name: each[rows, columns] if each.ndim > 1 else each for name, each in self.arrays().items()}
@@ -76,11 +72,9 @@ class Evidence:
         return {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
 
 
-def find_box(mask: np.ndarray) -> tuple[slice, slice]:
-    """Return rows and columns of the box around an object (H, W), with some room."""
-    found = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    rows, columns = (slice(max(int(places[0]) - ROOM, 0), int(places[-1]) + 1 + ROOM) for places in found)
-    return rows, columns
+def find_place(mask: np.ndarray) -> tuple[slice, slice]:
+    """Return the rows and columns of a picture (H, W) that are an object's evidence."""
+    return find_box(mask, _ROOM)
 
 
 def gather(
@@ -96,11 +90,11 @@ def gather(
         trust: What refinement says of itself.
         lit: Light directions were given.
     """
-    box = find_box(mask)
-    grey = refined.albedo.mean(axis=2)
+    box = find_place(mask)
+    inside, grey = mask[box], refined.albedo[box].mean(axis=2)
     assert start.expected_error is not None and again.expected_error is not None  # only such networks are asked
     return Evidence(
-        mask=mask[box],
+        mask=inside,
         network=again.normals[box],
         refined=refined.normals[box],
         start=start.normals[box],
@@ -108,7 +102,7 @@ def gather(
         told_first=start.expected_error[box],
         expected=trust.plain[box],
         residual=refined.pixel_residual[box],
-        albedo=(grey / max(float(grey[mask].mean()), 1e-9))[box],
+        albedo=grey / max(float(grey[inside].mean()), 1e-9),
         gloss=refined.strength[box],
         used=refined.used[box],
         images=float(len(refined.light_directions)),

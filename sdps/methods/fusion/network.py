@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from sdps.core.metrics import angle_degrees
 from sdps.core.symmetry import Symmetry
 from sdps.methods.fusion.evidence import Evidence
 from sdps.models.blocks import LOG_USUAL, SLOPE, conv, deconv
@@ -27,7 +28,6 @@ _MOST = 90.0
 _BESIDE = 0.5
 """How far the answer may lie beside both normals, as a share of what lies between them."""
 _USUAL_DEGREES, _USUAL_RESIDUAL, _USUAL_IMAGES = 3.3, 0.03, 32.0  # inputs of such are 0
-_ALL = slice(None), slice(None)
 
 
 class Joined(NamedTuple):
@@ -92,7 +92,7 @@ class FusionNet(nn.Module):
     def forward(self, given: Inputs) -> Joined:
         """Return the joined normals and the distance to the true ones to expect."""
         mask = given.maps[:, -1:]
-        seen = self.enter(torch.cat([*given[:4]], dim=1)) + self.told(given.numbers)[..., None, None]
+        seen = self.enter(torch.cat(given[:4], dim=1)) + self.told(given.numbers)[..., None, None]
         near = self.near(functional.leaky_relu(seen * mask, SLOPE))
         half = self.smaller(near)
         quarter = self.quarter(half)
@@ -105,14 +105,19 @@ class FusionNet(nn.Module):
         return Joined(normals * mask, (found[:, 4:] + LOG_USUAL).exp())
 
 
-def prepare(evidence: Evidence, part: tuple[slice, slice] = _ALL) -> Inputs:
-    """Return evidence, or that of some rows and columns, as the network takes it: B = 1, padded right and below."""
-    own, inside = evidence.part(*part), evidence.mask[part]
-    residual, mean = own.residual, evidence.mean_residual
+def prepare(evidence: Evidence) -> Inputs:
+    """Return evidence as the network takes it, B = 1, padded right and below."""
+    return prepare_part(evidence, describe(evidence))
+
+
+def prepare_part(own: Evidence, numbers: Tensor) -> Inputs:
+    """Return the evidence of a part of an object as the network takes it, with the numbers (1, 9) of the whole."""
+    inside, residual = own.mask, _log_residual(own.residual)
     maps = [
         *(_log_degrees(each) for each in (own.told, own.told_first, own.expected,
-                                          _between(own.network, own.refined), _between(own.start, own.network))),
-        np.log((residual + _FAINT) / _USUAL_RESIDUAL), np.log((residual + _FAINT) / (mean + _FAINT)),
+                                          angle_degrees(own.network, own.refined),
+                                          angle_degrees(own.start, own.network))),
+        residual, residual - float(numbers[0, 0]),
         np.log(own.albedo + _DARK), np.log(own.gloss + _MATT), own.used,
     ]  # fmt: skip
     stacked = np.stack([np.where(inside, each, 0.0) for each in maps] + [inside.astype(np.float32)])
@@ -121,22 +126,21 @@ def prepare(evidence: Evidence, part: tuple[slice, slice] = _ALL) -> Inputs:
     network, refined, start, rest = (
         torch.from_numpy(np.pad(each, padding).astype(np.float32))[None] for each in (*pictures, stacked)
     )
-    return Inputs(network, refined, start, rest, describe(evidence))
+    return Inputs(network, refined, start, rest, numbers)
 
 
 def describe(evidence: Evidence) -> Tensor:
-    """Return what the network is given of the whole object, (1, 9)."""
+    """Return what the network is given of the whole object, (1, 9); the misfit comes first."""
     inside, (images, spread, nearness, turned, lit) = evidence.mask, evidence.numbers
-    moved = _between(evidence.network[inside], evidence.refined[inside])
+    moved = angle_degrees(evidence.network[inside], evidence.refined[inside])
     told = [_log_degrees(each).mean() for each in (evidence.told[inside], evidence.expected[inside], moved)]
-    misfit = np.log((evidence.mean_residual + _FAINT) / _USUAL_RESIDUAL)
+    misfit = _log_residual(evidence.residual[inside].mean())
     numbers = [misfit, np.log(images / _USUAL_IMAGES), spread, 5.0 * nearness, _log_degrees(turned), lit, *told]
     return torch.from_numpy(np.array(numbers, np.float32))[None]
 
 
-def _between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the angles in degrees between unit vectors (..., 3)."""
-    return np.degrees(2.0 * np.arcsin(0.5 * np.linalg.norm(first - second, axis=-1).clip(max=2.0)))
+def _log_residual(residual: np.ndarray | float) -> np.ndarray:
+    return np.log((residual + _FAINT) / _USUAL_RESIDUAL)
 
 
 def _log_degrees(degrees: np.ndarray | float) -> np.ndarray:

@@ -1,6 +1,5 @@
 """What fusion learns from is kept as it was, and the network learns whom to believe."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,9 @@ from lab.releases import fusion
 from lab.releases.fusion_data import quantise
 from lab.shared.answered_scenes import Answered, keep, measure, read, read_all, tabulate
 from sdps.core.estimate import Estimate
-from sdps.methods.fusion.evidence import Evidence, find_box
-from sdps.methods.fusion.fuse import FusedEstimate
+from sdps.methods.fusion.evidence import Evidence, find_place
 from sdps.methods.fusion.network import FusionNet
+from sdps.refinement.trust import RefinedEstimate
 
 
 def ball(side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -40,7 +39,7 @@ def answered(seed: int, held_out: bool = False) -> Answered:
 
 def test_fusion_learns_whom_to_believe(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fusion, "_SIDE", 24)
-    monkeypatch.setattr(fusion, "_RATE", 1e-2)
+    monkeypatch.setattr(fusion, "_RATE", 3e-3)
     scenes = [answered(seed) for seed in range(6)]
     other = answered(9, held_out=True)
     before, after = (measure(other, net) for net in (FusionNet().eval(), fusion.train(scenes, 60, 16, 0)))
@@ -52,16 +51,12 @@ def test_fusion_learns_whom_to_believe(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_answered_scene_is_read_back(tmp_path: Path) -> None:
     scene = answered(3)
-    mask, box = scene.evidence.mask, find_box(scene.evidence.mask)
+    mask, box = scene.evidence.mask, find_place(scene.evidence.mask)
     lights = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (4, 1))
     start = Estimate(scene.truth, lights, np.ones(4, np.float32))
-    found = FusedEstimate(
-        scene.truth, lights, np.ones(4, np.float32), refined=replace(start), start=start, trust=None,  # type: ignore[arg-type]
-        evidence=replace(scene.evidence, **{name: each[box] for name, each in scene.evidence.arrays().items()
-                                            if each.ndim > 1}),
-    )  # fmt: skip
-    keep(tmp_path / "a.npz", found, scene.truth, lights, held_out=True)
-    keep(tmp_path / "b.npz", start, scene.truth, lights, held_out=False)
+    found = RefinedEstimate(scene.truth, lights, np.ones(4, np.float32), refined=start, start=start, trust=None)  # type: ignore[arg-type]
+    keep(tmp_path / "a.npz", (found, scene.evidence.part(*box)), scene.truth, lights, held_out=True)
+    keep(tmp_path / "b.npz", (found, None), scene.truth, lights, held_out=False)
     (back,) = read_all(tmp_path)
     assert back.held_out and back.name == "a" and read(tmp_path / "b.npz") is None
     assert back.lights == pytest.approx((0.0, 0.0), abs=0.1)

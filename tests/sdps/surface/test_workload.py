@@ -41,7 +41,9 @@ def test_one_line_says_pixels_pictures_minutes_and_memory(photos: Photographs) -
     ), line  # fmt: skip
 
 
-@pytest.mark.parametrize("method", ["sdps-frames", "sdps-frames+refine", "sdps", "lcnet+robust-least-squares"])
+@pytest.mark.parametrize(
+    "method", ["sdps-frames", "sdps-frames+refine", "sdps-frames+fuse", "sdps", "lcnet+robust-least-squares"]
+)
 @pytest.mark.parametrize(("height", "width", "count"), [(4000, 6000, 100), (4000, 6000, 8), (3000, 4000, 1000)])
 def test_any_ordinary_camera_fits(photos: Photographs, method: str, height: int, width: int, count: int) -> None:
     runner = _runner(method, (False, False), None, None, None)

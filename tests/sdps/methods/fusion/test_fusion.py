@@ -13,13 +13,12 @@ from sdps.core.geometry import Rig
 from sdps.core.metrics import angle_degrees
 from sdps.core.symmetry import SYMMETRIES, Symmetry
 from sdps.methods.fusion import fuse as fusing
-from sdps.methods.fusion.evidence import ROOM, Evidence, find_box
-from sdps.methods.fusion.network import REACH, FusionNet, describe, prepare
+from sdps.methods.fusion.evidence import Evidence, find_place
+from sdps.methods.fusion.network import REACH, FusionNet, describe, prepare, prepare_part
 from sdps.methods.parse import parse
 from sdps.methods.pretrained import require
 from sdps.methods.runner import Runner
-from sdps.refinement.refine import RefineConfig
-from sdps.refinement.trust import FEWEST_TO_FUSE
+from sdps.refinement.refine import FEWEST, RefineConfig
 
 
 def sphere(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +93,7 @@ def test_inputs_of_a_turned_object_are_the_turned_inputs(symmetry: Symmetry) -> 
 
 def test_the_whole_object_describes_every_part() -> None:
     evidence = make_evidence()
-    part = prepare(evidence, (slice(0, 8), slice(8, 24)))
+    part = prepare_part(evidence.part(slice(0, 8), slice(8, 24)), describe(evidence))
     assert torch.equal(part.numbers, describe(evidence))
     assert torch.equal(part.maps, prepare(evidence).maps[:, :, :8, 8:24])
     worse = replace(evidence, residual=2.0 * evidence.residual)
@@ -104,7 +103,7 @@ def test_the_whole_object_describes_every_part() -> None:
 def test_the_box_has_room_inside_the_picture() -> None:
     mask = np.zeros((20, 30), bool)
     mask[1:3, 10:12] = True
-    assert find_box(mask) == (slice(0, 3 + ROOM), slice(10 - ROOM, 12 + ROOM))
+    assert find_place(mask) == (slice(0, 7), slice(6, 16))
 
 
 def test_fused_methods_are_asked_for_by_name() -> None:
@@ -117,8 +116,8 @@ def test_fused_methods_are_asked_for_by_name() -> None:
     ):
         with pytest.raises(InputError, match=said):
             parse(text, require)
-    assert _runner("auto", (False, False), None, None, None, images=FEWEST_TO_FUSE).method.fused
-    assert not _runner("auto", (False, False), None, None, None, images=FEWEST_TO_FUSE - 1).method.refined
+    assert _runner("auto", (False, False), None, None, None, images=FEWEST).method.fused
+    assert not _runner("auto", (False, False), None, None, None, images=FEWEST - 1).method.refined
     assert not _runner("sdps-frames+refine", (False, False), None, None, None, images=40).method.fused
     assert not _runner("lcnet+psfcn", (False, False), None, None, None, images=40).method.fused
 
@@ -134,10 +133,11 @@ def test_the_fused_answer_lies_between_both_witnesses(lit: bool) -> None:
     given = (lights, np.ones(12, np.float32)) if lit else (None, None)
     found = runner.estimate(images, mask, given[0], given[1], rig=Rig())
     assert isinstance(found, fusing.FusedEstimate) and isinstance(found.start, Estimate)
-    box, evidence = find_box(mask), found.evidence
+    box, evidence = find_place(mask), runner.ask_again(images, mask, found, lit=lit)
     apart = angle_degrees(evidence.network, evidence.refined)[evidence.mask].mean()
     witnesses = (evidence.network, evidence.refined)
     away = [angle_degrees(found.normals[box], each)[evidence.mask].mean() for each in witnesses]
+    assert found.moved == pytest.approx(away, abs=0.01)
     assert max(away) < apart + 5.0 and evidence.lit == float(lit)
     assert found.expected_error is not None and found.expected_error[mask].min() > 0.0
     assert np.allclose(np.linalg.norm(found.normals[mask], axis=-1), 1.0, atol=1e-4)
