@@ -1,54 +1,65 @@
 #!/usr/bin/env bash
-# Half an hour of a borrowed GPU machine without network: render scenes of `world`, train lightset and frames further.
+# Half an hour of a borrowed GPU machine without network: render scenes of `world` and `ship` on its cores, and train
+# lightset and frames on its GPU meanwhile.
 #
-#   lab/gpu_half_hour.sh pack           here: what the machine lacks, into .gpu/, in loads that fit a call; says what to run
-#   lab/gpu_half_hour.sh loads          here: the loads again, after the working tree became smaller
-#   lab/gpu_half_hour.sh go [MINUTES]   there, as often as needed: unpack, render, train, test; stops after MINUTES (9)
-#   lab/gpu_half_hour.sh try            here: `go`, tiny, on the CPU, in five minutes; installs nothing
+#   lab/gpu_half_hour.sh pack          here: what the machine lacks, into .gpu/, in loads that fit a call; says what to run
+#   lab/gpu_half_hour.sh loads         here: the loads again, after the working tree became smaller
+#   lab/gpu_half_hour.sh probe         there, with the first load: do training and OptiX work, and how fast? takes two minutes
+#   lab/gpu_half_hour.sh go [SECONDS]  there, as often as needed: takes in what the call brought, starts what can be started,
+#                                      says every minute how it goes, and returns after SECONDS (560) or when all is done
+#   lab/gpu_half_hour.sh test          there: the tests that need a GPU; wants the whole working tree
+#   lab/gpu_half_hour.sh try           here: the same, tiny, on the CPU, in five minutes; installs nothing
 #
-# `go` begins where the one before ended, while the machine is held. Every two minutes, and when it ends, the weights so far
-# (float16), curves and logs are copied into $OUT: eight files.
+# What `go` starts runs on between calls while the machine is held, a call at least every 30 s. Whenever it returns, the
+# weights so far (float16), curves and logs lie in $OUT: eight files. A part that failed is started again by the next call.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-# The plan of the half hour; all can be set from outside: RENDER_MINUTES=8 lab/gpu_half_hour.sh go
-: "${RENDER_MINUTES:=6}" "${LIGHTSET_MINUTES:=8}" "${FRAMES_MINUTES:=8}" "${BRING_SECONDS:=120}"
-: "${LIGHTSET:=assets/weights/lightset.safetensors}" "${FRAMES:=assets/weights/frames.safetensors}"  # training starts there
-: "${SEED:=20261501}"  # of the scenes: another for every half hour
-: "${ROUNDS:=10}"  # parts of the plan, each with its share of every family; the first two compare GPU and CPU
-: "${COMPARE_SECONDS:=50}"  # of each at most
-: "${GPU_WORKERS:=12}" "${CPU_WORKERS:=$(nproc --all)}"  # shapes are made on the CPU: several processes keep one GPU busy
-DATA=("data.seed=$SEED" data.prefix=g1- 'data.families={composition: 700, sculpture: 500, blobby: 300}')  # 6,000 scenes
-# Loading binds: a core makes about eight samples a second, 15 processes two to four steps. Validation is rare, since one
-# process loads it. Rates of 2e-3 were right for a quarter of these batches.
-TRAINING='steps: null, skip_missing: true, cooldown: 0.7, warmup: 0.02, clip_gradient: 1.0, learning_rate: 3e-3, workers: 15,
-  validation_images: 32, validation_scenes: 24, validate_every: 400, checkpoint_minutes: 1'
-LIGHTSET_RUN='base: lightset, seed: 41, size: 64, images: 24, batch_scenes: 48, options: {nearness: true}'
-FRAMES_RUN='base: frames, seed: 42, crop: 48, images: 20, batch_scenes: 32, accumulate: 4, loss: chord, light_blend: 1.5,
-  light_error: 0.0, start_share: 0.5, lights: lightset-gpu'
+# The plan of the half hour; all can be set from outside: MINUTES=15 lab/gpu_half_hour.sh go
+: "${MINUTES:=20}"          # of training, both networks at the same time
+: "${ENOUGH:=800}"          # scenes with which it begins
+: "${SEED:=20261501}"       # of the scenes: another for every half hour
+: "${ROUNDS:=8}"            # parts of the plan, each with its share of every family
+: "${VARIANT:=llvm_ad_rgb}" # cuda_ad_rgb: render on the GPU, where OptiX works
+: "${WORLD_WORKERS:=9}" "${SHIP_WORKERS:=6}" "${READERS:=2}"
+NEAR=(data.lights=mixed data.light_count=32 data.near_lights=0.5 'data.near_light_distance=[2.5, .inf]'
+  data.near_light_spread=0.2 data.camera=mixed 'data.camera_distance=[1.34, .inf]')
+WORLD=("data.seed=$SEED" data.prefix=g1- data.spp=8 'data.families={composition: 1000, sculpture: 1250, blobby: 750}')
+SHIP=("data.seed=$SEED" data.prefix=g2- data.spp=8 "${NEAR[@]}" 'data.families={blobby: 1000, sculpture: 1500}')
+# Scenes lie in the GPU's memory, and samples are made there: loader processes would make a tenth of them.
+TRAINING='steps: null, resident: true, skip_missing: true, warmup: 0.02, clip_gradient: 1.0, cooldown: 0.7,
+  validation_images: 32, validation_scenes: 24, checkpoint_minutes: 1'
+LIGHTSET_RUN='base: lightset, seed: 41, size: 64, images: 28, fewest_images: 8, batch_scenes: 64, learning_rate: 3e-3,
+  validate_every: 2000, options: {nearness: true, breadth: 1.34, blocks: 4}'
+FRAMES_RUN='base: frames, seed: 42, crop: 96, images: 24, fewest_images: 6, batch_scenes: 32, accumulate: 4, loss: chord,
+  learning_rate: 2e-3, light_blend: 1.5, light_error: 0.0, lights: "shipped:lightset", start: "shipped:frames",
+  validate_every: 1000, options: {heads: 4, attending: 1, context: 160}'
 
-: "${WORK:=/tmp/gpu}" "${OUT:=out/gpu_half_hour}" "${PYTHON:=python3}"  # WORK lies outside the checkout there
+: "${WORK:=/tmp/gpu}" "${OUT:=out/gpu_half_hour}" "${PYTHON:=python3}" # WORK lies outside the checkout there
+export MINUTES ENOUGH SEED ROUNDS VARIANT WORLD_WORKERS SHIP_WORKERS READERS WORK PYTHON TINY="${TINY:-}"
 export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONUNBUFFERED=1
-
-TINY=()  # settings of training that `try` adds
 
 say() { echo "[$(date +%T)] $*"; }
 
 go() { # SECONDS
-  local code=0
-  END=$(($(date +%s) + $1))
-  mkdir -p "$OUT" "$WORK/logs" "$WORK/in" "$WORK/run"
-  (while sleep "$BRING_SECONDS"; do bring; done) > /dev/null 2>&1 &
-  BRINGING=$!
-  trap 'kill "$BRINGING" 2> /dev/null || true; bring' EXIT
+  local end=$(($(date +%s) + $1)) last=0 part
+  mkdir -p "$OUT" "$WORK/logs" "$WORK/in" "$WORK/run" "$WORK/mix/data/shards"
+  trap bring EXIT
   take
   [[ -e $WORK/site ]] || { say "the next load, please"; return; }
   set_up
-  [[ -e $WORK/rendered ]] || render
-  train || code=$?
-  if [[ $code == 124 ]]; then say "out of time; go on with: lab/gpu_half_hour.sh go"; return; fi
-  test_gpu || say "test-gpu failed"
-  say "all done; training ended with exit code $code"
+  while (($(date +%s) < end)); do
+    if [[ $VARIANT != llvm_ad_rgb || -e $WORK/llvm || $TINY ]]; then
+      for part in world ship; do begin render "$part"; done
+    fi
+    if (($(count_scenes) >= ENOUGH)) && join_manifests; then
+      for part in lightset frames; do begin train "$part"; done
+    fi
+    ! is_done train lightset || ! is_done train frames || { say "all done"; return; }
+    (($(date +%s) < last + 60)) || { last=$(date +%s) && report; }
+    sleep 2
+  done
+  report
 }
 
 take() { # what this call brought; an archive is unpacked when all its pieces are there
@@ -67,76 +78,87 @@ tarfile.open(fileobj=sys.stdin.buffer, mode='r|xz').extractall('$WORK/$name.new'
 
 set_up() { # Dr.Jit and OptiX look for the driver's files where most machines have them, this one perhaps not
   local name file
-  export PYTHONPATH=$PWD:$WORK/site SDPS_CACHE=$WORK
+  export PYTHONPATH=$WORK/code:$WORK/site SDPS_CACHE=$WORK
+  if [[ ! -e $WORK/code ]]; then # what runs between calls is not to change with the working tree
+    mkdir -p "$WORK/code.new" && cp -r render sdps pipelines lab assets pyproject.toml "$WORK/code.new"
+    cp -n "$WORK"/site/*.safetensors "$WORK/code.new/assets/weights/" 2> /dev/null || true
+    mv "$WORK/code.new" "$WORK/code"
+  fi
   cp -n "$WORK/site/StanfordBunny.ply" "$WORK" 2> /dev/null || true
   for name in LIBCUDA:libcuda.so LIBOPTIX:libnvoptix.so; do
     file=$({ find -L /usr/local/nvidia /usr/lib/x86_64-linux-gnu -maxdepth 2 -name "${name#*:}*" || true; } 2> /dev/null |
       sort | head -1)
     [[ ! $file ]] || export "DRJIT_${name%:*}_PATH=$file" LD_LIBRARY_PATH="${file%/*}:${LD_LIBRARY_PATH:-}"
-    say "${name#*:}: ${file:-not found}"
   done
   file=$(find -L /usr/local/nvidia -name nvoptix.bin 2> /dev/null | head -1 || true)
   [[ ! $file || -e /usr/share/nvidia/nvoptix.bin ]] || { mkdir -p /usr/share/nvidia && ln -s "$file" /usr/share/nvidia/; }
+  [[ ! -e $WORK/asked ]] || return 0
+  touch "$WORK/asked"
   file=$("$PYTHON" -c "import mitsuba as mi; mi.set_variant('cuda_ad_rgb')
 scene = mi.load_dict({'type': 'scene', 'sphere': {'type': 'sphere'}})
 print('works:', scene.ray_test(mi.Ray3f([0, 0, 5], [0, 0, -1])))" 2>&1 | tail -n 1 || true)
   say "OptiX: $file"
-  say "$(nvidia-smi -L 2> /dev/null || echo "no GPU here")"
+  say "$(nvidia-smi -L 2> /dev/null || echo "no GPU here"), $(nproc --all) cores, $(free -g | awk '/Mem/ {print $7}') GiB free"
 }
 
-until_then() { # SECOND COMMAND: ends it when `date +%s` says SECOND; it has half a minute to save what it has
-  local left=$(($1 - $(date +%s)))
-  ((left > 5)) || return 124
-  timeout -k 30 "$left" "${@:2}"
+begin() { # render|train PART: in a session of its own, unless it runs or is done
+  local name=$1-$2 pid
+  pid=$(cat "$WORK/logs/$name.pid" 2> /dev/null || true)
+  if is_done "$@" || { [[ $pid ]] && kill -0 "$pid" 2> /dev/null; }; then return 0; fi
+  if [[ $pid && ! $CALL_BEGAN -nt $WORK/logs/$name.pid ]]; then return 0; fi # failed in this call: once is enough
+  setsid bash "$0" "$@" >> "$WORK/logs/$name.log" 2>&1 < /dev/null &
+  echo $! > "$WORK/logs/$name.pid"
+  say "$name begins"
 }
 
-render() { # the first rounds compare GPU and CPU, the faster one does the others, then what the first left
-  local until=$(($(date +%s) + 60 * RENDER_MINUTES)) how best rates=() round
-  for how in "cuda_ad_rgb:$GPU_WORKERS" "llvm_ad_rgb:$CPU_WORKERS"; do
-    render_round $((${#rates[@]} + 1)) $(($(date +%s) + COMPARE_SECONDS)) "$how"
-    rates+=("$RATE $how")
+is_done() { [[ -e $WORK/logs/$1-$2.done ]]; }
+
+render() { # world|ship
+  local round workers settings
+  workers=$([[ $1 == world ]] && echo "$WORLD_WORKERS" || echo "$SHIP_WORKERS")
+  settings=("${WORLD[@]}")
+  [[ $1 == world ]] || settings=("${SHIP[@]}")
+  cd "$WORK/code" && mkdir -p "$WORK/$1/data"
+  [[ -e $WORK/$1/data/shards ]] || ln -s "$WORK/mix/data/shards" "$WORK/$1/data/shards"
+  for round in $(seq "$ROUNDS"); do
+    SDPS_VARIANT=$VARIANT nice -n 10 "$PYTHON" -m pipelines.cli render-data --preset "$1" --out "$WORK/$1" \
+      "${settings[@]/#/--set=}" ${TINY:+"${TINY_SCENES[@]/#/--set=}"} --shard "$round/$ROUNDS" --workers "$workers" || true
   done
-  best=$(printf '%s\n' "${rates[@]}" | sort -rn | head -1)
-  [[ $(count_scenes) != 0 ]] || { tail -n 3 "$WORK/logs/render.log"; say "nothing renders"; exit 2; }
-  for round in $(seq 3 "$ROUNDS") 1 2; do
-    (($(date +%s) + 5 < until)) && render_round "$round" "$until" "${best#* }"
+  touch "$WORK/logs/render-$1.done"
+}
+
+count_scenes() { find "$WORK/mix/data/shards" -name '*.exr' 2> /dev/null | wc -l; }
+
+join_manifests() { # of both presets, once both are planned
+  [[ ! -e $WORK/mix/data/manifest.jsonl ]] || return 0
+  [[ -e $WORK/world/data/manifest.jsonl && -e $WORK/ship/data/manifest.jsonl ]] || return 1
+  cat "$WORK"/{world,ship}/data/manifest.jsonl > "$WORK/mix/data/manifest.new"
+  cp "$WORK/world/data/config.yaml" "$WORK/mix/data/"
+  mv "$WORK/mix/data/manifest.new" "$WORK/mix/data/manifest.jsonl"
+}
+
+train() { # lightset|frames
+  local run=$LIGHTSET_RUN
+  cd "$WORK/code"
+  [[ $1 == lightset ]] || run=$FRAMES_RUN
+  "$PYTHON" -m pipelines.cli train --preset world --data "$WORK/mix/data" --out "$WORK/run" --models "$1-gpu" \
+    --set "runs.$1-gpu={$TRAINING, $run, workers: $READERS, minutes: $MINUTES}" \
+    ${TINY:+"${TINY_TRAINING[@]/#/--set=runs.$1-gpu.}"}
+  touch "$WORK/logs/train-$1.done"
+}
+
+report() {
+  local name
+  say "$(count_scenes) scenes; $(nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader 2> /dev/null || true)" \
+    "load $(cut -d' ' -f1 /proc/loadavg)"
+  for name in "$WORK"/logs/*.log; do
+    printf '  %s: ' "$(basename "$name" .log)" && tail -c 1500 "$name" | tr '\r' '\n' | grep -v '^ *$' | tail -n 1 | cut -c1-200 || echo
   done
-  touch "$WORK/rendered"
 }
 
-render_round() { # ROUND SECOND VARIANT:WORKERS; leaves scenes a minute in RATE
-  local before code=0 began
-  before=$(count_scenes) began=$(date +%s)
-  SDPS_VARIANT=${3%:*} until_then "$(($2 < END ? $2 : END))" "$PYTHON" -m pipelines.cli render-data --preset world \
-    --out "$WORK/run" "${DATA[@]/#/--set=}" --shard "$1/$ROUNDS" --workers "${3#*:}" >> "$WORK/logs/render.log" 2>&1 || code=$?
-  RATE=$((60 * ($(count_scenes) - before) / ($(date +%s) - began + 1)))
-  say "$3, round $1: $RATE scenes a minute, $(count_scenes) in all (exit code $code)"
-}
-
-count_scenes() { find "$WORK/run/data/shards" -name '*.exr' 2> /dev/null | wc -l; }
-
-train() { # frames on the lights of lightset; a finished run is not begun again
-  local code=0
-  until_then "$END" "$PYTHON" -m pipelines.cli train --preset world --data "$WORK/run/data" --out "$WORK/run" \
-    --models lightset-gpu,frames-gpu \
-    --set "runs.lightset-gpu={$TRAINING, $LIGHTSET_RUN, minutes: $LIGHTSET_MINUTES, start: $WORK/site/lightset.safetensors}" \
-    --set "runs.frames-gpu={$TRAINING, $FRAMES_RUN, minutes: $FRAMES_MINUTES, start: $WORK/site/frames.safetensors}" \
-    "${TINY[@]}" >> "$WORK/logs/train.log" 2>&1 || code=$?
-  tail -c 2000 "$WORK/logs/train.log" | tr '\r' '\n' | tail -n 5
-  return $code
-}
-
-test_gpu() { # with the Python that is there, in place of the .venv that make would build
-  local python
-  python=$(command -v "$PYTHON")
-  mkdir -p "$WORK/venv/bin"
-  printf '#!/bin/sh\nexec "%s" "$@"\n' "$python" > "$WORK/venv/bin/python" && chmod +x "$WORK/venv/bin/python"
-  touch "$WORK/venv/.ready" && touch "$WORK/venv/.assets-ready"
-  until_then "$END" make test-gpu VENV="$WORK/venv" 2>&1 | tee "$WORK/logs/test-gpu.log" | tail -n 20
-}
-
-bring() { # into $OUT: for each run its last weights, else the best so far
-  cp "$WORK"/logs/*.log "$WORK/run/data/preview.png" "$OUT" 2> /dev/null || true
+bring() { # into $OUT: for each run its last weights, else the best so far, and a sheet of what was rendered
+  tail -qn 40 "$WORK"/logs/*.log > "$OUT/logs.txt" 2> /dev/null || true
+  cp "$WORK/world/data/preview.png" "$OUT" 2> /dev/null || true
   "$PYTHON" - "$WORK/run/models" "$OUT" << 'PY' || true
 import shutil, sys
 from pathlib import Path
@@ -151,22 +173,54 @@ for run in Path(sys.argv[1]).glob("*-gpu"):
 PY
 }
 
-make_tiny() { # the same code with other numbers, on what is here
-  local name
-  PYTHON=$PWD/.venv/bin/python WORK=${TRY_WORK:-/tmp/gpu_try} RENDER_MINUTES=1 LIGHTSET_MINUTES=0.3 FRAMES_MINUTES=0.3
-  ROUNDS=3 COMPARE_SECONDS=30 BRING_SECONDS=20
-  DATA+=('data.families={composition: 1, sculpture: 3, blobby: 4}' data.spp=2 data.light_count=6 data.size=64 data.views=1
-    data.validation=0.3)
-  for name in workers=0 images=4 batch_scenes=2 accumulate=1 validation_scenes=2 validation_images=4 validate_every=5; do
-    TINY+=("--set=runs.lightset-gpu.$name" "--set=runs.frames-gpu.$name")
+test_gpu() { # with the Python that is there, in place of the .venv that make would build
+  local python
+  set_up
+  unset PYTHONPATH && export PYTHONPATH=$PWD:$WORK/site
+  python=$(command -v "$PYTHON")
+  mkdir -p "$WORK/venv/bin"
+  printf '#!/bin/sh\nexec "%s" "$@"\n' "$python" > "$WORK/venv/bin/python" && chmod +x "$WORK/venv/bin/python"
+  touch "$WORK/venv/.ready" "$WORK/venv/.assets-ready"
+  make test-gpu VENV="$WORK/venv" 2>&1 | tail -n 40
+}
+
+probe() { # on the scenes in .gpu/probe, each network for itself; then the renderer on the GPU
+  mkdir -p "$OUT" "$WORK/logs" "$WORK/in"
+  take && set_up
+  cp -r .gpu/probe "$WORK/probe" && cd "$WORK/code"
+  local name run
+  for name in lightset frames; do
+    run=$LIGHTSET_RUN
+    [[ $name == lightset ]] || run=$FRAMES_RUN
+    timeout 90 "$PYTHON" -m pipelines.cli train --preset world --data "$WORK/probe/data" --out "$WORK/probe" \
+      --models "$name-gpu" --set "runs.$name-gpu={$TRAINING, $run, workers: 2, minutes: ${PROBE_MINUTES:-0.4}, log_every: 10}" 2>&1 |
+      tr '\r' '\n' | tail -n 12 | cut -c1-400
+    tail -n 2 "$WORK/probe/models/$name-gpu/metrics.jsonl" || true
   done
+  nvidia-smi --query-gpu=memory.total,memory.used --format=csv,noheader || true
+  SDPS_VARIANT=cuda_ad_rgb timeout "${PROBE_SECONDS:-40}" "$PYTHON" -m pipelines.cli render-data --preset ship \
+    --out "$WORK/probe/cuda" "${SHIP[@]/#/--set=}" --shard 1/20 --workers 8 2>&1 | tr '\r' '\n' | tail -n 3 | cut -c1-300 || true
+  say "on the GPU: $(find "$WORK/probe/cuda/data/shards" -name '*.exr' 2> /dev/null | wc -l) scenes in ${PROBE_SECONDS:-40} s"
+}
+
+TINY_SCENES=('data.families={sculpture: 4, blobby: 6}' data.spp=2 data.light_count=10 data.size=64 data.views=1
+  data.validation=0.3)
+TINY_TRAINING=(images=6 fewest_images=4 batch_scenes=2 accumulate=1 validation_scenes=2 validation_images=4
+  validate_every=5)
+
+try() { # the same code with other numbers, on what is here
+  export TINY=1 PYTHON=$PWD/.venv/bin/python WORK=${TRY_WORK:-/tmp/gpu_try} MINUTES=0.4 ENOUGH=10 ROUNDS=1
+  export WORLD_WORKERS=1 SHIP_WORKERS=1 READERS=1
   rm -rf "$WORK" && mkdir -p "$WORK/site"
-  cp "$LIGHTSET" "$WORK/site/lightset.safetensors" && cp "$FRAMES" "$WORK/site/frames.safetensors"
+  bash "$0" go "${TRY_SECONDS:-40}" && bash "$0" go 240
 }
 
 case ${1:-} in
   pack | loads) exec lab/gpu_pack.sh "$1" ;;
-  go) go $((60 * ${2:-9})) ;;
-  try) make_tiny; (go "${TRY_SECONDS:-75}"); go 150 ;;  # the first is cut off
+  go) CALL_BEGAN=$(mktemp) && go "${2:-560}" ;;
+  render | train) "$1" "$2" ;;
+  probe) probe ;;
+  test) test_gpu ;;
+  try) try ;;
   *) sed -n '2,/^set/{/^set/d;s/^# \{0,1\}//p}' "$0"; [[ ${1:-} == --help ]] || exit 2 ;;
 esac

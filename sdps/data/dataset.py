@@ -25,7 +25,7 @@ from sdps.data.augment import Augmentation, augment
 from sdps.data.sample_geometry import Layout, lay_out, place
 from sdps.data.scene_store import PackedImages, SceneStore, StoredScene, list_finished, require_equal_counts
 
-_CROP_DRAWS = 8
+CROP_DRAWS = 8
 _WITH_DECODED = 2.5  # bytes of shards and decoded scenes together, over those of the shards
 
 
@@ -63,6 +63,7 @@ class SampleOptions:
     Attributes:
         seed: Root seed.
         images: Images drawn per scene (all, in random order, where a scene has fewer).
+        fewest: Of batches made on a device: each has so many images to `images`; 0: always `images`.
         size: Side in pixels.
         crop: Side of the random crop, 0 for none.
         min_object: Least share of object pixels wanted in a crop.
@@ -73,6 +74,7 @@ class SampleOptions:
 
     seed: int
     images: int
+    fewest: int = 0
     size: int = 128
     crop: int = 0
     min_object: float = 0.3
@@ -175,7 +177,7 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
         normals, directions, layout = symmetry.vectors(normals), symmetry.vectors(directions), layout.turn(symmetry)
     if options.rescale and min(mask.shape) > options.size:
         images, normals, mask, layout = _rescale(images, normals, mask, layout, options, rng)
-    images, normals, mask, layout = _resize(images, normals, mask, layout, options.size)
+    images, normals, mask, layout = resize(images, normals, mask, layout, options.size)
     placed = place(layout, mask, directions)
     if layout.positions is not None:
         images = images / placed.irradiance[:, None, None, None]
@@ -272,7 +274,7 @@ def _rescale(
     return images[:, *window], normals[window], mask[window], layout.select(window)
 
 
-def _resize(
+def resize(
     images: np.ndarray, normals: np.ndarray, mask: np.ndarray, layout: Layout, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Layout]:
     """Bring a scene of another size to (size, size), normals to unit length, the mask to its majority."""
@@ -298,7 +300,7 @@ def _crop_corner(mask: np.ndarray, side: int, min_object: float, rng: np.random.
     rows, columns = np.nonzero(mask)
     last = mask.shape[0] - side, mask.shape[1] - side
     best, best_share = (last[0] // 2, last[1] // 2), -1.0
-    for _ in range(_CROP_DRAWS if len(rows) else 0):
+    for _ in range(CROP_DRAWS if len(rows) else 0):
         pixel = rng.integers(len(rows))
         places = zip((rows[pixel], columns[pixel]), last, strict=True)
         row, column = (int(np.clip(place - side // 2, 0, limit)) for place, limit in places)

@@ -106,3 +106,62 @@ class LightAttention(nn.Module):
 def pool(tokens: Tensor) -> Tensor:
     """Return mean and maximum (N, 2 C) over the lights of tokens (N, Q, C)."""
     return torch.cat([tokens.mean(dim=1), tokens.max(dim=1).values], dim=-1)
+
+
+class Surroundings(nn.Module):
+    """A map's pixels at half its resolution convolve, and attend to each other, the more the nearer they lie.
+
+    What a head makes of distances is a slope that it learns (Press et al., Train Short, Test Long, ICLR 2022), so that
+    maps may be larger than those of training.
+
+    Args:
+        inputs: Channels of the map.
+        width: Channels at half its resolution.
+        heads: Of the attention.
+        layers: How often pixels convolve and attend.
+    """
+
+    def __init__(self, inputs: int, width: int, heads: int, layers: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.enter = conv(inputs, width, stride=2)
+        self.leave = nn.ConvTranspose2d(width, inputs, 4, stride=2, padding=1)
+        self.near = nn.ModuleList(nn.Sequential(conv(width, width), conv(width, width)) for _ in range(layers))
+        self.norm = nn.ModuleList(nn.LayerNorm(width) for _ in range(layers))
+        self.ask = nn.ModuleList(nn.Linear(width, 3 * width) for _ in range(layers))
+        self.answer = nn.ModuleList(nn.Linear(width, width) for _ in range(layers))
+        steep = 2.0 ** -torch.arange(1.0, heads + 1.0)  # from half a pixel's weight per pixel to hardly any
+        self.slopes = nn.Parameter(steep.log().expand(layers, heads).clone())
+        for parameter in self.leave.parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return features (B, C, H, W) with what their surroundings add; H and W are even."""
+        seen = self.enter(features)
+        distances = pixel_distances(seen.shape[-2], seen.shape[-1], seen.device)
+        for number, near in enumerate(self.near):
+            seen = seen + near(seen)
+            seen = seen + self._attend(seen, number, distances)
+        return features + self.leave(seen)
+
+    def _attend(self, seen: Tensor, number: int, distances: Tensor) -> Tensor:
+        tokens = self.norm[number](seen.flatten(2).transpose(1, 2))  # (B, h w, width)
+        query, key, value = self.ask[number](tokens).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        bias = -self.slopes[number].exp()[:, None, None] * distances  # (heads, h w, h w)
+        if torch.is_grad_enabled():
+            shares = (query @ key.transpose(-1, -2) * key.shape[-1] ** -0.5 + bias).softmax(dim=-1)
+            heard = shares.to(value.dtype) @ value
+        else:
+            heard = functional.scaled_dot_product_attention(query, key, value, attn_mask=bias.to(query.dtype))
+        found = self.answer[number](heard.transpose(1, 2).flatten(2))
+        return found.transpose(1, 2).unflatten(2, seen.shape[-2:])
+
+
+def pixel_distances(height: int, width: int, device: torch.device) -> Tensor:  # (H W, H W)
+    """Return the distances between the pixels of a map, in pixels."""
+    rows, columns = torch.arange(height, device=device), torch.arange(width, device=device)
+    down = (rows[:, None] - rows)[:, None, :, None].float()
+    across = (columns[:, None] - columns)[None, :, None, :].float()
+    return torch.hypot(down.expand(-1, width, -1, width), across.expand(height, -1, height, -1)).reshape(
+        height * width, height * width
+    )

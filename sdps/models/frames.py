@@ -26,7 +26,17 @@ from sdps.core.first_normals import first_normals, frames, turn_to_sight
 from sdps.core.losses import NormalCriterion, expected_error_loss
 from sdps.core.symmetry import Symmetry
 from sdps.models.base import FusionNetwork, Observations, Placement, Truth
-from sdps.models.blocks import LOG_USUAL, SLOPE, Exchange, LightAttention, chord_degrees, conv, deconv, pool
+from sdps.models.blocks import (
+    LOG_USUAL,
+    SLOPE,
+    Exchange,
+    LightAttention,
+    Surroundings,
+    chord_degrees,
+    conv,
+    deconv,
+    pool,
+)
 
 FRAMES = ("normal", "camera")
 _SEEN, _KNOWN = 11, 7
@@ -86,9 +96,10 @@ class FrameNet(FusionNetwork):
         frame: `normal` for the frame of the first normal; `camera` leaves directions as they are, to compare.
         heads: Of the attention across the lights of a pixel, after the last `attending` of the blocks; 0 for none.
         attending: Layers of attention.
+        context: Channels of `Surroundings` at an eighth of the resolution, a multiple of 4; 0 for none.
     """
 
-    added = ("attend",)
+    added = ("attend", "surroundings")
 
     needs_mask = True
     kept_bytes = 6
@@ -97,13 +108,16 @@ class FrameNet(FusionNetwork):
     tells_errors = True
 
     def __init__(
-        self, *, width: int = 64, blocks: int = 4, frame: str = "normal", heads: int = 0, attending: int = 2
-    ) -> None:
+        self, *, width: int = 64, blocks: int = 4, frame: str = "normal", heads: int = 0, attending: int = 2,
+        context: int = 0,
+    ) -> None:  # fmt: skip
         super().__init__()
         if blocks < 1 or width < 1:
             raise InputError(f"width and blocks must be at least 1, got {width} and {blocks}")
         if heads < 0 or (heads and (width % heads or not 0 <= attending <= blocks)):
             raise InputError(f"heads must divide width, and attending be 0 to blocks, got {heads} and {attending}")
+        if context < 0 or context % 4:
+            raise InputError(f"context must be a multiple of 4, or 0, got {context}")
         if frame not in FRAMES:
             raise unknown("frame", str(frame), FRAMES)
         self.frame = frame
@@ -117,6 +131,8 @@ class FrameNet(FusionNetwork):
         self.enter = nn.Sequential(conv(_MAP + 4, 64), conv(64, 64))
         self.smaller = nn.Sequential(conv(64, 96, stride=2), conv(96, 96))
         self.quarter = nn.Sequential(conv(96, 128, stride=2), conv(128, 128), conv(128, 128), deconv(128, 96))
+        self.surroundings = Surroundings(128, context, 4, 2) if context else None
+        self.size_multiple = 8 if context else 4
         self.back = nn.Sequential(conv(192, 96), deconv(96, 64))
         self.leave = nn.Sequential(conv(128, 64), nn.Conv2d(64, 4, 3, padding=1))
         # Training begins at the first normals.
@@ -163,7 +179,10 @@ class FrameNet(FusionNetwork):
         normals, fused, mask, _ = feature
         entered = self.enter(torch.cat([normals.to(fused.dtype), fused, mask.to(fused.dtype)], dim=1))
         half = self.smaller(entered)
-        back = self.back(torch.cat([self.quarter(half), half], dim=1))
+        quarter = self.quarter[:-1](half)
+        if self.surroundings is not None:
+            quarter = self.surroundings(quarter)
+        back = self.back(torch.cat([self.quarter[-1](quarter), half], dim=1))
         change = self.leave(torch.cat([back, entered], dim=1)).float()
         corrected = functional.normalize(normals + change[:, :3], dim=1)
         return feature.face(corrected), (change[:, 3:] + LOG_USUAL).exp()

@@ -25,7 +25,7 @@ SIDE = 64
 _SEEN = 6
 """Channels of an image: its radiance, its shading, how bright it is as a whole, and the mask."""
 _WIDTHS = (48, 96, 128, 192)
-"""Channels at 32, 16, 8 and 4 pixels a side."""
+"""Channels at 32, 16, 8 and 4 pixels a side, of a network of breadth 1."""
 _FLOOR = 0.01
 """Added to what images are divided by; full scale is 1."""
 _BRIGHTEST = 6.0
@@ -93,6 +93,7 @@ class LightSetNet(LightingNetwork):
         blocks: Layers of attention across the images.
         heads: Of the attention.
         intensity_range: Intensities drawn in training.
+        breadth: Factor on the channels of the convolutions, which are multiples of 16.
         nearness: Predict how near the lamps stand; the released networks before it take them for distant.
     """
 
@@ -100,15 +101,18 @@ class LightSetNet(LightingNetwork):
 
     def __init__(
         self, *, width: int = 256, blocks: int = 3, heads: int = 4, intensity_range: tuple[float, float] = (0.2, 2.0),
-        nearness: bool = False,
+        nearness: bool = False, breadth: float = 1.0,
     ) -> None:  # fmt: skip
         super().__init__()
         if blocks < 0 or width < 1 or heads < 1 or width % heads:
             raise InputError(f"heads must divide width, and blocks be 0 or more, got {heads}, {width} and {blocks}")
+        if not breadth > 0.0:
+            raise InputError(f"breadth must be above 0, got {breadth:g}")
+        widths = [max(16, 16 * round(breadth * channels / 16)) for channels in _WIDTHS]
         self.classes = LightClasses(low=intensity_range[0], high=intensity_range[1])
-        ends = zip((_SEEN, *_WIDTHS), _WIDTHS, strict=False)
+        ends = zip((_SEEN, *widths), widths, strict=False)
         self.levels = nn.Sequential(*(Level(inputs, outputs) for inputs, outputs in ends))
-        self.read = nn.Linear(_WIDTHS[-1] * 16, width)
+        self.read = nn.Linear(widths[-1] * 16, width)
         self.blocks = nn.ModuleList(Attention(width, heads) for _ in range(blocks))
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 5))
         self.near = nn.Linear(width, 1) if nearness else None

@@ -63,8 +63,8 @@ class Stage(ABC):
         """Return how training samples are made."""
         config = self.config
         return SampleOptions(
-            seed=config.seed, images=config.images, size=config.size, rescale=config.rescale,
-            augmentation=config.augmentation,
+            seed=config.seed, images=config.images, fewest=config.fewest_images, size=config.size,
+            rescale=config.rescale, augmentation=config.augmentation,
         )  # fmt: skip
 
     def validation_options(self) -> SampleOptions:
@@ -72,7 +72,7 @@ class Stage(ABC):
         options = self.sample_options()
         augmentation = replace(options.augmentation, symmetries=False, biased=0.0, frontal=0.0)
         images = self.config.validation_images or options.images
-        return replace(options, images=images, crop=0, rescale=False, augmentation=augmentation)
+        return replace(options, images=images, fewest=0, crop=0, rescale=False, augmentation=augmentation)
 
     @abstractmethod
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:

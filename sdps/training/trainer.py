@@ -28,6 +28,7 @@ from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 from sdps.data.dataset import Batch, SampleKey, SceneDataset, collate
 from sdps.data.interrupts import StopRequest, stop_on_signal
+from sdps.data.resident_scenes import ResidentScenes
 from sdps.data.sources import BatchSource, StoredScenes
 from sdps.models.checkpoint import TrainedModel, code_version, load_state, save_state, save_weights
 from sdps.training.distributed import Team, team
@@ -191,19 +192,9 @@ class Trainer:
         config = self.config
         stage.to(here.device)
         self.arithmetic = here.same_arithmetic(config.precision)
-        options = {"cache": config.cache, "skip_missing": config.skip_missing}
-        self.source = source or StoredScenes(
-            SceneDataset(data, "train", stage.sample_options(), **options),
-            batch=config.batch_scenes,
-            workers=config.workers,
-            pin_memory=here.device.type == "cuda",
-            rank=here.rank,
-            world=here.world,
-            window=config.shuffle_window,
-        )
-        self.validation = None
-        if config.validation_scenes and here.leads and any(scene.split == "val" for scene in read_manifest(data)):
-            self.validation = SceneDataset(data, "val", stage.validation_options(), **options)
+        self.source = source or _open_source(stage, data, here)
+        self._validates = bool(config.validation_scenes) and here.leads
+        self._validates = self._validates and any(scene.split == "val" for scene in read_manifest(data))
         self.optimiser = _optimiser(stage.network, config)
         average = get_ema_multi_avg_fn(config.ema)
         self.average = AveragedModel(stage.network, multi_avg_fn=average) if config.ema else None
@@ -281,15 +272,18 @@ class Trainer:
 
         The best weights so far, by the stage's goal, are saved.
         """
-        if self.validation is None:
+        if not self._validates:
             return {}
+        # Opened anew: of a folder that is being rendered more scenes are there.
+        options = {"cache": self.config.cache, "skip_missing": self.config.skip_missing}
+        scenes = SceneDataset(self.data, "val", self.stage.validation_options(), **options)
         trained, self.stage.network = self.stage.network, self._kept()
         self.stage.network.eval()
-        count = min(self.config.validation_scenes, len(self.validation))
+        count = min(self.config.validation_scenes, len(scenes))
         rows = []
         try:
-            for index in np.linspace(0, len(self.validation) - 1, count).round().astype(int):
-                batch = collate([self.validation.sample(SampleKey(int(index), 0, int(index)))])
+            for index in np.linspace(0, len(scenes) - 1, count).round().astype(int):
+                batch = collate([scenes.sample(SampleKey(int(index), 0, int(index)))])
                 assert isinstance(batch, Batch)  # `sample` raises
                 with self.arithmetic.autocast():
                     rows.append(self.stage.metrics(batch.to(self.team.device)))
@@ -423,6 +417,19 @@ class Trainer:
         name = self.stage.name
         weights = None if interrupted else {name: self.folder / f"{name}.safetensors"}
         return TrainingResult(weights, self.step, self.seconds(), metrics, waiting_share, interrupted)
+
+
+def _open_source(stage: Stage, data: Path, here: Team) -> BatchSource:
+    """Return batches of a data folder, made by loader processes or on the device."""
+    config, options = stage.config, stage.sample_options()
+    shared: dict[str, Any] = {"batch": config.batch_scenes, "workers": config.workers, "rank": here.rank,
+                              "world": here.world}  # fmt: skip
+    if config.resident:
+        return ResidentScenes(data, options, device=here.device, growing=config.skip_missing, **shared)
+    return StoredScenes(
+        SceneDataset(data, "train", options, cache=config.cache, skip_missing=config.skip_missing),
+        pin_memory=here.device.type == "cuda", window=config.shuffle_window, **shared,
+    )  # fmt: skip
 
 
 def _optimiser(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer | Muon:

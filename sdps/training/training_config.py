@@ -33,6 +33,8 @@ class TrainingConfig:
         batch_scenes: Scenes per optimiser step.
         accumulate: Parts a step's scenes are processed in, to save memory; must divide `batch_scenes`.
         images: Images drawn per scene and step.
+        fewest_images: Where samples are made on the device (`resident`), each step draws so many to `images`; 0: always
+            `images`.
         size: Side in pixels to which scenes of another size are resized.
         learning_rate: Peak learning rate.
         schedule: `halving` (after each of `halve_after`), `cosine` (to zero), `constant`, or `trapezoid`
@@ -54,6 +56,8 @@ class TrainingConfig:
         cache: Keep decoded scenes as memory-mapped arrays in `<data>/cache`.
         shuffle_window: Of a packed set (`sdps data pack`), scenes among which the order is drawn; only about twice as
             many are kept on this disk. With more than there are, the order is that of a data folder.
+        resident: Hold the scenes in the GPU's memory and make samples there (`sdps.data.resident_scenes`); `workers`
+            processes decode them. With `skip_missing`, scenes that are rendered meanwhile are taken in, too.
         rescale: Scenes larger than `size` are drawn at a random scale and cropped, instead of being shrunk whole.
         skip_missing: Train on the scenes that are there instead of refusing an incomplete folder.
         log_every: Steps between lines of metrics.
@@ -74,6 +78,7 @@ class TrainingConfig:
     batch_scenes: int = 32
     accumulate: int = 1
     images: int = 32
+    fewest_images: int = 0
     size: int = 128
     learning_rate: float = 5e-4
     schedule: Literal["halving", "cosine", "constant", "trapezoid"] = "halving"
@@ -90,6 +95,7 @@ class TrainingConfig:
     workers: int = 2
     cache: bool = True
     shuffle_window: int = 1024
+    resident: bool = False
     rescale: bool = False
     skip_missing: bool = False
     log_every: int = 20
@@ -109,6 +115,7 @@ class TrainingConfig:
             self,
             "not negative",
             "seed",
+            "fewest_images",
             "weight_decay",
             "clip_gradient",
             "workers",
@@ -119,6 +126,10 @@ class TrainingConfig:
             raise InputError("steps and minutes are both set; keep one of them")
         if self.batch_scenes % self.accumulate:
             raise InputError(f"accumulate {self.accumulate} must divide batch_scenes {self.batch_scenes}")
+        if self.fewest_images and not (self.resident and self.fewest_images <= self.images):
+            raise InputError(
+                f"fewest_images {self.fewest_images} needs resident: true, and to be at most images ({self.images})"
+            )
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 and at least 16, got {self.size}")
         if self.start_share and not self.start:
