@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Half an hour of a borrowed GPU machine without network: render scenes of `world` and `ship` on its cores, and train
-# lightset and frames on its GPU meanwhile.
+# Half an hour of a borrowed GPU machine without network: render scenes of `world` and `ship`, and train lightset and frames
+# on them meanwhile.
 #
 #   lab/gpu_half_hour.sh pack          here: what the machine lacks, into .gpu/, in loads that fit a call; says what to run
 #   lab/gpu_half_hour.sh loads         here: the loads again, after the working tree became smaller
@@ -8,10 +8,11 @@
 #   lab/gpu_half_hour.sh go [SECONDS]  there, as often as needed: takes in what the call brought, starts what can be started,
 #                                      says every minute how it goes, and returns after SECONDS (560) or when all is done
 #   lab/gpu_half_hour.sh test          there: the tests that need a GPU; wants the whole working tree
-#   lab/gpu_half_hour.sh try           here: the same, tiny, on the CPU, in five minutes; installs nothing
+#   lab/gpu_half_hour.sh try           here: the same, tiny, on the CPU, in two minutes; installs nothing
 #
-# What `go` starts runs on between calls while the machine is held, a call at least every 30 s. Whenever it returns, the
-# weights so far (float16), curves and logs lie in $OUT: eight files. A part that failed is started again by the next call.
+# What `go` starts runs on between calls while the machine is held: the next call must come within 30 s, and nothing else may
+# run beside a call that outlasts it. Whenever `go` returns, the weights so far (float16), curves and logs lie in $OUT: eight
+# files. Choose MINUTES so that training ends within a call. A part that failed is started again by the next call.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -20,15 +21,16 @@ cd "$(dirname "$0")/.."
 : "${ENOUGH:=800}"          # scenes with which it begins
 : "${SEED:=20261501}"       # of the scenes: another for every half hour
 : "${ROUNDS:=8}"            # parts of the plan, each with its share of every family
-: "${VARIANT:=llvm_ad_rgb}" # cuda_ad_rgb: render on the GPU, where OptiX works
-: "${WORLD_WORKERS:=9}" "${SHIP_WORKERS:=6}" "${READERS:=2}"
+: "${VARIANT:=auto}" # cuda_ad_rgb where OptiX works: 23 scenes a second beside 8 processes; else llvm_ad_rgb
+: "${WORLD_WORKERS:=8}" "${SHIP_WORKERS:=5}" "${READERS:=2}" # shapes are made on the CPU
 NEAR=(data.lights=mixed data.light_count=32 data.near_lights=0.5 'data.near_light_distance=[2.5, .inf]'
   data.near_light_spread=0.2 data.camera=mixed 'data.camera_distance=[1.34, .inf]')
 WORLD=("data.seed=$SEED" data.prefix=g1- data.spp=8 'data.families={composition: 1000, sculpture: 1250, blobby: 750}')
 SHIP=("data.seed=$SEED" data.prefix=g2- data.spp=8 "${NEAR[@]}" 'data.families={blobby: 1000, sculpture: 1500}')
 # Scenes lie in the GPU's memory, and samples are made there: loader processes would make a tenth of them.
 TRAINING='steps: null, resident: true, skip_missing: true, warmup: 0.02, clip_gradient: 1.0, cooldown: 0.7,
-  validation_images: 32, validation_scenes: 24, checkpoint_minutes: 1'
+  validation_images: 32, validation_scenes: 24, checkpoint_minutes: 1,
+  augmentation: {sensor: {stops: [-4.0, 1.0], black_error: [-8.0, 8.0]}}'
 LIGHTSET_RUN='base: lightset, seed: 41, size: 64, images: 28, fewest_images: 8, batch_scenes: 64, learning_rate: 3e-3,
   validate_every: 2000, options: {nearness: true, breadth: 1.34, blocks: 4}'
 FRAMES_RUN='base: frames, seed: 42, crop: 96, images: 24, fewest_images: 6, batch_scenes: 32, accumulate: 4, loss: chord,
@@ -49,7 +51,7 @@ go() { # SECONDS
   [[ -e $WORK/site ]] || { say "the next load, please"; return; }
   set_up
   while (($(date +%s) < end)); do
-    if [[ $VARIANT != llvm_ad_rgb || -e $WORK/llvm || $TINY ]]; then
+    if [[ $VARIANT != llvm_ad_rgb || -e $WORK/llvm || $TINY ]]; then # without OptiX libLLVM is waited for
       for part in world ship; do begin render "$part"; done
     fi
     if (($(count_scenes) >= ENOUGH)) && join_manifests; then
@@ -92,13 +94,17 @@ set_up() { # Dr.Jit and OptiX look for the driver's files where most machines ha
   done
   file=$(find -L /usr/local/nvidia -name nvoptix.bin 2> /dev/null | head -1 || true)
   [[ ! $file || -e /usr/share/nvidia/nvoptix.bin ]] || { mkdir -p /usr/share/nvidia && ln -s "$file" /usr/share/nvidia/; }
-  [[ ! -e $WORK/asked ]] || return 0
-  touch "$WORK/asked"
-  file=$("$PYTHON" -c "import mitsuba as mi; mi.set_variant('cuda_ad_rgb')
+  if [[ ! -e $WORK/optix ]]; then
+    "$PYTHON" -c "import mitsuba as mi; mi.set_variant('cuda_ad_rgb')
 scene = mi.load_dict({'type': 'scene', 'sphere': {'type': 'sphere'}})
-print('works:', scene.ray_test(mi.Ray3f([0, 0, 5], [0, 0, -1])))" 2>&1 | tail -n 1 || true)
-  say "OptiX: $file"
-  say "$(nvidia-smi -L 2> /dev/null || echo "no GPU here"), $(nproc --all) cores, $(free -g | awk '/Mem/ {print $7}') GiB free"
+print('works:', scene.ray_test(mi.Ray3f([0, 0, 5], [0, 0, -1])))" 2>&1 | tail -n 1 > "$WORK/optix" || true
+    say "OptiX: $(cat "$WORK/optix")"
+    say "$(nvidia-smi -L 2> /dev/null || echo "no GPU here"), $(nproc --all) cores, $(free -g | awk '/Mem/ {print $7}') GiB free"
+  fi
+  if [[ $VARIANT == auto ]]; then
+    VARIANT=llvm_ad_rgb
+    ! grep -q '^works' "$WORK/optix" || VARIANT=cuda_ad_rgb
+  fi
 }
 
 begin() { # render|train PART: in a session of its own, unless it runs or is done

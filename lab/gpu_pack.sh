@@ -7,7 +7,7 @@ MISSING='mitsuba drjit openexr pyamg trimesh'  # of what pyproject.toml asks for
 PLUGINS='area|bitmap|box|conductor|constant|d65|diffuse|directional|gaussian|hdrfilm|independent|irregular|measured|merge'
 PLUGINS+='|obj|orthographic|path|perspective|ply|point|rectangle|regular|serialized|sphere|srgb|twosided|uniform'
 : "${CALL_BYTES:=$((63 << 20))}"  # that travel in a call, the working tree included
-: "${LIGHTSET:=assets/weights/lightset.safetensors}" "${FRAMES:=assets/weights/frames.safetensors}"  # training starts there
+: "${LIGHTSET:=assets/weights/lightset.safetensors}" "${FRAMES:=assets/weights/frames.safetensors}"  # `shipped:` there
 PYTHON=.venv/bin/python
 
 pack() {
@@ -37,6 +37,9 @@ PY
     grep -vE '/(ld-linux|lib(c|m|z|gcc_s|stdc\+\+)\.so)' | xargs cp -L -t .gpu/llvm/usr/lib
   for name in site llvm; do tar -C ".gpu/$name" -c . | nice xz -T0 --x86 --lzma2=preset=6 > ".gpu/$name.tar.xz"; done
   rm -rf .gpu/site .gpu/llvm .gpu/wheels
+  # A few scenes, to see whether training works before any are rendered there.
+  "$PYTHON" -m pipelines.cli render-data --preset world --out .gpu/probe --workers 1 --set data.seed=1 --set data.validation=0.2 \
+    --set 'data.families={sculpture: 3, blobby: 3}' > /dev/null
   loads
 }
 
@@ -69,9 +72,11 @@ loads() { # .gpu/1, .gpu/2, ...: pieces of the archives, each named ARCHIVE.PIEC
   for name in $(seq "$load"); do
     echo "  carry [\".gpu/$name\"] ($(du -sm ".gpu/$name" | cut -f1) MiB)  command: bash lab/gpu_half_hour.sh go"
   done
+  echo "  The first may carry .gpu/probe too ($(du -sm .gpu/probe 2> /dev/null | cut -f1) MiB) and run: bash lab/gpu_half_hour.sh probe"
+  echo "  libLLVM is needed only where the probe says that OptiX does not work."
   echo "  nothing carried           command: bash lab/gpu_half_hour.sh go   (until it says: all done)"
-  echo "In fewer calls: git sparse-checkout set --no-cone '/*' '!/docs/images/' '!/assets/weights/*.safetensors'"
-  echo "  then lab/gpu_half_hour.sh loads; after the last load: git sparse-checkout disable (test-gpu needs the weights)"
+  echo "In fewer calls: git sparse-checkout set --no-cone '/*' '!/docs/images/' '!/assets/weights/*.safetensors' '!/tests/'"
+  echo "  then lab/gpu_half_hour.sh loads; before \`test\`: git sparse-checkout disable"
 }
 
 case ${1:-pack} in

@@ -24,8 +24,9 @@ FOLDERS = [
     )),
     "render",
     *(f"sdps.{name}" for name in (
-        "core", "data", "models", "training", "publishing", "inference", "refinement", "classical.common", "classical",
-        "methods.fusion", "methods", "photos.light_files", "photos.pictures", "photos.analysis", "photos",
+        "core", "data", "data.resident", "models", "training", "publishing", "inference", "refinement",
+        "classical.common", "classical", "methods.fusion", "methods", "photos.light_files", "photos.pictures",
+        "photos.analysis", "photos",
         "surface",
     )),
     "sdps",

@@ -28,7 +28,7 @@ from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 from sdps.data.dataset import Batch, SampleKey, SceneDataset, collate
 from sdps.data.interrupts import StopRequest, stop_on_signal
-from sdps.data.resident_scenes import ResidentScenes
+from sdps.data.resident.resident_scenes import ResidentScenes
 from sdps.data.sources import BatchSource, StoredScenes
 from sdps.models.checkpoint import TrainedModel, code_version, load_state, save_state, save_weights
 from sdps.training.distributed import Team, team

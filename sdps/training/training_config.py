@@ -56,7 +56,7 @@ class TrainingConfig:
         cache: Keep decoded scenes as memory-mapped arrays in `<data>/cache`.
         shuffle_window: Of a packed set (`sdps data pack`), scenes among which the order is drawn; only about twice as
             many are kept on this disk. With more than there are, the order is that of a data folder.
-        resident: Hold the scenes in the GPU's memory and make samples there (`sdps.data.resident_scenes`); `workers`
+        resident: Hold the scenes in the GPU's memory and make samples there (`sdps.data.resident`); `workers`
             processes decode them. With `skip_missing`, scenes that are rendered meanwhile are taken in, too.
         rescale: Scenes larger than `size` are drawn at a random scale and cropped, instead of being shrunk whole.
         skip_missing: Train on the scenes that are there instead of refusing an incomplete folder.

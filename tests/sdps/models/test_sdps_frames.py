@@ -16,7 +16,7 @@ from sdps.core.first_normals import first_normals, frames, turn_to_sight
 from sdps.core.symmetry import Symmetry
 from sdps.data.augment import Augmentation
 from sdps.models.base import Lights, Observations, Placement
-from sdps.models.blocks import parameter_count
+from sdps.models.blocks import Surroundings, parameter_count, pixel_distances
 from sdps.models.checkpoint import TrainedModel, load_weights, save_weights
 from sdps.models.cnnps import rotate_about_view
 from sdps.models.frames import FrameNet, FusedMap, Pixels, object_pixels, pixel_inputs
@@ -184,6 +184,42 @@ def test_attention_begins_as_nothing_and_is_the_same_in_training_and_in_use(trai
     assert (used - trained(seen)).abs().max() > 1e-3
 
 
+def test_surroundings_begin_as_nothing_and_reach_further(trained):
+    wide = FrameNet(width=16, blocks=2, context=16).eval()
+    missing = wide.load_state_dict(trained.state_dict(), strict=False).missing_keys
+    assert missing and all(key.partition(".")[0] in FrameNet.added for key in missing)
+    seen = observations(5)
+    assert wide.size_multiple == 8 and trained.size_multiple == 4
+    with torch.no_grad():
+        torch.testing.assert_close(wide(seen), trained(seen))
+    for parameter in wide.surroundings.leave.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    with torch.no_grad():
+        used = wide(seen)
+    torch.testing.assert_close(wide(seen).detach(), used, atol=1e-4, rtol=0)
+    assert (used - trained(seen)).abs().max() > 1e-3
+
+
+def test_pixels_are_as_far_apart_as_they_lie():
+    distances = pixel_distances(3, 4, torch.device("cpu"))
+    assert distances.shape == (12, 12)
+    assert distances[0, 11] == pytest.approx(13**0.5) and distances[5, 6] == 1.0 and distances[1, 9] == 2.0
+
+
+def test_nearer_pixels_count_more():
+    torch.manual_seed(0)
+    block = Surroundings(8, 16, 4, 1)
+    torch.nn.init.zeros_(block.ask[0].weight)
+    torch.nn.init.zeros_(block.ask[0].bias)
+    block.ask[0].weight.data[32:] = torch.eye(16)  # heard is the mean of what pixels show, weighted by distance
+    block.answer[0].weight.data = torch.eye(16)
+    block.answer[0].bias.data.zero_()
+    seen = torch.zeros(1, 16, 8, 8)
+    seen[0, :, 0, 0] = torch.randn(16)
+    found = block._attend(seen, 0, pixel_distances(8, 8, seen.device))[0].norm(dim=0)
+    assert found[0, 1] > found[0, 3] > found[0, 7] > 0.0
+
+
 def test_size_and_options():
     assert parameter_count(FrameNet()) == MODELS["frames"].parameters <= 3_000_000
     for options in ({"width": 0}, {"blocks": 0}):
@@ -192,6 +228,8 @@ def test_size_and_options():
     for options in ({"heads": 5}, {"heads": 4, "attending": 9}):
         with pytest.raises(InputError, match="heads must divide width"):
             FrameNet(**options)
+    with pytest.raises(InputError, match="context must be a multiple of 4"):
+        FrameNet(context=6)
     with pytest.raises(InputError, match="camera"):
         FrameNet(frame="camra")
 

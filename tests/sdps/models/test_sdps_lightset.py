@@ -156,3 +156,13 @@ def test_expected_errors_are_in_degrees(network):
 def test_options_that_build_nothing_are_refused():
     with pytest.raises(InputError, match="heads must divide width"):
         LightSetNet(width=30, heads=4)
+
+
+def test_breadth_widens_the_convolutions() -> None:
+    broad, usual = (LightSetNet(width=32, blocks=1, heads=2, breadth=breadth) for breadth in (1.34, 1.0))
+    assert [level.more.out_channels for level in broad.levels] == [64, 128, 176, 256]
+    assert [level.more.out_channels for level in usual.levels] == [48, 96, 128, 192]
+    with torch.no_grad():
+        assert broad(*scene()).directions.shape == (1, 5, 3)
+    with pytest.raises(InputError, match="breadth must be above 0"):
+        LightSetNet(breadth=0.0)

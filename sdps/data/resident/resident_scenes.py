@@ -22,8 +22,8 @@ from render.shared.errors import InputError
 from render.shared.progress import progress_bar
 from render.shared.seeds import generator
 from sdps.data.dataset import Batch, SampleOptions, require_lights
-from sdps.data.device_samples import Held, Prepared, make_batch, prepare, require_possible
 from sdps.data.interrupts import leave_signals_to_parent
+from sdps.data.resident.device_samples import Held, Prepared, make_batch, prepare, require_possible
 from sdps.data.scene_store import SceneStore, list_finished
 from sdps.data.sources import share_of_batch
 

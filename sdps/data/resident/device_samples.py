@@ -18,7 +18,7 @@ from render.shared.errors import InputError
 from sdps.core.symmetry import SYMMETRIES
 from sdps.data.augment import Augmentation
 from sdps.data.dataset import CROP_DRAWS, Batch, SampleOptions, choose_images, resize
-from sdps.data.device_sensor import Sensors, record
+from sdps.data.resident.device_sensor import Sensors, record
 from sdps.data.sample_geometry import lay_out, place
 from sdps.data.scene_store import StoredScene
 
