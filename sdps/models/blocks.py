@@ -5,6 +5,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 SLOPE = 0.1
+_TOGETHER = 512
+"""Pixels that attend to all others at once in use, so that memory grows with the map and not with its square."""
 LOG_USUAL = -2.0
 """Logarithm of the error, a distance of unit vectors, that an untrained network expects: 8 degrees."""
 
@@ -138,30 +140,32 @@ class Surroundings(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Return features (B, C, H, W) with what their surroundings add; H and W are even."""
         seen = self.enter(features)
-        distances = pixel_distances(seen.shape[-2], seen.shape[-1], seen.device)
         for number, near in enumerate(self.near):
             seen = seen + near(seen)
-            seen = seen + self._attend(seen, number, distances)
+            seen = seen + self.attend(seen, number)
         return features + self.leave(seen)
 
-    def _attend(self, seen: Tensor, number: int, distances: Tensor) -> Tensor:
-        tokens = self.norm[number](seen.flatten(2).transpose(1, 2))  # (B, h w, width)
+    def attend(self, seen: Tensor, number: int) -> Tensor:
+        """Return what pixels (B, C, h, w) hear from each other in a layer; without gradients a few at a time."""
+        tokens = self.norm[number](seen.flatten(2).transpose(1, 2))  # (B, h w, C)
         query, key, value = self.ask[number](tokens).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        bias = -self.slopes[number].exp()[:, None, None] * distances  # (heads, h w, h w)
+        places = pixel_places(seen.shape[-2], seen.shape[-1], seen.device)
+        slopes = self.slopes[number].exp()[:, None, None]
         if torch.is_grad_enabled():
-            shares = (query @ key.transpose(-1, -2) * key.shape[-1] ** -0.5 + bias).softmax(dim=-1)
+            likeness = query @ key.transpose(-1, -2) * key.shape[-1] ** -0.5
+            shares = (likeness - slopes * torch.cdist(places, places)).softmax(dim=-1)
             heard = shares.to(value.dtype) @ value
         else:
-            heard = functional.scaled_dot_product_attention(query, key, value, attn_mask=bias.to(query.dtype))
+            parts = []
+            for some, there in zip(query.split(_TOGETHER, dim=2), places.split(_TOGETHER), strict=True):
+                bias = (-slopes * torch.cdist(there, places)).to(query.dtype)
+                parts.append(functional.scaled_dot_product_attention(some, key, value, attn_mask=bias))
+            heard = torch.cat(parts, dim=2)
         found = self.answer[number](heard.transpose(1, 2).flatten(2))
         return found.transpose(1, 2).unflatten(2, seen.shape[-2:])
 
 
-def pixel_distances(height: int, width: int, device: torch.device) -> Tensor:  # (H W, H W)
-    """Return the distances between the pixels of a map, in pixels."""
-    rows, columns = torch.arange(height, device=device), torch.arange(width, device=device)
-    down = (rows[:, None] - rows)[:, None, :, None].float()
-    across = (columns[:, None] - columns)[None, :, None, :].float()
-    return torch.hypot(down.expand(-1, width, -1, width), across.expand(height, -1, height, -1)).reshape(
-        height * width, height * width
-    )
+def pixel_places(height: int, width: int, device: torch.device) -> Tensor:  # (H W, 2) float32
+    """Return rows and columns of the pixels of a map, in reading order."""
+    rows, columns = (torch.arange(count, device=device, dtype=torch.float32) for count in (height, width))
+    return torch.stack(torch.meshgrid(rows, columns, indexing="ij"), dim=-1).flatten(0, 1)

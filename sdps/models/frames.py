@@ -132,7 +132,7 @@ class FrameNet(FusionNetwork):
         self.smaller = nn.Sequential(conv(64, 96, stride=2), conv(96, 96))
         self.quarter = nn.Sequential(conv(96, 128, stride=2), conv(128, 128), conv(128, 128), deconv(128, 96))
         self.surroundings = Surroundings(128, context, 4, 2) if context else None
-        self.size_multiple = 8 if context else 4
+        self.size_multiple, self.reach = (8, 96) if context else (4, 32)
         self.back = nn.Sequential(conv(192, 96), deconv(96, 64))
         self.leave = nn.Sequential(conv(128, 64), nn.Conv2d(64, 4, 3, padding=1))
         # Training begins at the first normals.

@@ -4,6 +4,7 @@ Every scene is decoded once and stays. A folder that is still being rendered is 
 taken in as they appear, until the memory set aside is full.
 """
 
+import logging
 import os
 import time
 from collections.abc import Generator, Iterator
@@ -27,6 +28,7 @@ from sdps.data.resident.device_samples import Held, Prepared, make_batch, prepar
 from sdps.data.scene_store import SceneStore, list_finished
 from sdps.data.sources import share_of_batch
 
+_log = logging.getLogger(__name__)
 _SHARE = 0.5
 """Of the memory that is free when training begins: the rest is for the network and its batches."""
 _LOOK_EVERY = 5.0  # seconds, for scenes that were rendered meanwhile
@@ -74,6 +76,9 @@ class ResidentScenes:
                 f"{folder}: {each * min(batch, self.scenes) / 1e9:.1f} GB of scenes do not fit into the memory of "
                 f"{device}; lower batch_scenes or size, or set resident to false"
             )
+        if room < self.scenes:
+            about = "%s: %d of %d scenes fit into the memory of %s; the others are not trained on"
+            _log.warning(about, folder, room, self.scenes, device)
         self.held = Held(room, max(lights), options.size, device)
         self._room, self._stop, self._failed = room, Event(), list[BaseException]()
         self._filling: Thread | None = None

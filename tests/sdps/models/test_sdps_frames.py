@@ -15,8 +15,9 @@ from render.shared.errors import InputError
 from sdps.core.first_normals import first_normals, frames, turn_to_sight
 from sdps.core.symmetry import Symmetry
 from sdps.data.augment import Augmentation
+from sdps.models import blocks
 from sdps.models.base import Lights, Observations, Placement
-from sdps.models.blocks import Surroundings, parameter_count, pixel_distances
+from sdps.models.blocks import Surroundings, parameter_count
 from sdps.models.checkpoint import TrainedModel, load_weights, save_weights
 from sdps.models.cnnps import rotate_about_view
 from sdps.models.frames import FrameNet, FusedMap, Pixels, object_pixels, pixel_inputs
@@ -200,13 +201,7 @@ def test_surroundings_begin_as_nothing_and_reach_further(trained):
     assert (used - trained(seen)).abs().max() > 1e-3
 
 
-def test_pixels_are_as_far_apart_as_they_lie():
-    distances = pixel_distances(3, 4, torch.device("cpu"))
-    assert distances.shape == (12, 12)
-    assert distances[0, 11] == pytest.approx(13**0.5) and distances[5, 6] == 1.0 and distances[1, 9] == 2.0
-
-
-def test_nearer_pixels_count_more():
+def test_nearer_pixels_count_more(monkeypatch):
     torch.manual_seed(0)
     block = Surroundings(8, 16, 4, 1)
     torch.nn.init.zeros_(block.ask[0].weight)
@@ -216,8 +211,12 @@ def test_nearer_pixels_count_more():
     block.answer[0].bias.data.zero_()
     seen = torch.zeros(1, 16, 8, 8)
     seen[0, :, 0, 0] = torch.randn(16)
-    found = block._attend(seen, 0, pixel_distances(8, 8, seen.device))[0].norm(dim=0)
+    learned = block.attend(seen, 0)[0]
+    found = learned.norm(dim=0)
     assert found[0, 1] > found[0, 3] > found[0, 7] > 0.0
+    monkeypatch.setattr(blocks, "_TOGETHER", 5)
+    with torch.no_grad():
+        torch.testing.assert_close(block.attend(seen, 0)[0], learned)
 
 
 def test_size_and_options():
