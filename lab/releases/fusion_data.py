@@ -4,7 +4,7 @@
 
 renders the scenes of `lab/presets/fusion_world.yaml` and `fusion_ship.yaml` and answers them; `--part 0/2` answers
 every second one. Each becomes a file with the evidence, the truth and how far lights were off. What is there stays, so
-a run that was stopped goes on. The photographs of a scene, 4 to 48, have random intensities, bits, and clipping.
+a run that was stopped goes on. A scene has 4 to 48 photographs of random intensities, by one of the training's cameras.
 """
 
 import argparse
@@ -19,8 +19,10 @@ from lab.shared.answered_scenes import answer, keep
 from lab.studies.refinement_study import render_scenes
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import read_shard
+from render.shared.imaging.sensor import SensorModel
 from render.shared.seeds import generator
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Rig
+from sdps.data.augment import exposure_scale
 from sdps.data.sample_geometry import lay_out, place
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.parse import parse
@@ -33,7 +35,9 @@ _COUNTS, _SHARES = ((4, 12), (12, 32), (48, 48)), (0.3, 0.5, 0.2)
 """Numbers of photographs, evenly over their logarithm, and how often."""
 _LENS_KNOWN, _LIT = 0.75, 0.15
 _QUICK = RefineConfig(coarse_pixels=1200, iterations=500, iterations_before=200, fine_iterations=80)
-_BITS = (8, 8, 12, 16)
+_METERED = 0.3  # mean of the object's pixels at 0 stops, as in training
+_SATURATED = 0.995  # a little is off where the black level is
+_CAMERAS = SensorModel(stops=(-4.0, 1.0), black_error=(-8.0, 8.0))
 
 
 class Photographs:
@@ -55,22 +59,14 @@ class Photographs:
         self.placed = place(layout, shard.mask, lights[chosen])
         gains = rng.uniform(0.3, 2.0, count).astype(np.float32)
         radiance = shard.images[chosen].astype(np.float32) * shard.mask[..., None] * gains[:, None, None, None]
-        full = float(np.quantile(radiance[:, shard.mask], rng.uniform(0.99, 1.0)))
-        self.images = quantise(np.clip(radiance / full, 0.0, 1.0), int(rng.choice(_BITS)))
+        radiance *= exposure_scale(radiance[:, shard.mask], _METERED, 1.0)
+        self.images = np.minimum(_CAMERAS.draw(rng).record(radiance, rng), 1.0)
         self.gains = gains * self.placed.irradiance
         lens = spec.view.camera_distance
         known = lens is not None and rng.random() < _LENS_KNOWN
         camera = Camera(lens * shard.mask.shape[1] / 2) if known else ORTHOGRAPHIC
         self.lit = bool(rng.random() < _LIT)
         self.rig = Rig(camera, self.placed.nearness if self.lit and self.placed.nearness.any() else None)
-
-
-def quantise(radiance: np.ndarray, bits: int) -> np.ndarray:
-    """Return radiance in [0, 1] as photographs of so many bits keep it; those of 8 along a curve of a square root."""
-    steps = 2**bits - 1
-    if bits == 8:
-        return np.square(np.round(np.sqrt(radiance) * steps) / steps)
-    return np.round(radiance * steps) / steps
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -93,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         shown = Photographs(folder, spec)
         runner, lights, gains = (lit, shown.placed.directions, shown.gains) if shown.lit else (unlit, None, None)
-        answered = answer(runner, shown.images, shown.mask, lights, gains, 1.0, shown.rig)
+        answered = answer(runner, shown.images, shown.mask, lights, gains, _SATURATED, shown.rig)
         keep(path, answered, shown.normals, shown.placed.directions, held_out=spec.split == "val")
     return 0
 

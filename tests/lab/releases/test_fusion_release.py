@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sdps_scenes import write_data
 
 from lab.releases import fusion
-from lab.releases.fusion_data import quantise
+from lab.releases.fusion_data import Photographs
 from lab.shared.answered_scenes import Answered, keep, measure, read, read_all, tabulate
 from sdps.core.estimate import Estimate
 from sdps.methods.fusion.evidence import Evidence, find_place
@@ -66,8 +67,14 @@ def test_an_answered_scene_is_read_back(tmp_path: Path) -> None:
     assert back.evidence.numbers == scene.evidence.numbers
 
 
-@pytest.mark.parametrize(("bits", "off"), [(8, 0.004), (12, 2e-4), (16, 1e-5)])
-def test_photographs_keep_so_many_bits(bits: int, off: float) -> None:
-    radiance = np.linspace(0.0, 1.0, 1001)
-    kept = quantise(radiance, bits)
-    assert np.abs(kept - radiance).max() < off and len(np.unique(kept)) <= 2**bits
+def test_photographs_are_those_of_cameras_that_expose_as_people_do(tmp_path: Path) -> None:
+    scenes = write_data(tmp_path, ("train",) * 12, lights=24, size=32)
+    levels = []
+    for scene in scenes:
+        shown = Photographs(tmp_path, scene)
+        assert 4 <= len(shown.images) == len(shown.gains) == len(shown.placed.directions) <= 24
+        assert shown.images.max() <= 1.0 and shown.images.min() > -0.2
+        levels.append(float(shown.images[:, shown.mask].mean()))
+        lit = np.einsum("hwc,lc->lhw", shown.normals, shown.placed.directions).clip(0.0) * shown.gains[:, None, None]
+        assert np.corrcoef(lit[:, shown.mask].ravel(), shown.images[:, shown.mask].mean(-1).ravel())[0, 1] > 0.8
+    assert min(levels) < 0.08 and max(levels) > 0.3
