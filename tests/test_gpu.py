@@ -14,7 +14,9 @@ from sdps_scenes import hemisphere_lights, shade, sphere_normals, write_data
 from render.backend.variant import has_cuda_driver, works
 from render.records.manifest import read_manifest
 from render.records.shards import read_shard
+from render.shared.imaging.sensor import SensorModel
 from sdps.core.precision import arithmetic
+from sdps.data.augment import Augmentation
 from sdps.inference.estimator import Estimator
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.parse import parse
@@ -75,6 +77,18 @@ def test_auto_precision_trains_and_stays_finite(data: Path, tmp_path: Path) -> N
     result = train(create_stage("psfcn", "psfcn", settings, {}), data, tmp_path, device="cuda")
     assert all(np.isfinite(value) for value in result.metrics.values())
     assert arithmetic("auto", "cuda").device == "cuda"
+
+
+@needs_torch
+@pytest.mark.parametrize("model", ["lightset", "frames"])
+def test_scenes_in_the_gpus_memory_are_trained_on(data: Path, tmp_path: Path, model: str) -> None:
+    cameras = Augmentation(sensor=SensorModel(), noise=0.0)
+    shared = COMMON | {"resident": True, "fewest_images": 2, "augmentation": cameras}
+    config = NormalTraining(**shared, crop=32, lights="true")
+    if model == "lightset":
+        config = LightingTraining(**shared, size=64)
+    result = train(create_stage(model, model, config, {}), data, tmp_path)
+    assert result.steps == 6 and all(np.isfinite(value) for value in result.metrics.values())
 
 
 @needs_torch
