@@ -2,7 +2,7 @@
 
     python -m lab.studies.dark_study DiLiGenT/pmsData --objects pot2 cow [--normals frames.safetensors]
 
-Renders the object anew from its true normals and the reflectance that its photographs show, the median radiance over
+Renders the object from its true normals and the reflectance that its photographs show, the median radiance over
 (n.h, n.l), without shadows, relief or noise. The same pictures are then rounded to the photographs' 8 bits, and the
 photographs are blurred by a pixel. Prints mean degrees of normals under true lights.
 """
@@ -28,10 +28,10 @@ from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
 
 _BINS, _SMOOTH, _LEAST = (40, 20), 0.7, 1e-3
-_HEAD = ("object", "photographs", "rendered anew", "rounded to 8 bits", "photographs, blurred")
+_HEAD = ("object", "photographs", "rendered", "rounded to 8 bits", "photographs, blurred")
 
 
-def render_anew(images: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:
+def render_measured(images: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:
     """Return radiance (L, P, 3) of pixels as their object's median reflectance has it.
 
     Args:
@@ -41,7 +41,7 @@ def render_anew(images: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> 
     """
     half = unit(lights + np.array([0.0, 0.0, 1.0]))
     angles, cosines = np.arccos((half @ normals.T).clip(-1.0, 1.0)), (lights @ normals.T).clip(0.0, 1.0)  # (L, P)
-    anew = np.zeros(images.shape, np.float32)
+    rendered = np.zeros(images.shape, np.float32)
     for channel in range(3):
         values = images[..., channel]
         table, across, along, _ = binned_statistic_2d(
@@ -52,8 +52,8 @@ def render_anew(images: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> 
         table = gaussian_filter(np.where(known, table, 0.0), _SMOOTH) / weight
         centres = [(edges[1:] + edges[:-1]) / 2 for edges in (across, along)]
         look_up = RegularGridInterpolator(centres, table, bounds_error=False, fill_value=None)
-        anew[..., channel] = look_up(np.stack([angles, cosines], axis=-1)).clip(min=0.0) * (cosines > 0.0)
-    return anew
+        rendered[..., channel] = look_up(np.stack([angles, cosines], axis=-1)).clip(min=0.0) * (cosines > 0.0)
+    return rendered
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -76,10 +76,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lights, gains = item.true_directions[:: args.every], item.intensities[:: args.every][:, None, None, :]
         inside = item.mask[None, ..., None]
         photographs = np.asarray(item.load()[:], np.float32)[:: args.every] / gains * inside
-        anew = np.zeros_like(photographs)
-        anew[:, item.mask] = render_anew(photographs[:, item.mask], item.normals[item.mask], lights)
+        rendered = np.zeros_like(photographs)
+        rendered[:, item.mask] = render_measured(photographs[:, item.mask], item.normals[item.mask], lights)
         weight = gaussian_filter(item.mask.astype(np.float32), 1.0).clip(min=_LEAST)[None, ..., None]
-        shown = (photographs, anew, np.round(anew * gains * 255) / 255 / gains,
+        shown = (photographs, rendered, np.round(rendered * gains * 255) / 255 / gains,
                  gaussian_filter(photographs, (0, 1, 1, 0)) / weight * inside)  # fmt: skip
         errors = []
         for images in shown:

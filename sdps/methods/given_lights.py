@@ -29,6 +29,8 @@ _PIXELS = 1500
 _ROUNDS = 6
 _DARK = 0.05  # shading, relative to the pixel's brightest, below which a picture tells nothing of its light
 _LEVEL = 0.1  # residual, relative to the pixel's mean, that counts half
+_FEWEST_TO_CARRY = 8  # lights; the map has nine numbers
+_CARRIED = 5.0  # degrees between the directions a network finds, carried, and the known ones, on average
 _PRIOR = 0.2  # weight of the network's intensity, as a share of the data's, where Lambert's law fits
 _MISFIT = 0.2  # residual, relative to the images' mean, of an object that does not fit it
 
@@ -178,6 +180,32 @@ def find_intensities(images: ReducedImages, directions: np.ndarray, start: np.nd
         found = ratio / ((weights * shading**2).sum(axis=1) + prior)
         found = scale_to_mean(found)
     return np.maximum(found, 1e-3).astype(np.float32)
+
+
+def carry_intensities(directions: np.ndarray, seen: np.ndarray, strengths: np.ndarray) -> np.ndarray:
+    """Return the intensities (L,), mean 1, that a network would find if it knew the directions.
+
+    Images of a matte surface tell intensities times directions only up to a linear map of all of them (Hayakawa, JOSA
+    1994), and a network errs much like that: in both. The map that brings its directions to the known ones mends its
+    intensities, too. Where no map does that, as with rows in another order, or too few lights tell it, they stay.
+
+    Args:
+        directions: (L, 3) unit, known.
+        seen: (L, 3) unit, what a network finds.
+        strengths: (L,), the same for intensities.
+    """
+    start = scale_to_mean(np.asarray(strengths, np.float64))
+    if len(start) < _FEWEST_TO_CARRY:
+        return start
+    vectors, found = seen * start[:, None], start
+    for _ in range(_ROUNDS):
+        change = np.linalg.lstsq(vectors, found[:, None] * directions - vectors, rcond=None)[0]
+        carried = vectors + vectors @ change
+        found = (carried * directions).sum(axis=1)
+        if found.min() <= 0.0:
+            return start
+        found = scale_to_mean(found)
+    return found if angle_degrees(carried, directions).mean() < _CARRIED else start
 
 
 def compare_lights(

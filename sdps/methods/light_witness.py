@@ -12,7 +12,7 @@ from sdps.core.estimate import Estimate
 from sdps.core.intensities import grey, scale_to_mean
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
-from sdps.methods.given_lights import LightFit, compare_lights, find_intensities, reduce_images
+from sdps.methods.given_lights import LightFit, carry_intensities, compare_lights, find_intensities, reduce_images
 from sdps.methods.method import Method
 from sdps.methods.runner import Runner
 from sdps.models.registry import COMBINATIONS
@@ -69,7 +69,9 @@ def question_lights(
     directions = unit(np.asarray(directions, np.float64))
     reduced = reduce_images(images, mask)
     if intensities is None:
-        start = np.ones(len(images)) if seen is None else seen.intensities
+        start = np.ones(len(images))
+        if seen is not None:
+            start = carry_intensities(directions, seen.light_directions, seen.intensities)
         intensities = find_intensities(reduced, directions, start)
     if seen is None or len(files) < _FEWEST:
         return intensities, None

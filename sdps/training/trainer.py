@@ -193,8 +193,9 @@ class Trainer:
         stage.to(here.device)
         self.arithmetic = here.same_arithmetic(config.precision)
         self.source = source or _open_source(stage, data, here)
-        self._validates = bool(config.validation_scenes) and here.leads
-        self._validates = self._validates and any(scene.split == "val" for scene in read_manifest(data))
+        self._validates = (
+            config.validation_scenes > 0 and here.leads and any(scene.split == "val" for scene in read_manifest(data))
+        )
         self.optimiser = _optimiser(stage.network, config)
         average = get_ema_multi_avg_fn(config.ema)
         self.average = AveragedModel(stage.network, multi_avg_fn=average) if config.ema else None

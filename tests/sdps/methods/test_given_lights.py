@@ -10,7 +10,14 @@ import pytest
 import sdps
 from render.shared.errors import InputError
 from sdps.core.metrics import angle_degrees
-from sdps.methods.given_lights import AXES, ReducedImages, compare_lights, find_intensities, reduce_images
+from sdps.methods.given_lights import (
+    AXES,
+    ReducedImages,
+    carry_intensities,
+    compare_lights,
+    find_intensities,
+    reduce_images,
+)
 from sdps.photos.light_files.light_advice import advise
 from sdps.photos.light_files.light_frame import frame_matrix, frame_name
 
@@ -140,3 +147,16 @@ def test_right_lights_have_no_verdict(photographs: Path) -> None:
     facts = found.summary()
     assert facts["light_directions"] == "given" and facts["light_intensities"] == "found"
     assert "expected_light_error_degrees" not in facts["refined"]  # given lights are not exact
+
+
+def test_intensities_of_a_network_are_mended_by_the_map_that_mends_its_directions() -> None:
+    true = STRENGTHS / STRENGTHS.mean()
+    bent = (true[:, None] * LIGHTS) @ (np.diag([1.12, 0.95, 0.9]) + 0.03)
+    strengths = np.linalg.norm(bent, axis=1)
+    found = carry_intensities(LIGHTS, bent / strengths[:, None], strengths)
+    assert np.abs(found / true - 1.0).max() < 1e-3 < np.abs(strengths / strengths.mean() / true - 1.0).max()
+    shuffled = np.roll(LIGHTS, 3, axis=0)
+    kept = carry_intensities(shuffled, bent / strengths[:, None], strengths)
+    np.testing.assert_allclose(kept, strengths / strengths.mean())
+    few = carry_intensities(LIGHTS[:5], bent[:5] / strengths[:5, None], strengths[:5])
+    np.testing.assert_allclose(few, strengths[:5] / strengths[:5].mean())
