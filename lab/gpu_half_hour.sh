@@ -28,14 +28,10 @@ NEAR=(data.lights=mixed data.light_count=32 data.near_lights=0.5 'data.near_ligh
 WORLD=("data.seed=$SEED" data.prefix=g1- data.spp=8 'data.families={composition: 1000, sculpture: 1250, blobby: 750}')
 SHIP=("data.seed=$SEED" data.prefix=g2- data.spp=8 "${NEAR[@]}" 'data.families={blobby: 1000, sculpture: 1500}')
 # Scenes lie in the GPU's memory, and samples are made there: loader processes would make a tenth of them.
-TRAINING='steps: null, resident: true, skip_missing: true, warmup: 0.02, clip_gradient: 1.0, cooldown: 0.7,
-  validation_images: 32, validation_scenes: 24, checkpoint_minutes: 1,
-  augmentation: {sensor: {stops: [-4.0, 1.0], black_error: [-8.0, 8.0]}}'
-LIGHTSET_RUN='base: lightset, seed: 41, size: 64, images: 28, fewest_images: 8, batch_scenes: 64, learning_rate: 3e-3,
-  validate_every: 2000, options: {nearness: true, breadth: 1.34, blocks: 4}'
-FRAMES_RUN='base: frames, seed: 42, crop: 96, images: 24, fewest_images: 6, batch_scenes: 32, accumulate: 4, loss: chord,
-  learning_rate: 2e-3, light_blend: 1.5, light_error: 0.0, lights: "shipped:lightset", start: "shipped:frames",
-  validate_every: 1000, options: {heads: 4, attending: 1, context: 160}'
+# Both runs are those of the preset, but for these settings.
+TRAINING=(checkpoint_minutes=1 validation_scenes=24 'augmentation={sensor: {stops: [-4.0, 1.0], black_error: [-8.0, 8.0]}}')
+LIGHTSET=(validate_every=2000)
+FRAMES=(validate_every=1000 start=shipped:frames lights=shipped:lightset)
 
 : "${WORK:=/tmp/gpu}" "${OUT:=out/gpu_half_hour}" "${PYTHON:=python3}" # WORK lies outside the checkout there
 export MINUTES ENOUGH SEED ROUNDS VARIANT WORLD_WORKERS SHIP_WORKERS READERS WORK PYTHON TINY="${TINY:-}"
@@ -144,13 +140,16 @@ join_manifests() { # of both presets, once both are planned
 }
 
 train() { # lightset|frames
-  local run=$LIGHTSET_RUN
   cd "$WORK/code"
-  [[ $1 == lightset ]] || run=$FRAMES_RUN
-  "$PYTHON" -m pipelines.cli train --preset world --data "$WORK/mix/data" --out "$WORK/run" --models "$1-gpu" \
-    --set "runs.$1-gpu={$TRAINING, $run, workers: $READERS, minutes: $MINUTES}" \
-    ${TINY:+"${TINY_TRAINING[@]/#/--set=runs.$1-gpu.}"}
+  learn "$1" "$WORK/mix/data" "$WORK/run" "minutes=$MINUTES" ${TINY:+"${TINY_TRAINING[@]}"}
   touch "$WORK/logs/train-$1.done"
+}
+
+learn() { # lightset|frames DATA OUT SETTING...
+  local settings=("${TRAINING[@]}" "${LIGHTSET[@]}")
+  [[ $1 == lightset ]] || settings=("${TRAINING[@]}" "${FRAMES[@]}")
+  settings+=("workers=$READERS" "${@:4}")
+  "$PYTHON" -m pipelines.cli train --preset world --data "$2" --out "$3" --models "$1-gpu" "${settings[@]/#/--set=runs.$1-gpu.}"
 }
 
 report() {
@@ -194,13 +193,10 @@ probe() { # on the scenes in .gpu/probe, each network for itself; then the rende
   mkdir -p "$OUT" "$WORK/logs" "$WORK/in"
   take && set_up
   cp -r .gpu/probe "$WORK/probe" && cd "$WORK/code"
-  local name run
+  local name
   for name in lightset frames; do
-    run=$LIGHTSET_RUN
-    [[ $name == lightset ]] || run=$FRAMES_RUN
-    timeout 90 "$PYTHON" -m pipelines.cli train --preset world --data "$WORK/probe/data" --out "$WORK/probe" \
-      --models "$name-gpu" --set "runs.$name-gpu={$TRAINING, $run, workers: 2, minutes: ${PROBE_MINUTES:-0.4}, log_every: 10}" 2>&1 |
-      tr '\r' '\n' | tail -n 12 | cut -c1-400
+    learn "$name" "$WORK/probe/data" "$WORK/probe" "minutes=${PROBE_MINUTES:-0.4}" log_every=10 2>&1 |
+      tr '\r' '\n' | tail -n 12 | cut -c1-400 || true
     tail -n 2 "$WORK/probe/models/$name-gpu/metrics.jsonl" || true
   done
   nvidia-smi --query-gpu=memory.total,memory.used --format=csv,noheader || true
