@@ -197,14 +197,16 @@ def carry_intensities(directions: np.ndarray, seen: np.ndarray, strengths: np.nd
     start = scale_to_mean(np.asarray(strengths, np.float64))
     if len(start) < _FEWEST_TO_CARRY:
         return start
-    vectors, found = seen * start[:, None], start
-    for _ in range(_ROUNDS):
-        change = np.linalg.lstsq(vectors, found[:, None] * directions - vectors, rcond=None)[0]
-        carried = vectors + vectors @ change
-        found = (carried * directions).sum(axis=1)
-        if found.min() <= 0.0:
-            return start
-        found = scale_to_mean(found)
+    # The map after which nothing of the vectors lies across the known directions.
+    vectors = seen * start[:, None]
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # (L, 3, 3)
+    system = np.einsum("lab,lc->labc", across, vectors).reshape(-1, 9)  # (3 L, 9)
+    carried = vectors @ np.linalg.svd(system, full_matrices=False)[2][-1].reshape(3, 3).T
+    found = (carried * directions).sum(axis=1)
+    carried, found = carried * np.sign(found.sum()), found * np.sign(found.sum())
+    if found.min() <= 0.0:
+        return start
+    found = scale_to_mean(found)
     return found if angle_degrees(carried, directions).mean() < _CARRIED else start
 
 
