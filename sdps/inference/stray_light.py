@@ -46,9 +46,11 @@ def stray_light(values: np.ndarray) -> np.ndarray:
 def remove_stray_light(images: np.ndarray, level: np.ndarray) -> np.ndarray:
     """Return images less their stray light; up to three times its level they are black, as noise in shadow is.
 
+    Below 0, where too much was taken off for a black level or a dark frame, the level is added back.
+
     Args:
         images: (L, ..., 3) float32.
         level: (L, 3), of `stray_light`.
     """
     level = level.reshape(len(level), *[1] * (images.ndim - 2), 3)
-    return np.where(images > _NOISE * level, images - level, np.float32(0.0))
+    return np.where(images > _NOISE * level, np.maximum(images - level, 0.0), np.float32(0.0))

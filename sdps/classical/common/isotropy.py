@@ -58,7 +58,7 @@ def asymmetry(values: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np
 
 def log_values(profiles: np.ndarray, intensities: np.ndarray) -> np.ndarray:  # (P, L) float32
     """Return log samples over intensity and the pixel's typical value."""
-    values = (profiles / intensities).astype(np.float32)
+    values = np.maximum(profiles / intensities, 0.0).astype(np.float32)  # a dark frame leaves noise around 0
     values /= np.maximum(np.median(values, axis=1, keepdims=True), 1e-3 * values.max() + 1e-12)
     return np.log(values + np.float32(_FLOOR))
 

@@ -123,3 +123,8 @@ def test_bad_lights():
         half_vector(scene.images, scene.mask, intensities=np.ones(60))
     with pytest.raises(InputError, match="samples"):
         half_vector(scene.images, scene.mask, samples=1)
+
+
+def test_samples_below_zero_count_as_black():
+    below = np.random.default_rng(0).uniform(-0.2, 1.0, (5, 7))
+    np.testing.assert_array_equal(log_values(below, np.ones(7)), log_values(below.clip(0.0), np.ones(7)))

@@ -57,3 +57,15 @@ def test_an_image_without_a_shadow_of_its_own_has_about_the_level_of_the_others(
     found = stray_light(veiled[:, mask])
     np.testing.assert_allclose(found[1:], 0.004, atol=0.001)
     assert 0.0 < found[0].max() <= 0.0081  # its darkest pixels are lit
+
+
+def test_nothing_is_below_zero_where_too_much_was_taken_off(sphere: tuple) -> None:
+    """A black level too high, or a dark frame: shadows lie below 0, and noise in them further; logarithms follow."""
+    images, mask = sphere
+    noisy = images - np.float32(0.004) + np.random.default_rng(3).normal(0.0, 0.001, images.shape).astype(np.float32)
+    scene = survey(noisy, mask, None, stray=True)
+    assert scene.stray.max() < 0.0
+    shown = scene.read(0, 24)
+    assert shown.min() == 0.0
+    lit = mask & (images.min(-1) > 0.1)
+    assert np.abs(shown[lit] - images[lit]).mean() < 0.002
