@@ -40,7 +40,8 @@ def stray_light(values: np.ndarray) -> np.ndarray:
     for column in level.T:
         known = column[np.isfinite(column)]
         column[np.isnan(column)] = np.median(known) if len(known) else 0.0
-    return np.minimum(level, _MOST * np.median(level, axis=0))
+    most = _MOST * np.abs(np.median(level, axis=0))
+    return np.clip(level, -most, most)
 
 
 def remove_stray_light(images: np.ndarray, level: np.ndarray) -> np.ndarray:
