@@ -2,9 +2,12 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from render.shared.errors import InputError, unknown
+from sdps.surface.exports.height_maps import write_curvatures, write_gradients, write_heights
+from sdps.surface.exports.normal_maps import CONVENTIONS, write_normals
 from sdps.surface.exports.saved_result import SavedResult
 
 Writer = Callable[[SavedResult, Path], list[Path]]
@@ -24,7 +27,13 @@ class Export:
     write: Writer
 
 
-EXPORTS: dict[str, Export] = {}
+EXPORTS: dict[str, Export] = {
+    **{f"normals-{name}": Export(f"normals for {wanted.who}: PNG of 16 bits, EXR", partial(write_normals, name))
+       for name, wanted in CONVENTIONS.items()},
+    "height": Export("inspection, displacement: height as float and 16-bit TIFF, mm where known", write_heights),
+    "gradients": Export("inspection: slopes dz/dx and dz/dy as TIFF", write_gradients),
+    "curvature": Export("inspection: mean and Gaussian curvature as TIFF", write_curvatures),
+}  # fmt: skip
 """By name; each is written into a folder of that name."""
 
 
