@@ -42,7 +42,6 @@ def test_what_cannot_be_written_ends_in_one_line(
     assert main(["export", *arguments]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
-    assert not (tmp_path / "result" / "exports" / "meshroom").exists()
 
 
 def test_infer_exports_what_it_saved_and_says_what_it_cannot(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -73,9 +73,7 @@ def write_exports(result: SavedResult, names: Iterable[str], out: Path) -> list[
             folder.mkdir(parents=True, exist_ok=True)
             made += EXPORTS[name].write(result, folder)
         except OSError as error:
-            reason = error.strerror or error
-            raise InputError(f"{folder}: cannot be written ({reason}); choose another --out") from error
-        finally:
-            if folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()  # nothing could be written
+            raise InputError(
+                f"{folder}: cannot be written ({error.strerror or error}); choose another --out"
+            ) from error
     return made
