@@ -192,6 +192,7 @@ class Inference:
             "light_intensities": "found" if photos.intensities is None else "given",
             "lamps": self.lamps,
             "camera": photos.camera_summary,
+            **_number_camera(photos),
             **({"pixel_size": photos.pixel_size} if photos.pixel_size else {}),
             "frame": "x right, y up, z to the camera; lights from the surface to the light",
             "depth": {"unit": f"{_unit(photos)} towards the camera", "components": self.depth.components,
@@ -297,6 +298,15 @@ def check_out(out: Path, photographs: Path) -> None:
 def _unit(photos: Photographs) -> str:
     """Return the unit of the files' depth."""
     return "millimetres" if photos.pixel_size else "pixels"
+
+
+def _number_camera(photos: Photographs) -> dict[str, Any]:
+    """Return the camera in numbers, of the pictures as read; nothing of the plain orthographic one."""
+    camera = photos.camera
+    if not camera.is_perspective and camera.principal is None:
+        return {}
+    focal = camera.focal if camera.is_perspective else None
+    return {"camera_pixels": {"focal": focal, "principal": list(camera.middle(photos.shape))}}
 
 
 def _by_file(photos: Photographs, values: np.ndarray, digits: int) -> dict[str, float]:

@@ -1,0 +1,1 @@
+"""What other programs want of a saved result: files in their forms, frames and units."""
