@@ -1,0 +1,140 @@
+"""Relightable pictures: `.ptm` (polynomial texture map, LRGB) and `.rti` (hemispherical harmonics, HSH).
+
+Both hold, for each pixel, a few numbers that make its brightness a function of the light's direction (u, v, w), x right,
+y up, w to the camera. Viewers show the sum as it is, so what is fitted are values for a screen (sRGB's curve):
+
+    PTM   L = a0 u^2 + a1 v^2 + a2 u v + a3 u + a4 v + a5,  value = L rgb / 255        rows from bottom to top
+    HSH   value_c = sum_k a_kc H_k(u, v, w)                                            rows from top to bottom
+
+References: Malzbender, Gelb and Wolters, Polynomial Texture Maps, SIGGRAPH 2001, equation 7, and HP's PTM file format
+1.2; Gautron et al., A Novel Hemispherical Basis, EGSR 2004, equations 7 and 11.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from render.shared.errors import InputError
+from render.shared.files import atomic_path
+from render.shared.imaging.srgb import to_srgb
+
+POLYNOMIAL = 6
+"""Numbers of a pixel in a `.ptm`; as many lights are needed."""
+HARMONICS = (4, 9)
+"""Numbers of a pixel and channel in a `.rti` of order 2 and 3."""
+_STEADY = 1e-3
+"""Ridge, as a share of the lights: what lights do not determine stays small."""
+_OUTLIERS = 0.02  # percent of the numbers at either end that may be clipped to a byte's range
+_FULL = 255.0
+
+
+def expand_polynomial(directions: np.ndarray) -> np.ndarray:
+    """Return what a PTM's numbers are multiplied with, (L, 6), of unit directions (L, 3)."""
+    u, v = np.asarray(directions, np.float64).T[:2]
+    return np.stack([u * u, v * v, u * v, u, v, np.ones_like(u)], axis=1)
+
+
+def expand_harmonics(directions: np.ndarray, terms: int) -> np.ndarray:
+    """Return the first 4 or 9 hemispherical harmonics of unit directions (L, 3), as (L, terms)."""
+    x, y, z = np.asarray(directions, np.float64).T
+    azimuth, z = np.arctan2(y, x), np.clip(z, 0.0, 1.0)
+    shifted, across = 2.0 * z - 1.0, np.sqrt(z - z * z)
+    found = [
+        np.full_like(z, np.sqrt(1 / (2 * np.pi))),
+        np.sqrt(6 / np.pi) * np.cos(azimuth) * across,
+        np.sqrt(3 / (2 * np.pi)) * shifted,
+        np.sqrt(6 / np.pi) * np.sin(azimuth) * across,
+        -np.sqrt(30 / np.pi) * np.cos(2 * azimuth) * across**2,
+        np.sqrt(30 / np.pi) * np.cos(azimuth) * shifted * across,
+        np.sqrt(5 / (2 * np.pi)) * (1 - 6 * across**2),
+        np.sqrt(30 / np.pi) * np.sin(azimuth) * shifted * across,
+        -np.sqrt(30 / np.pi) * np.sin(2 * azimuth) * across**2,
+    ]
+    return np.stack(found[:terms], axis=1)
+
+
+def fit_pictures(pictures: Iterable[np.ndarray], basis: np.ndarray) -> np.ndarray:
+    """Return the numbers (K, n, 3) float32 that explain L pictures best, by least squares.
+
+    Args:
+        pictures: L arrays (n, 3), linear radiance under equal lights, 1 for white; read once.
+        basis: (L, K), `expand_polynomial` or `expand_harmonics` of the lights.
+
+    Raises:
+        InputError: fewer lights than numbers.
+    """
+    count, terms = basis.shape
+    if count < terms:
+        raise InputError(f"a relightable picture of {terms} numbers a pixel needs {terms} lights or more, got {count}")
+    ridge = _STEADY * count * np.eye(terms)
+    solution = np.linalg.solve(basis.T @ basis + ridge, basis.T).astype(np.float32)  # (K, L)
+    found = None
+    for number, picture in enumerate(pictures):
+        shown = to_srgb(np.clip(picture, 0.0, 1.0)).astype(np.float32)
+        found = np.zeros((terms, *shown.shape), np.float32) if found is None else found
+        for term in range(terms):
+            found[term] += solution[term, number] * shown
+    if found is None:
+        raise InputError("a relightable picture needs pictures")
+    return found
+
+
+def write_ptm(path: str | Path, numbers: np.ndarray, mask: np.ndarray) -> None:
+    """Write a `.ptm` (PTM_FORMAT_LRGB 1.2), black outside the mask.
+
+    Args:
+        path: The file.
+        numbers: (6, n, 3) of `fit_pictures` with `expand_polynomial`, for the mask's pixels.
+        mask: (H, W) bool.
+    """
+    mean = np.maximum(_mean_shown(numbers), 1e-6)  # (n, 3)
+    colour = mean / mean.max(axis=1, keepdims=True)
+    grey = _FULL * (numbers * colour).sum(axis=2) / (colour**2).sum(axis=1)  # (6, n): a pixel's colours, projected
+    low, high = _ranges(grey)
+    scale = np.maximum(high - low, 1e-3) / _FULL
+    bias = np.rint(-low / scale)
+    head = f"PTM_1.2\nPTM_FORMAT_LRGB\n{mask.shape[1]}\n{mask.shape[0]}\n"
+    head += " ".join(f"{value:.7g}" for value in scale) + "\n" + " ".join(f"{value:.0f}" for value in bias) + "\n"
+    scale = np.array([float(f"{value:.7g}") for value in scale])
+    bytes_of = np.clip(np.rint(grey / scale[:, None] + bias[:, None]), 0, 255).astype(np.uint8)
+    black = np.append(bias, [0, 0, 0]).astype(np.uint8)
+    whole = np.broadcast_to(black, (*mask.shape, 9)).copy()
+    whole[mask] = np.concatenate([bytes_of.T, np.rint(_FULL * colour).astype(np.uint8)], axis=1)
+    whole = whole[::-1]
+    with atomic_path(Path(path)) as temporary:
+        temporary.write_bytes(head.encode() + whole[..., :6].tobytes() + whole[..., 6:].tobytes())
+
+
+def write_rti(path: str | Path, numbers: np.ndarray, mask: np.ndarray) -> None:
+    """Write a `.rti` (HSH 1.2), black outside the mask.
+
+    Args:
+        path: The file.
+        numbers: (4 or 9, n, 3) of `fit_pictures` with `expand_harmonics`, for the mask's pixels.
+        mask: (H, W) bool.
+    """
+    terms = len(numbers)
+    low, high = _ranges(numbers.reshape(terms, -1))
+    scale, bias = np.maximum(high - low, 1e-6).astype("<f4"), low.astype("<f4")
+    head = f"#HSH1.2\n3\n{mask.shape[1]} {mask.shape[0]} 3\n{terms} 2 1\n".encode()
+    zero = np.clip(np.rint(-_FULL * bias / scale), 0, 255).astype(np.uint8)
+    whole = np.broadcast_to(zero, (*mask.shape, 3, terms)).copy()
+    share = (np.moveaxis(numbers, 0, -1) - bias) / scale  # (n, 3, K)
+    whole[mask] = np.clip(np.rint(_FULL * share), 0, 255).astype(np.uint8)
+    with atomic_path(Path(path)) as temporary:
+        temporary.write_bytes(head + scale.tobytes() + bias.tobytes() + whole.tobytes())
+
+
+def _mean_shown(numbers: np.ndarray) -> np.ndarray:  # (n, 3)
+    """Return the mean colour of pixels under lights all around, 30 degrees from the camera; numbers (6, n, 3)."""
+    around = np.linspace(0.0, 2.0 * np.pi, 9)[:-1]
+    u, v = 0.5 * np.cos(around), 0.5 * np.sin(around)
+    basis = expand_polynomial(np.stack([u, v, np.sqrt(1.0 - u * u - v * v)], axis=1)).mean(axis=0)
+    return np.clip(np.tensordot(basis, numbers, 1), 0.0, None)
+
+
+def _ranges(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the greatest of each row of numbers (K, m), but for outliers; 0 is between them."""
+    low, high = np.percentile(numbers, [_OUTLIERS, 100.0 - _OUTLIERS], axis=1)
+    return np.minimum(low, 0.0), np.maximum(high, 0.0)
