@@ -1,7 +1,7 @@
 """Relightable pictures: `.ptm` (polynomial texture map, LRGB) and `.rti` (hemispherical harmonics, HSH).
 
-Both hold, for each pixel, a few numbers that make its brightness a function of the light's direction (u, v, w), x right,
-y up, w to the camera. Viewers show the sum as it is, so what is fitted are values for a screen (sRGB's curve):
+Both hold, for each pixel, a few numbers that make its brightness a function of the light's direction (u, v, w): u
+right, v up, w to the camera. Viewers show the sum as it is, so what is fitted are values for a screen (sRGB's curve):
 
     PTM   L = a0 u^2 + a1 v^2 + a2 u v + a3 u + a4 v + a5,  value = L rgb / 255        rows from bottom to top
     HSH   value_c = sum_k a_kc H_k(u, v, w)                                            rows from top to bottom

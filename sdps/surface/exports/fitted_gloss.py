@@ -1,0 +1,230 @@
+"""Base colour, metallic and roughness of glTF (`metallic_roughness`), fitted to the reflectance that refinement found.
+
+Radiance f max(n . l, 0) of both is compared at 1300 directions of light, of surfaces at four tilts. For each pixel,
+with the object's scale k (radiance of the photographs over that of glTF):
+
+    dielectric   rho D + S  is  k ((1 - F) base + M_roughness), M the highlight of f0 = 0.04
+    metal        rho D + S  is  k base P_roughness,             P the highlight of f0 = 1
+
+Least squares gives base for every roughness, then roughness. k is what explains the highlights of most pixels as those
+of a dielectric, whose f0 is known: so highlights tell how dark the base colour is. Where it would be brighter than
+white, k is such that its brightest percent is 0.95.
+
+What the model can tell of metals: its highlights have no colour, so a metal's is found in the lamps' colour, and given
+back to it here as if they were white. An object is of metal if it would be blacker as a dielectric than black paint
+(0.03) and a metal explains it better; in other objects, pixels whose highlights reflect five times as much as those of
+a dielectric can are of metal.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from render.shared.errors import InputError
+from sdps.refinement.reflectance import evaluate_body, evaluate_factor, evaluate_lobes, measure_angles
+from sdps.surface.exports.metallic_roughness import (
+    DIELECTRIC,
+    evaluate_fresnel,
+    evaluate_highlight,
+    measure_cosines,
+)
+
+ROUGHNESS = np.linspace(0.05, 1.0, 58)
+"""Tried one by one, with a parabola between them."""
+BRIGHTEST = 0.95
+"""Of base colour: no surface is brighter."""
+BLACKEST = 0.03
+"""Base colour that dielectrics hardly go below."""
+METAL = 5.0 * DIELECTRIC
+"""f0 from which on a pixel is of metal."""
+_VIEWS = (0.98, 0.9, 0.75, 0.55)  # n . v
+_TRIED, _FIRST, _LAST = 160, 0.02, 5000.0  # scales, relative to photographs of mean 1
+_FEW, _PART = 2000, 2**14
+_FLOOR = 0.05
+
+
+class Surface(NamedTuple):
+    """What refinement found of n pixels (`sdps.refinement.image_model.Refined`).
+
+    Attributes:
+        albedo: (n, 3) rho.
+        strength: (n,) s.
+        body, modes: (4,) and (M,).
+        amplitudes, sharpness: (K,) of the lobes.
+        gains: (3,) of the channels, the mean of the lamps' intensities.
+    """
+
+    albedo: np.ndarray
+    strength: np.ndarray
+    body: np.ndarray
+    modes: np.ndarray
+    amplitudes: np.ndarray
+    sharpness: np.ndarray
+    gains: np.ndarray
+
+
+class Materials(NamedTuple):
+    """glTF's materials of n pixels, float32.
+
+    Attributes:
+        base: (n, 3) linear base colour, 0 to 1.
+        metallic: (n,) 0 or 1.
+        roughness: (n,) 0.05 to 1.
+        scale: Radiance of the photographs (of mean 1, under intensities of mean 1) over that of glTF.
+    """
+
+    base: np.ndarray
+    metallic: np.ndarray
+    roughness: np.ndarray
+    scale: float
+
+
+class _Shapes(NamedTuple):
+    """Radiance at the sampled directions (N,), or for each roughness (R, N)."""
+
+    body: np.ndarray
+    lobes: np.ndarray
+    matt: np.ndarray
+    dielectric: np.ndarray
+    mirror: np.ndarray
+
+
+def fit_materials(surface: Surface) -> Materials:
+    """Return the materials that reflect most like a refined surface.
+
+    Raises:
+        InputError: no pixels, or values that are not finite.
+    """
+    if not len(surface.albedo) or not all(np.isfinite(part).all() for part in surface):
+        raise InputError("the refined reflectance is empty or not finite; run `sdps infer` again")
+    shapes = _sample(surface)
+    few = slice(None, None, max(1, len(surface.albedo) // _FEW))
+    grey, strength = surface.albedo.mean(axis=1, dtype=np.float64), surface.strength.astype(np.float64)
+    scale = _find_scale(shapes, grey[few], strength[few])
+    off, roughness = _as_dielectric(shapes, grey[few], strength[few], scale)
+    plain = _base_colour(shapes, surface.albedo[few], strength[few], roughness, scale)
+    better = _as_metal(shapes, grey[few], strength[few])[0].mean() < off.mean()
+    if better and np.median(plain.mean(axis=1)) < BLACKEST:
+        return _all_metal(shapes, surface)
+    scale *= max(1.0, float(np.percentile(plain.max(axis=1), 99)) / BRIGHTEST)
+    parts = [slice(start, start + _PART) for start in range(0, len(grey), _PART)]
+    found = [_fit_part(shapes, surface, some, scale) for some in parts]
+    return Materials(*(np.concatenate(parts).astype(np.float32) for parts in zip(*found, strict=True)), scale)
+
+
+def _fit_part(shapes: _Shapes, surface: Surface, some: slice, scale: float) -> tuple[np.ndarray, ...]:
+    """Return base colour, metallic and roughness of some pixels, dielectrics or metal."""
+    grey, strength = surface.albedo[some].mean(axis=1, dtype=np.float64), surface.strength[some].astype(np.float64)
+    off, roughness = _as_dielectric(shapes, grey, strength, scale)
+    base = _base_colour(shapes, surface.albedo[some], strength, roughness, scale)
+    metal_off, metal_roughness, reflected = _as_metal(shapes, grey, strength)
+    metal = (reflected > METAL * scale) & (metal_off < off)
+    coloured = reflected[:, None] * (surface.gains / surface.gains.max()) / scale
+    base = np.where(metal[:, None], coloured, base)
+    return np.clip(base, 0.0, 1.0), metal, np.where(metal, metal_roughness, roughness)
+
+
+def _all_metal(shapes: _Shapes, surface: Surface) -> Materials:
+    """Return the materials of an object of metal, whose brightest percent is set to `BRIGHTEST`."""
+    grey, strength = surface.albedo.mean(axis=1, dtype=np.float64), surface.strength.astype(np.float64)
+    parts = [slice(start, start + _PART) for start in range(0, len(grey), _PART)]
+    found = [_as_metal(shapes, grey[some], strength[some])[1:] for some in parts]
+    roughness, reflected = (np.concatenate(values) for values in zip(*found, strict=True))
+    scale = max(float(np.percentile(reflected, 99)), 1e-9) / BRIGHTEST
+    base = np.clip(reflected[:, None] * (surface.gains / surface.gains.max()) / scale, 0.0, 1.0)
+    one = np.ones(len(base), np.float32)
+    return Materials(base.astype(np.float32), one, roughness.astype(np.float32), scale)
+
+
+def _sample(surface: Surface) -> _Shapes:
+    """Return what body, lobes and glTF's parts reflect, at half vectors up to 60 degrees from the normals."""
+    normals, lights = _directions()
+    angles, cosines = measure_angles(normals, lights[:, None]), measure_cosines(normals, lights)
+    lit = (normals * lights).sum(axis=1)
+    factor = evaluate_factor(angles, surface.modes)[:, 0] * lit
+    lobes = evaluate_lobes(angles, np.ones(len(normals)), surface.amplitudes, surface.sharpness)[:, 0]
+    fresnel = DIELECTRIC + (1.0 - DIELECTRIC) * evaluate_fresnel(cosines)
+    mirror = np.stack([evaluate_highlight(cosines, roughness) * lit for roughness in ROUGHNESS])
+    body = evaluate_body(angles, surface.body)[:, 0]
+    return _Shapes(body * factor, lobes * factor, (1.0 - fresnel) * lit, mirror * fresnel, mirror)
+
+
+def _directions() -> tuple[np.ndarray, np.ndarray]:
+    """Return normals and lights (N, 3), evenly spaced in the angle of the half vector."""
+    tilt, turn = np.radians(np.arange(1.0, 60.0, 2.0)), np.radians(np.arange(0.0, 360.0, 15.0))
+    tilt, turn = (grid.ravel() for grid in np.meshgrid(tilt, turn))
+    normals, lights = [], []
+    for view in _VIEWS:
+        normal, side = np.array([np.sqrt(1 - view**2), 0.0, view]), np.array([view, 0.0, -np.sqrt(1 - view**2)])
+        around = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.array([0.0, 1.0, 0.0])
+        half = np.cos(tilt)[:, None] * normal + np.sin(tilt)[:, None] * around
+        light = 2.0 * half[:, 2:] * half - np.array([0.0, 0.0, 1.0])
+        usable = (half[:, 2] > 0.3) & (light @ normal > 0.1) & (light[:, 2] > 0.15)
+        lights.append(light[usable])
+        normals.append(np.broadcast_to(normal, lights[-1].shape))
+    return np.concatenate(normals), np.concatenate(lights)
+
+
+def _find_scale(shapes: _Shapes, grey: np.ndarray, strength: np.ndarray) -> float:
+    """Return the scale that explains the highlights of most pixels as those of dielectrics."""
+    tried = np.geomspace(_FIRST, _LAST, _TRIED)
+    apart = _apart_from_matt(shapes)
+    wanted = _multiply(grey, strength, apart.body, apart.lobes)
+    wanted += _FLOOR * wanted.mean() + 1e-12  # pixels count the same, but for those that hardly shine
+    shares = (_as_dielectric(shapes, grey, strength, scale)[0] / wanted for scale in tried)
+    off = [np.sqrt(np.maximum(share, 0.0)).mean() for share in shares]  # not squared: an inlay must not decide
+    return float(tried[int(np.argmin(off))])
+
+
+def _as_dielectric(
+    shapes: _Shapes, grey: np.ndarray, strength: np.ndarray, scale: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the squares that the best dielectric leaves of each pixel, and its roughness; base is whatever fits."""
+    apart = _apart_from_matt(shapes)
+    both = np.outer(grey, apart.dielectric @ apart.body) + np.outer(strength, apart.dielectric @ apart.lobes)  # (n, R)
+    off = scale**2 * (apart.dielectric**2).sum(axis=1) - 2 * scale * both
+    return off.min(axis=1) + _multiply(grey, strength, apart.body, apart.lobes), _at_least(off)
+
+
+def _as_metal(shapes: _Shapes, grey: np.ndarray, strength: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the squares that the best metal leaves of each pixel, its roughness, and k base."""
+    both = np.outer(grey, shapes.mirror @ shapes.body) + np.outer(strength, shapes.mirror @ shapes.lobes)
+    own = (shapes.mirror**2).sum(axis=1)
+    off = -(both**2) / own
+    best = off.argmin(axis=1)
+    reflected = both[np.arange(len(best)), best] / own[best]
+    return off.min(axis=1) + _multiply(grey, strength, shapes.body, shapes.lobes), _at_least(off), reflected
+
+
+def _apart_from_matt(shapes: _Shapes) -> _Shapes:
+    """Return what is left when any base colour may explain what it can."""
+    matt = shapes.matt / np.linalg.norm(shapes.matt)
+    return _Shapes(*(part - (part @ matt)[..., None] * matt for part in shapes))
+
+
+def _multiply(grey: np.ndarray, strength: np.ndarray, body: np.ndarray, lobes: np.ndarray) -> np.ndarray:  # (n,)
+    """Return the squares of rho body + s lobes."""
+    return grey**2 * (body @ body) + 2 * grey * strength * (body @ lobes) + strength**2 * (lobes @ lobes)
+
+
+def _base_colour(
+    shapes: _Shapes, albedo: np.ndarray, strength: np.ndarray, roughness: np.ndarray, scale: float
+) -> np.ndarray:  # (n, 3)
+    """Return the base colour of dielectrics of that roughness."""
+    body, lobes = shapes.body @ shapes.matt, shapes.lobes @ shapes.matt
+    own = np.interp(roughness, ROUGHNESS, shapes.dielectric @ shapes.matt)
+    left = (strength * lobes - scale * own)[:, None]
+    return np.maximum(albedo * body + left, 0.0) / (scale * (shapes.matt @ shapes.matt))
+
+
+def _at_least(off: np.ndarray) -> np.ndarray:  # (n,)
+    """Return the roughness at the least of each row (n, R), between the three lowest by a parabola."""
+    middle = np.clip(off.argmin(axis=1), 1, len(ROUGHNESS) - 2)
+    rows = np.arange(len(off))
+    left, here, right = (off[rows, middle + step] for step in (-1, 0, 1))
+    bend = left - 2 * here + right
+    shift = np.where(bend > 0, 0.5 * (left - right) / np.where(bend > 0, bend, 1.0), 0.0)
+    step = ROUGHNESS[1] - ROUGHNESS[0]
+    at_edge = off.argmin(axis=1) != middle
+    shift = np.where(at_edge, off.argmin(axis=1) - middle, np.clip(shift, -1.0, 1.0))
+    return np.clip(ROUGHNESS[middle] + step * shift, ROUGHNESS[0], ROUGHNESS[-1])
