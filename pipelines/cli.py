@@ -103,6 +103,8 @@ EVALUATE = Group("score methods on rendered scenes and real photographs, and wri
 COMMANDS: dict[str, Command | Group] = {
     "infer": Command("pipelines.infer", "find normals, lights and a surface in a folder of photographs",
                      example="sdps infer photos --out out/vase\nsdps infer photos --lights lights.lp --mask mask.png"),
+    "export": Command("pipelines.export_result", "write a result for other programs: normal maps, heights, lights, SfMData",
+                      example="sdps export out/vase --normals directx\nsdps export out/vase --as height,lp"),
     "app": Command("pipelines.app.app", "serve a local page for photographs, scenes and data", example="sdps app"),
     "doctor": Command("pipelines.doctor", "show what this machine has and what is missing",
                       example="sdps doctor --fix"),
@@ -145,10 +147,11 @@ GROUPS = {
     "lights": {"lights", "light-set", "intensities", "frame", "light-distance"},
     "the camera": {"focal", "principal", "pixel-size", "camera-distance"},
     "how it is solved": {"method", "methods", "refine", "discontinuities", "read-out", "light-views", "normal-views",
-                         "keep-stray-light", "lighting", "normals"},
+                         "keep-stray-light", "lighting"},
     "which scenes": {"ids", "split", "limit", "count", "skip-missing", "shard", "retry-failed", "shapes", "materials",
                      "category", "role"},
-    "what comes out": {"out", "json", "layout", "bits", "exposure", "mitsuba", "photographs", "tensorboard"},
+    "what comes out": {"out", "json", "layout", "bits", "exposure", "mitsuba", "photographs", "tensorboard", "export",
+                      "as"},
     "the machine": {"workers", "keep-free", "timeout", "cache-gb", "cluster", "cluster-config", "stream", "precision",
                     "verify"},
 }  # fmt: skip

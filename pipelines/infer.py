@@ -11,6 +11,7 @@ import numpy as np
 
 from pipelines.evaluate.report import page as report
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table, Tile
+from pipelines.export_result import FOLDER, add_normals, choose_exports
 from pipelines.shared import network_flags, pictures
 from render.shared.errors import InputError
 from render.shared.progress import bars, stage
@@ -64,6 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="principal point, in pixels of the files (default: their middle)")  # fmt: skip
     parser.add_argument("--pixel-size", type=float, default=None, metavar="MM",
                         help="millimetres that a pixel of the files shows: the unit of depth and meshes")  # fmt: skip
+    parser.add_argument("--export", default=None, metavar="NAME[,NAME]",
+                        help="also write files for other programs, into exports (see `sdps export`)")  # fmt: skip
+    add_normals(parser)
     network_flags.add_arguments(parser)
     parser.add_argument("--self-test", action="store_true",
                         help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
@@ -77,9 +81,12 @@ def main(args: argparse.Namespace) -> int:
         args.folder = photograph_bunny(args.out / "photographs")
     if args.folder is None:
         raise InputError("name a folder of photographs, or use --self-test")
+    exports = choose_exports(args.export, args.normals)
     with bars(without=("reading", "checks", "refinement")):  # these have their own
         result, said = infer_folder(args)
         made = result.save(args.out)
+        if exports:
+            made += _export(args.out, exports)
         page = write_page(args.out / "report.html", result)
     if args.self_test:
         from pipelines.evaluate.self_test import compare
@@ -91,6 +98,20 @@ def main(args: argparse.Namespace) -> int:
     if result.verdict:
         sys.stdout.write(f"{_MARKS['error']} {result.verdict}\n")
     return 0
+
+
+def _export(folder: Path, names: Sequence[str]) -> list[Path]:
+    """Write exports of what was just saved; one that it does not hold is said, and the others are written."""
+    from sdps.surface.exports.registry import write_exports
+    from sdps.surface.exports.saved_result import read_result
+
+    result, made = read_result(folder), list[Path]()
+    for name in names:
+        try:
+            made += write_exports(result, [name], folder / FOLDER)
+        except InputError as error:
+            sys.stdout.write(f"! export {name}: {error}\n")
+    return made
 
 
 def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:

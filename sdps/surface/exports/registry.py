@@ -2,10 +2,16 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from render.shared.errors import InputError, unknown
+from sdps.surface.exports.height_maps import write_curvatures, write_gradients, write_heights
+from sdps.surface.exports.light_exports import write_diligent, write_lp
+from sdps.surface.exports.normal_maps import CONVENTIONS, write_normals
+from sdps.surface.exports.reconstruction_folders import write_bini, write_rnb
 from sdps.surface.exports.saved_result import SavedResult
+from sdps.surface.exports.sfm_data import write_meshroom
 
 Writer = Callable[[SavedResult, Path], list[Path]]
 """Writes files into a folder, which exists, and returns them. An `InputError` says what the result lacks for it."""
@@ -24,7 +30,18 @@ class Export:
     write: Writer
 
 
-EXPORTS: dict[str, Export] = {}
+EXPORTS: dict[str, Export] = {
+    **{f"normals-{name}": Export(f"normals for {wanted.who}: PNG of 16 bits, EXR", partial(write_normals, name))
+       for name, wanted in CONVENTIONS.items()},
+    "height": Export("inspection, displacement: height as float and 16-bit TIFF, mm where known", write_heights),
+    "gradients": Export("inspection: slopes dz/dx and dz/dy as TIFF", write_gradients),
+    "curvature": Export("inspection: mean and Gaussian curvature as TIFF", write_curvatures),
+    "lp": Export("RTIBuilder, RelightLab, Meshroom: light directions as .lp", write_lp),
+    "diligent": Export("MATLAB scripts: lights as DiLiGenT's text files", write_diligent),
+    "bini": Export("BiNI: normal_map.png, mask.png, K.txt", write_bini),
+    "rnb": Export("RNb-NeuS, SuperNormal: one view with cameras.npz", write_rnb),
+    "meshroom": Export("Meshroom: normalMaps.sfm with its maps, mask and lights", write_meshroom),
+}  # fmt: skip
 """By name; each is written into a folder of that name."""
 
 
