@@ -1,6 +1,7 @@
 """`sdps infer`: a folder of photographs under moving light in, normals, lights, depth, meshes and a page out."""
 
 import argparse
+import dataclasses
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -86,7 +87,7 @@ def main(args: argparse.Namespace) -> int:
         result, said = infer_folder(args)
         made = result.save(args.out)
         if exports:
-            made += _export(args.out, exports)
+            made += _export(args.out, exports, result.photos)
         page = write_page(args.out / "report.html", result)
     if args.self_test:
         from pipelines.evaluate.self_test import compare
@@ -100,12 +101,12 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _export(folder: Path, names: Sequence[str]) -> list[Path]:
+def _export(folder: Path, names: Sequence[str], photos: "Photographs") -> list[Path]:
     """Write exports of what was just saved; one that it does not hold is said, and the others are written."""
     from sdps.surface.exports.registry import write_exports
     from sdps.surface.exports.saved_result import read_result
 
-    result, made = read_result(folder), list[Path]()
+    result, made = dataclasses.replace(read_result(folder), pictures=photos), list[Path]()
     for name in names:
         try:
             made += write_exports(result, [name], folder / FOLDER)

@@ -7,8 +7,8 @@ from scipy.optimize import nnls
 from render.shared.errors import InputError
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.reflectance import LOBES, MODES, SHAPES
-from sdps.surface.exports.fitted_gloss import BRIGHTEST, Materials, Surface, fit_materials
-from sdps.surface.exports.metallic_roughness import (
+from sdps.surface.gloss.fitted_gloss import BRIGHTEST, Materials, Surface, fit_materials
+from sdps.surface.gloss.metallic_roughness import (
     evaluate_highlight,
     measure_cosines,
     reflect_gltf,

@@ -22,7 +22,7 @@ import numpy as np
 
 from render.shared.errors import InputError
 from sdps.refinement.reflectance import evaluate_body, evaluate_factor, evaluate_lobes, measure_angles
-from sdps.surface.exports.metallic_roughness import (
+from sdps.surface.gloss.metallic_roughness import (
     DIELECTRIC,
     evaluate_fresnel,
     evaluate_highlight,

@@ -80,6 +80,25 @@ def fit_pictures(pictures: Iterable[np.ndarray], basis: np.ndarray) -> np.ndarra
     return found
 
 
+def measure_error(pictures: Iterable[np.ndarray], basis: np.ndarray, numbers: np.ndarray) -> float:
+    """Return how far the fit is from what it was fitted to, root mean square of values for a screen, 0 to 1.
+
+    Arguments as of `fit_pictures`, and what it returned.
+    """
+    squares = [
+        float(((np.tensordot(row, numbers, 1).clip(0.0, 1.0) - to_srgb(picture)) ** 2).mean())
+        for row, picture in zip(basis.astype(np.float32), pictures, strict=True)
+    ]
+    return float(np.sqrt(np.mean(squares)))
+
+
+def spread_lights(count: int) -> np.ndarray:
+    """Return directions (count, 3) that are spread evenly from the camera down to 11 degrees above the horizon."""
+    turn, z = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0)), np.linspace(0.99, 0.2, count)
+    side = np.sqrt(1.0 - z * z)
+    return np.stack([side * np.cos(turn), side * np.sin(turn), z], axis=1)
+
+
 def write_ptm(path: str | Path, numbers: np.ndarray, mask: np.ndarray) -> None:
     """Write a `.ptm` (PTM_FORMAT_LRGB 1.2), black outside the mask.
 

@@ -7,7 +7,7 @@ import pytest
 
 from render.shared.errors import InputError
 from render.shared.imaging.srgb import to_srgb
-from sdps.surface.exports.relightable import (
+from sdps.surface.gloss.relightable import (
     expand_harmonics,
     expand_polynomial,
     fit_pictures,
