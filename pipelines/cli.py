@@ -103,7 +103,7 @@ EVALUATE = Group("score methods on rendered scenes and real photographs, and wri
 COMMANDS: dict[str, Command | Group] = {
     "infer": Command("pipelines.infer", "find normals, lights and a surface in a folder of photographs",
                      example="sdps infer photos --out out/vase\nsdps infer photos --lights lights.lp --mask mask.png"),
-    "export": Command("pipelines.export_result", "write a result for other programs: normal maps, heights, lights, SfMData",
+    "export": Command("pipelines.export_result", "write a result for other programs: normals, heights, lights",
                       example="sdps export out/vase --normals directx\nsdps export out/vase --as height,lp"),
     "app": Command("pipelines.app.app", "serve a local page for photographs, scenes and data", example="sdps app"),
     "doctor": Command("pipelines.doctor", "show what this machine has and what is missing",
