@@ -99,41 +99,48 @@ def fit_materials(surface: Surface) -> Materials:
         raise InputError("the refined reflectance is empty or not finite; run `sdps infer` again")
     shapes = _sample(surface)
     few = slice(None, None, max(1, len(surface.albedo) // _FEW))
-    grey, strength = surface.albedo.mean(axis=1, dtype=np.float64), surface.strength.astype(np.float64)
-    scale = _find_scale(shapes, grey[few], strength[few])
-    off, roughness = _as_dielectric(shapes, grey[few], strength[few], scale)
-    plain = _base_colour(shapes, surface.albedo[few], strength[few], roughness, scale)
-    better = _as_metal(shapes, grey[few], strength[few])[0].mean() < off.mean()
+    grey, strength = _read_part(surface, few)
+    scale = _find_scale(shapes, grey, strength)
+    off, roughness = _as_dielectric(shapes, grey, strength, scale)
+    plain = _base_colour(shapes, surface.albedo[few], strength, roughness, scale)
+    better = _as_metal(shapes, grey, strength)[0].mean() < off.mean()
     if better and np.median(plain.mean(axis=1)) < BLACKEST:
         return _all_metal(shapes, surface)
     scale *= max(1.0, float(np.percentile(plain.max(axis=1), 99)) / BRIGHTEST)
-    parts = [slice(start, start + _PART) for start in range(0, len(grey), _PART)]
-    found = [_fit_part(shapes, surface, some, scale) for some in parts]
-    return Materials(*(np.concatenate(parts).astype(np.float32) for parts in zip(*found, strict=True)), scale)
+    found = [_fit_part(shapes, surface, some, scale) for some in _split(len(surface.albedo))]
+    base, metallic, roughness = (np.concatenate(values) for values in zip(*found, strict=True))
+    return Materials(base, metallic, roughness, scale)
 
 
 def _fit_part(shapes: _Shapes, surface: Surface, some: slice, scale: float) -> tuple[np.ndarray, ...]:
     """Return base colour, metallic and roughness of some pixels, dielectrics or metal."""
-    grey, strength = surface.albedo[some].mean(axis=1, dtype=np.float64), surface.strength[some].astype(np.float64)
+    grey, strength = _read_part(surface, some)
     off, roughness = _as_dielectric(shapes, grey, strength, scale)
     base = _base_colour(shapes, surface.albedo[some], strength, roughness, scale)
     metal_off, metal_roughness, reflected = _as_metal(shapes, grey, strength)
     metal = (reflected > METAL * scale) & (metal_off < off)
     coloured = reflected[:, None] * (surface.gains / surface.gains.max()) / scale
     base = np.where(metal[:, None], coloured, base)
-    return np.clip(base, 0.0, 1.0), metal, np.where(metal, metal_roughness, roughness)
+    found = np.clip(base, 0.0, 1.0), metal, np.where(metal, metal_roughness, roughness)
+    return tuple(values.astype(np.float32) for values in found)
 
 
 def _all_metal(shapes: _Shapes, surface: Surface) -> Materials:
     """Return the materials of an object of metal, whose brightest percent is set to `BRIGHTEST`."""
-    grey, strength = surface.albedo.mean(axis=1, dtype=np.float64), surface.strength.astype(np.float64)
-    parts = [slice(start, start + _PART) for start in range(0, len(grey), _PART)]
-    found = [_as_metal(shapes, grey[some], strength[some])[1:] for some in parts]
-    roughness, reflected = (np.concatenate(values) for values in zip(*found, strict=True))
+    found = [_as_metal(shapes, *_read_part(surface, some))[1:] for some in _split(len(surface.albedo))]
+    roughness, reflected = (np.concatenate(values).astype(np.float32) for values in zip(*found, strict=True))
     scale = max(float(np.percentile(reflected, 99)), 1e-9) / BRIGHTEST
-    base = np.clip(reflected[:, None] * (surface.gains / surface.gains.max()) / scale, 0.0, 1.0)
-    one = np.ones(len(base), np.float32)
-    return Materials(base.astype(np.float32), one, roughness.astype(np.float32), scale)
+    colour = (surface.gains / surface.gains.max() / scale).astype(np.float32)
+    return Materials(np.clip(reflected[:, None] * colour, 0.0, 1.0), np.ones_like(roughness), roughness, scale)
+
+
+def _read_part(surface: Surface, some: slice) -> tuple[np.ndarray, np.ndarray]:
+    """Return the grey albedo and the strength of some pixels, float64."""
+    return surface.albedo[some].mean(axis=1, dtype=np.float64), surface.strength[some].astype(np.float64)
+
+
+def _split(count: int) -> list[slice]:
+    return [slice(start, start + _PART) for start in range(0, count, _PART)]
 
 
 def _sample(surface: Surface) -> _Shapes:

@@ -65,7 +65,7 @@ def write_textured_glb(
     places = _place(surface.vertices / scale, mask.shape, camera, box)
     textured = trimesh.Trimesh(
         vertices=surface.vertices, faces=surface.faces, vertex_normals=np.tile([0.0, 0.0, 1.0], (count, 1)),
-        vertex_attributes={_TANGENTS: np.tile(np.float32([1.0, 0.0, 0.0, 1.0]), (count, 1))},
+        vertex_attributes={_TANGENTS: np.tile(np.array([1, 0, 0, 1], np.float32), (count, 1))},
         visual=TextureVisuals(uv=places, material=_paint(maps, mask, box)), process=False,
     )  # fmt: skip
     data: Any = textured.export(file_type="glb", include_normals=True, tree_postprocessor=_name_tangents)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from saved_results import save_result, sphere
 
 from render.shared.errors import InputError
 from render.shared.imaging.srgb import from_srgb
@@ -18,7 +19,6 @@ from sdps.surface.exports.registry import write_exports
 from sdps.surface.exports.saved_result import SavedLights, SavedResult, read_result
 from sdps.surface.gloss.metallic_roughness import shade_gltf
 from sdps.surface.gloss.relightable import spread_lights
-from tests.support.saved_results import save_result, sphere
 
 LIGHTS = spread_lights(24).astype(np.float32)
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.optimize import nnls
+from sdps_scenes import hemisphere_lights, sphere_normals
 
 from render.shared.errors import InputError
 from sdps.refinement.refine import RefineConfig, refine
@@ -14,7 +15,6 @@ from sdps.surface.gloss.metallic_roughness import (
     reflect_gltf,
     shade_gltf,
 )
-from tests.support.sdps_scenes import hemisphere_lights, sphere_normals
 
 QUICK = RefineConfig(coarse_pixels=400, iterations=250, bounces=0, fine_iterations=0)
 
