@@ -86,8 +86,7 @@ def main(args: argparse.Namespace) -> int:
     with bars(without=("reading", "checks", "refinement")):  # these have their own
         result, said = infer_folder(args)
         made = result.save(args.out)
-        if exports:
-            made += _export(args.out, exports, result.photos)
+        exported = _export(args.out, exports, result.photos) if exports else ""
         page = write_page(args.out / "report.html", result)
     if args.self_test:
         from pipelines.evaluate.self_test import compare
@@ -95,24 +94,27 @@ def main(args: argparse.Namespace) -> int:
         sys.stdout.write(compare(args.folder, result, args.out))
     sys.stdout.write(describe(result.findings[said:]))
     sys.stdout.write(f"{_tell_lamps(result)}\n")
-    sys.stdout.write(f"{result.method}: {result.seconds:.1f} s; {', '.join(path.name for path in made)}\n{page}\n")
+    sys.stdout.write(
+        f"{result.method}: {result.seconds:.1f} s; {', '.join(path.name for path in made)}\n{exported}{page}\n"
+    )
     if result.verdict:
         sys.stdout.write(f"{_MARKS['error']} {result.verdict}\n")
     return 0
 
 
-def _export(folder: Path, names: Sequence[str], photos: "Photographs") -> list[Path]:
-    """Write exports of what was just saved; one that it does not hold is said, and the others are written."""
+def _export(folder: Path, names: Sequence[str], photos: "Photographs") -> str:
+    """Write exports of what was just saved, and say it, one a line; one that the result lacks something for is said."""
     from sdps.surface.exports.registry import write_exports
     from sdps.surface.exports.saved_result import read_result
 
-    result, made = dataclasses.replace(read_result(folder), pictures=photos), list[Path]()
+    result, said = dataclasses.replace(read_result(folder), pictures=photos), []
     for name in names:
         try:
-            made += write_exports(result, [name], folder / FOLDER)
+            made = write_exports(result, [name], folder / FOLDER)
+            said.append(f"{folder / FOLDER / name}: {', '.join(path.name for path in made)}\n")
         except InputError as error:
-            sys.stdout.write(f"! export {name}: {error}\n")
-    return made
+            said.append(f"{_MARKS['warning']}{name} was not exported: {error}\n")
+    return "".join(said)
 
 
 def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:

@@ -25,6 +25,7 @@ import tifffile
 import trimesh
 import yaml
 from PIL import Image
+from saved_results import save_result, sphere
 from textures_support import write_maps
 
 
@@ -401,6 +402,23 @@ def _read_records(folder: Path, path: Path) -> None:
         read_record(path)
 
 
+def _result(folder: Path) -> None:
+    from sdps.core.geometry import Camera
+
+    camera = Camera(40.0)
+    save_result(folder / "result", sphere(15, 6.0, camera), camera=camera, pixel_size=0.5)
+
+
+def _read_result(folder: Path, path: Path) -> None:
+    from sdps.surface.exports.registry import EXPORTS, write_exports
+    from sdps.surface.exports.saved_result import read_result
+
+    try:
+        write_exports(read_result(folder / "result"), EXPORTS, folder / "exports")
+    finally:
+        shutil.rmtree(folder / "exports", ignore_errors=True)
+
+
 def _read_cache(folder: Path, path: Path) -> None:
     from sdps.data.scene_store import SceneStore
 
@@ -447,6 +465,7 @@ TARGETS: dict[str, Target] = {
     "DiLiGenT trees": Target(_diligent, _read_tree, "tree/**/*.*"),
     "command lines": Target(_command_lines, _read_command_line, "*.argv"),
     "records": Target(_records, _read_records, "**/*.json"),
+    "saved results": Target(_result, _read_result, "result/*"),
     "training cache": Target(_cache, _read_cache, "**/*.npy"),
 }
 SLOW = ("data folders", "PS-FCN trees", "DiLiGenT trees", "model cards", "folders the app shows")

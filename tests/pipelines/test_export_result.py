@@ -53,7 +53,7 @@ def test_infer_exports_what_it_saved_and_says_what_it_cannot(tmp_path: Path, cap
     flags = ["--method", "pf14", "--export", "meshroom,lp,ptm", "--normals", "opengl", "--out", str(out)]
     assert main(["infer", str(photos), *flags]) == 0
     said = capsys.readouterr().out
-    assert "! export meshroom: " in said and "again with --focal" in said
+    assert "! meshroom was not exported: " in said and "again with --focal" in said
     assert (out / "exports" / "lp" / "lights.lp").is_file()
     assert (out / "exports" / "normals-opengl" / "normal.png").is_file()
     told = json.loads((out / "exports" / "ptm" / "ptm.json").read_text())

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from sdps.inference.image_source import ImageSource
 
 _AGAIN = "run `sdps infer` again"
+_UNIT = 1.001
+_MOST = 1e9  # of any number; more is in a damaged file
 RESULT = "result.json"
 
 
@@ -72,8 +74,10 @@ class SavedResult:
         for name, array, wanted in (("normal.npy", self.normals, (*shape, 3)), ("depth.npy", self.depth, shape)):
             if array.shape != wanted:
                 raise InputError(f"{self.folder / name}: is {array.shape}, where mask.png wants {wanted}; {_AGAIN}")
-            if not np.isfinite(array).all():
+            if not np.abs(array).max(initial=0.0) < _MOST:
                 raise InputError(f"{self.folder / name}: has values that are not finite; {_AGAIN}")
+        if np.abs(self.normals).max(initial=0.0) > _UNIT:
+            raise InputError(f"{self.folder / 'normal.npy'}: has vectors longer than 1; {_AGAIN}")
         if not self.mask.any():
             raise InputError(f"{self.folder / 'mask.png'}: is empty; {_AGAIN}")
 
@@ -119,6 +123,8 @@ class SavedResult:
         array = _read_array(path)
         if array.shape[:2] != self.shape:
             raise InputError(f"{path}: is {array.shape}, where mask.png is {self.shape}; {_AGAIN}")
+        if not np.abs(array).max(initial=0.0) < _MOST:
+            raise InputError(f"{path}: has values that are not finite; {_AGAIN}")
         return array
 
 
@@ -146,7 +152,7 @@ def _read_scale(path: Path, facts: dict[str, Any]) -> tuple[float | None, Camera
     """Return millimetres per pixel, None where they are not known, and the camera of result.json."""
     try:
         size, known = facts.get("pixel_size"), facts.get("camera_pixels")
-        if size is not None and not 0.0 < float(size) < np.inf:
+        if size is not None and not 1.0 / _MOST < float(size) < _MOST:
             raise ValueError(f"pixel_size {size}")
         if known is None:
             if not str(facts.get("camera", "orthographic")).startswith("orthographic"):
