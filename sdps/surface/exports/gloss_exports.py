@@ -13,7 +13,7 @@ from sdps.photos.response import display
 from sdps.refinement.reflectance import shade
 from sdps.surface.exports.map_files import write_picture
 from sdps.surface.exports.saved_result import SavedResult
-from sdps.surface.gloss.fitted_gloss import BRIGHTEST, Materials, Surface, fit_materials
+from sdps.surface.gloss.fitted_gloss import BRIGHTEST, Materials, Surface, fit_materials, match_photographs
 from sdps.surface.gloss.relightable import (
     HARMONICS,
     expand_harmonics,
@@ -100,7 +100,10 @@ def read_surface(result: SavedResult) -> Surface:
 
 def _make_maps(result: SavedResult) -> tuple[Maps, Materials]:
     """Return the pictures of a result, and the materials of its pixels."""
-    found = fit_materials(read_surface(result))
+    surface = read_surface(result)
+    found = fit_materials(surface)
+    if result.lights is not None:
+        found = match_photographs(found, surface, result.normals[result.mask], result.lights.directions)
     pictures = [np.zeros((*result.shape, *part.shape[1:]), np.float32) for part in found[:3]]
     for picture, part in zip(pictures, found[:3], strict=True):
         picture[result.mask] = part

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.shared.errors import InputError
-from sdps.refinement.reflectance import evaluate_body, evaluate_factor, evaluate_lobes, measure_angles
+from sdps.refinement.reflectance import evaluate_body, evaluate_factor, evaluate_lobes, measure_angles, shade
 from sdps.surface.gloss.metallic_roughness import (
     DIELECTRIC,
     evaluate_fresnel,
@@ -41,6 +41,7 @@ _VIEWS = (0.98, 0.9, 0.75, 0.55)  # n . v
 _TRIED, _FIRST, _LAST = 160, 0.02, 5000.0  # scales, relative to photographs of mean 1
 _FEW, _PART = 2000, 2**14
 _FLOOR = 0.05
+_MOST_LIGHTS = 32
 
 
 class Surface(NamedTuple):
@@ -191,6 +192,44 @@ def _as_dielectric(
     both = np.outer(grey, apart.dielectric @ apart.body) + np.outer(strength, apart.dielectric @ apart.lobes)  # (n, R)
     off = scale**2 * (apart.dielectric**2).sum(axis=1) - 2 * scale * both
     return off.min(axis=1) + _multiply(grey, strength, apart.body, apart.lobes), _at_least(off)
+
+
+def match_photographs(found: Materials, surface: Surface, normals: np.ndarray, lights: np.ndarray) -> Materials:
+    """Return materials whose base colour makes them, under the photographs' lights, most like the refined surface.
+
+    Elsewhere a highlight that no photograph saw would count as much as what all of them saw.
+
+    Args:
+        found: Of `fit_materials`.
+        surface: What it was fitted to.
+        normals: (n, 3) unit, in the camera's frame.
+        lights: (L, 3) unit, from the surface to the light.
+    """
+    lights = lights[:: -(-len(lights) // _MOST_LIGHTS)]
+    parts = [_match_part(found, surface, normals, lights, some) for some in _split(len(normals))]
+    base, scale = np.concatenate(parts), found.scale
+    if found.metallic.all():
+        share = max(float(np.percentile(base.max(axis=1), 99)), 1e-9) / BRIGHTEST
+        base, scale = base / share, scale * share
+    return found._replace(base=np.clip(base, 0.0, 1.0).astype(np.float32), scale=scale)
+
+
+def _match_part(
+    found: Materials, surface: Surface, normals: np.ndarray, lights: np.ndarray, some: slice
+) -> np.ndarray:  # (n, 3)
+    """Return the base colour of some pixels by least squares; radiance is linear in it."""
+    metallic, roughness = found.metallic[some, None], found.roughness[some, None].astype(np.float64)
+    own = surface._replace(albedo=surface.albedo[some], strength=surface.strength[some])
+    wanted = shade(normals[some], lights.astype(np.float32), own) / found.scale  # (n, 3, L)
+    wanted *= np.where(metallic > 0, surface.gains / surface.gains.max(), 1.0)[..., None]
+    cosines = measure_cosines(normals[some, None], lights)
+    lit = np.clip(normals[some] @ lights.T, 0.0, None)
+    fresnel, mirror = evaluate_fresnel(cosines), evaluate_highlight(cosines, roughness) * lit
+    f0 = np.where(metallic > 0, 0.0, DIELECTRIC)
+    fixed = (f0 + (1.0 - f0) * fresnel) * mirror
+    moves = np.where(metallic > 0, (1.0 - fresnel) * mirror, (1.0 - f0) * (1.0 - fresnel) * lit)  # times base
+    left = ((wanted - fixed[:, None]) * moves[:, None]).sum(axis=-1)
+    return np.maximum(left / np.maximum((moves**2).sum(axis=1), 1e-9)[:, None], 0.0)
 
 
 def _as_metal(shapes: _Shapes, grey: np.ndarray, strength: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from sdps_scenes import hemisphere_lights, sphere_normals
 from render.shared.errors import InputError
 from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.reflectance import LOBES, MODES, SHAPES
-from sdps.surface.gloss.fitted_gloss import BRIGHTEST, Materials, Surface, fit_materials
+from sdps.surface.gloss.fitted_gloss import BRIGHTEST, Materials, Surface, fit_materials, match_photographs
 from sdps.surface.gloss.metallic_roughness import (
     evaluate_highlight,
     measure_cosines,
@@ -70,6 +70,16 @@ def test_without_highlights_the_brightest_is_nearly_white_and_rough() -> None:
     assert found.base[0] == pytest.approx(BRIGHTEST * np.array([1.0, 2 / 3, 1 / 3]), rel=0.1)
     assert found.roughness.min() > 0.9
     assert found.metallic.max() == 0.0
+
+
+def test_base_colour_follows_what_the_lights_of_the_photographs_show() -> None:
+    """Of a dull metal whose colour is in its body too, lights far from the highlight show the body alone."""
+    shining = surface(np.array([[0.6, 0.02, 0.02]]), np.array([4.0]), 0.4)._replace(gains=np.ones(3))
+    found = Materials(np.zeros((1, 3)), np.ones(1), np.full(1, 0.4), 1.0)
+    front, aside = np.array([[0.0, 0.0, 1.0]]), np.array([[0.9, 0.0, np.sqrt(0.19)], [-0.9, 0.0, np.sqrt(0.19)]])
+    red, grey = (match_photographs(found, shining, front, lights).base[0] for lights in (aside, front))
+    assert red[0] > 2.0 * red[1]
+    assert grey[0] < 1.2 * grey[1]
 
 
 def test_a_reflectance_that_is_not_finite_is_refused() -> None:
