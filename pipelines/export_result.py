@@ -50,6 +50,8 @@ def choose_exports(names: str | None, normals: str | None) -> tuple[str, ...]:
     Raises:
         InputError: an unknown one, with the nearest.
     """
+    if names is None and normals is None:  # most runs of `infer`: nothing is loaded for them
+        return ()
     from sdps.surface.exports.normal_maps import CONVENTIONS
     from sdps.surface.exports.registry import split_names
 

@@ -41,7 +41,7 @@ class Convention:
 
 
 OPENGL = Convention("Blender, Substance, Houdini, glTF, RelightLab", (1, 1, 1), (1, 1, 1), _FLAT, tangent=True)
-CAMERA = Convention("our frame, the vectors as they are", (1, 1, 1), (1, 1, 1), _NOTHING)
+CAMERA = Convention("your own code (x right, y up, z to the camera)", (1, 1, 1), (1, 1, 1), _NOTHING)
 ALICEVISION = Convention("AliceVision, Meshroom", (1, 1, 1), (1, -1, -1), _NOTHING)
 CONVENTIONS = {
     "opengl": OPENGL,
