@@ -107,7 +107,8 @@ def _make_maps(result: SavedResult) -> tuple[Maps, Materials]:
     pictures = [np.zeros((*result.shape, *part.shape[1:]), np.float32) for part in found[:3]]
     for picture, part in zip(pictures, found[:3], strict=True):
         picture[result.mask] = part
-    return Maps(*pictures, result.normals), found
+    base, metallic, roughness = pictures
+    return Maps(base, metallic, roughness, result.normals), found
 
 
 def _describe(result: SavedResult, found: Materials) -> dict[str, Any]:
