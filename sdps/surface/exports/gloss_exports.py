@@ -10,7 +10,7 @@ from render.shared.errors import InputError
 from render.shared.files import write_json
 from render.shared.images import quantise
 from sdps.photos.response import display
-from sdps.refinement.reflectance import shade
+from sdps.refinement.reflectance import MODES, SHAPES, shade
 from sdps.surface.exports.map_files import write_picture
 from sdps.surface.exports.saved_result import SavedResult
 from sdps.surface.gloss.fitted_gloss import BRIGHTEST, Materials, Surface, fit_materials, match_photographs
@@ -88,14 +88,27 @@ def read_surface(result: SavedResult) -> Surface:
             f"{result.folder}: nothing was refined, so how it shines is not known; run `sdps infer --refine` again"
         )
     try:
-        shapes = [facts["body"], facts["modes"], facts["lobes"]["amplitudes"], facts["lobes"]["sharpness"]]
-        numbers = [np.array(values, np.float64) for values in (*shapes, facts["channels"])]
+        lobes = facts["lobes"]
+        body, modes, amplitudes, sharpness, gains = (
+            np.array(values, np.float64)
+            for values in (facts["body"], facts["modes"], lobes["amplitudes"], lobes["sharpness"], facts["channels"])
+        )
+        if (body.shape, modes.shape, gains.shape) != ((SHAPES,), (MODES,), (3,)) or not gains.min() > 0.0:
+            raise ValueError("numbers of another model")
+        if amplitudes.ndim != 1 or amplitudes.shape != sharpness.shape:
+            raise ValueError("lobes without sharpness")
+        if albedo.shape != (*result.shape, 3) or strength.size != result.mask.size:
+            raise ValueError(f"albedo {albedo.shape} and highlights {strength.shape} of a picture {result.shape}")
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{result.folder / 'result.json'}: its reflectance is of an earlier version or damaged ({error}); "
             "run `sdps infer` again"
         ) from error
-    return Surface(albedo[result.mask], strength.reshape(result.shape)[result.mask], *numbers)
+    strength = strength.reshape(result.shape)[result.mask]
+    found = Surface(albedo[result.mask], strength, body, modes, amplitudes, sharpness, gains)
+    if not all(np.isfinite(part).all() for part in found):
+        raise InputError(f"{result.folder}: its reflectance is not finite; run `sdps infer` again")
+    return found
 
 
 def _make_maps(result: SavedResult) -> tuple[Maps, Materials]:

@@ -94,10 +94,10 @@ def fit_materials(surface: Surface) -> Materials:
     """Return the materials that reflect most like a refined surface.
 
     Raises:
-        InputError: no pixels, or values that are not finite.
+        InputError: no pixels.
     """
-    if not len(surface.albedo) or not all(np.isfinite(part).all() for part in surface):
-        raise InputError("the refined reflectance is empty or not finite; run `sdps infer` again")
+    if not len(surface.albedo):
+        raise InputError("the refined reflectance has no pixels; run `sdps infer` again")
     shapes = _sample(surface)
     few = slice(None, None, max(1, len(surface.albedo) // _FEW))
     grey, strength = _read_part(surface, few)

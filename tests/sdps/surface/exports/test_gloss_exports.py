@@ -13,7 +13,7 @@ from saved_results import save_result, sphere
 from render.shared.errors import InputError
 from render.shared.imaging.srgb import from_srgb
 from sdps.core.geometry import ORTHOGRAPHIC, Camera
-from sdps.refinement.reflectance import MODES, SHAPES, shade
+from sdps.refinement.reflectance import SHAPES, shade
 from sdps.surface.exports.gloss_exports import read_surface
 from sdps.surface.exports.registry import write_exports
 from sdps.surface.exports.saved_result import SavedLights, SavedResult, read_result
@@ -30,12 +30,6 @@ def refined_result(folder: Path, camera: Camera = ORTHOGRAPHIC) -> SavedResult:
     albedo = np.where(normals[..., :1] < 0.0, [1.8, 0.8, 0.4], [0.4, 0.8, 1.8]) * mask[..., None]
     np.save(folder / "albedo.npy", albedo.astype(np.float32))
     np.save(folder / "highlights.npy", mask.astype(np.float32))
-    facts = json.loads((folder / "result.json").read_text())
-    facts["refined"] = {
-        "body": [0.0] * SHAPES, "modes": [0.0] * MODES, "channels": [1.0, 1.0, 1.0], "doubt": "",
-        "lobes": {"amplitudes": [1.2, 0.8, 0.15], "sharpness": [200.0, 80.0, 30.0]},
-    }  # fmt: skip
-    (folder / "result.json").write_text(json.dumps(facts))
     return read_result(folder)
 
 
@@ -121,11 +115,22 @@ def test_relightable_files_are_of_the_photographs_or_else_relit(tmp_path: Path, 
 @pytest.mark.parametrize("name", ["materials", "gltf", "ptm"])
 def test_what_was_not_refined_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match=r"nothing was refined.*sdps infer --refine"):
-        write_exports(save_result(tmp_path), [name], tmp_path / "out")
+        write_exports(save_result(tmp_path, albedo=False), [name], tmp_path / "out")
 
 
-def test_a_result_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("part", ["channels", "body", "modes"])
+@pytest.mark.parametrize("value", [None, [1.0], "words", [[1.0, 2.0, 3.0]], {}, [0.0, 0.0, 0.0]])
+def test_a_reflectance_that_is_damaged_or_of_an_earlier_version_is_refused(
+    tmp_path: Path, part: str, value: object
+) -> None:
     result = refined_result(tmp_path)
-    del result.facts["refined"]["channels"]
+    result.facts["refined"][part] = value
     with pytest.raises(InputError, match=r"result\.json: its reflectance is of an earlier version"):
         write_exports(result, ["materials"], tmp_path / "out")
+
+
+def test_a_reflectance_that_is_not_finite_is_refused(tmp_path: Path) -> None:
+    result = refined_result(tmp_path)
+    result.facts["refined"]["body"] = [float("nan")] * SHAPES
+    with pytest.raises(InputError, match="not finite"):
+        write_exports(result, ["rti"], tmp_path / "out")
