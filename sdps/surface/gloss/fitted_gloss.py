@@ -101,22 +101,23 @@ def fit_materials(surface: Surface) -> Materials:
     shapes = _sample(surface)
     few = slice(None, None, max(1, len(surface.albedo) // _FEW))
     grey, strength = _read_part(surface, few)
-    scale = _find_scale(shapes, grey, strength)
-    off, roughness = _as_dielectric(shapes, grey, strength, scale)
+    apart = _apart_from_matt(shapes)
+    scale = _find_scale(apart, grey, strength)
+    off, roughness = _as_dielectric(apart, grey, strength, scale)
     plain = _base_colour(shapes, surface.albedo[few], strength, roughness, scale)
     better = _as_metal(shapes, grey, strength)[0].mean() < off.mean()
     if better and np.median(plain.mean(axis=1)) < BLACKEST:
         return _all_metal(shapes, surface)
     scale *= max(1.0, float(np.percentile(plain.max(axis=1), 99)) / BRIGHTEST)
-    found = [_fit_part(shapes, surface, some, scale) for some in _split(len(surface.albedo))]
+    found = [_fit_part(shapes, apart, surface, some, scale) for some in _split(len(surface.albedo))]
     base, metallic, roughness = (np.concatenate(values) for values in zip(*found, strict=True))
     return Materials(base, metallic, roughness, scale)
 
 
-def _fit_part(shapes: _Shapes, surface: Surface, some: slice, scale: float) -> tuple[np.ndarray, ...]:
+def _fit_part(shapes: _Shapes, apart: _Shapes, surface: Surface, some: slice, scale: float) -> tuple[np.ndarray, ...]:
     """Return base colour, metallic and roughness of some pixels, dielectrics or metal."""
     grey, strength = _read_part(surface, some)
-    off, roughness = _as_dielectric(shapes, grey, strength, scale)
+    off, roughness = _as_dielectric(apart, grey, strength, scale)
     base = _base_colour(shapes, surface.albedo[some], strength, roughness, scale)
     metal_off, metal_roughness, reflected = _as_metal(shapes, grey, strength)
     metal = (reflected > METAL * scale) & (metal_off < off)
@@ -177,22 +178,20 @@ def _directions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.concatenate(normals), np.concatenate(lights), np.concatenate(weights)
 
 
-def _find_scale(shapes: _Shapes, grey: np.ndarray, strength: np.ndarray) -> float:
+def _find_scale(apart: _Shapes, grey: np.ndarray, strength: np.ndarray) -> float:
     """Return the scale that explains the highlights of most pixels as those of dielectrics."""
     tried = np.geomspace(_FIRST, _LAST, _TRIED)
-    apart = _apart_from_matt(shapes)
     wanted = _multiply(grey, strength, apart.body, apart.lobes)
     wanted += _FLOOR * wanted.mean() + 1e-12  # pixels count the same, but for those that hardly shine
-    shares = (_as_dielectric(shapes, grey, strength, scale)[0] / wanted for scale in tried)
+    shares = (_as_dielectric(apart, grey, strength, scale)[0] / wanted for scale in tried)
     off = [np.sqrt(np.maximum(share, 0.0)).mean() for share in shares]  # not squared: an inlay must not decide
     return float(tried[int(np.argmin(off))])
 
 
 def _as_dielectric(
-    shapes: _Shapes, grey: np.ndarray, strength: np.ndarray, scale: float
+    apart: _Shapes, grey: np.ndarray, strength: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the squares that the best dielectric leaves of each pixel, and its roughness; base is whatever fits."""
-    apart = _apart_from_matt(shapes)
     both = np.outer(grey, apart.dielectric @ apart.body) + np.outer(strength, apart.dielectric @ apart.lobes)  # (n, R)
     off = scale**2 * (apart.dielectric**2).sum(axis=1) - 2 * scale * both
     return off.min(axis=1) + _multiply(grey, strength, apart.body, apart.lobes), _at_least(off)
