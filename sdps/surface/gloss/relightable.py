@@ -26,7 +26,7 @@ HARMONICS = (4, 9)
 _STEADY = 1e-3
 """Ridge, as a share of the lights: what lights do not determine stays small."""
 _OUTLIERS = 0.02  # percent of the numbers at either end that may be clipped to a byte's range
-_FULL = 255.0
+_FULL, _FEW, _PART = 255.0, 2**20, 2**18
 
 
 def expand_polynomial(directions: np.ndarray) -> np.ndarray:
@@ -71,10 +71,11 @@ def fit_pictures(pictures: Iterable[np.ndarray], basis: np.ndarray) -> np.ndarra
     solution = np.linalg.solve(basis.T @ basis + ridge, basis.T).astype(np.float32)  # (K, L)
     found = None
     for number, picture in enumerate(pictures):
-        shown = to_srgb(np.clip(picture, 0.0, 1.0)).astype(np.float32)
-        found = np.zeros((terms, *shown.shape), np.float32) if found is None else found
-        for term in range(terms):
-            found[term] += solution[term, number] * shown
+        found = np.zeros((terms, *picture.shape), np.float32) if found is None else found
+        for some in _split(len(picture)):
+            shown = to_srgb(picture[some].astype(np.float32, copy=False))
+            for term in range(terms):
+                found[term, some] += solution[term, number] * shown
     if found is None:
         raise InputError("a relightable picture needs pictures")
     return found
@@ -85,8 +86,9 @@ def measure_error(pictures: Iterable[np.ndarray], basis: np.ndarray, numbers: np
 
     Arguments as of `fit_pictures`, and what it returned.
     """
+    few = slice(None, None, max(1, numbers.shape[1] // _PART))
     squares = [
-        float(((np.tensordot(row, numbers, 1).clip(0.0, 1.0) - to_srgb(picture)) ** 2).mean())
+        float(((np.tensordot(row, numbers[:, few], 1).clip(0.0, 1.0) - to_srgb(picture[few])) ** 2).mean())
         for row, picture in zip(basis.astype(np.float32), pictures, strict=True)
     ]
     return float(np.sqrt(np.mean(squares)))
@@ -107,22 +109,24 @@ def write_ptm(path: str | Path, numbers: np.ndarray, mask: np.ndarray) -> None:
         numbers: (6, n, 3) of `fit_pictures` with `expand_polynomial`, for the mask's pixels.
         mask: (H, W) bool.
     """
-    mean = np.maximum(_mean_shown(numbers), 1e-6)  # (n, 3)
-    colour = mean / mean.max(axis=1, keepdims=True)
-    grey = _FULL * (numbers * colour).sum(axis=2) / (colour**2).sum(axis=1)  # (6, n): a pixel's colours, projected
+    colour, grey = np.empty_like(numbers[0]), np.empty(numbers.shape[:2], np.float32)  # (n, 3), (6, n)
+    for some in _split(len(colour)):
+        mean = np.maximum(_mean_shown(numbers[:, some]), 1e-6)
+        colour[some] = mean / mean.max(axis=1, keepdims=True)
+        grey[:, some] = _FULL * (numbers[:, some] * colour[some]).sum(axis=2) / (colour[some] ** 2).sum(axis=1)
     low, high = _ranges(grey)
     scale = np.maximum(high - low, 1e-3) / _FULL
     bias = np.rint(-low / scale)
     head = f"PTM_1.2\nPTM_FORMAT_LRGB\n{mask.shape[1]}\n{mask.shape[0]}\n"
     head += " ".join(f"{value:.7g}" for value in scale) + "\n" + " ".join(f"{value:.0f}" for value in bias) + "\n"
     scale = np.array([float(f"{value:.7g}") for value in scale])
-    bytes_of = np.clip(np.rint(grey / scale[:, None] + bias[:, None]), 0, 255).astype(np.uint8)
-    black = np.append(bias, [0, 0, 0]).astype(np.uint8)
-    whole = np.broadcast_to(black, (*mask.shape, 9)).copy()
-    whole[mask] = np.concatenate([bytes_of.T, np.rint(_FULL * colour).astype(np.uint8)], axis=1)
-    whole = whole[::-1]
-    with atomic_path(Path(path)) as temporary:
-        temporary.write_bytes(head.encode() + whole[..., :6].tobytes() + whole[..., 6:].tobytes())
+    whole = np.zeros((*mask.shape, 9), np.uint8)
+    whole[..., :6] = bias.astype(np.uint8)
+    places, flat = np.flatnonzero(mask), whole.reshape(-1, 9)
+    for some in _split(len(places)):
+        flat[places[some], :POLYNOMIAL] = _to_bytes(grey[:, some].T / scale + bias)
+        flat[places[some], POLYNOMIAL:] = _to_bytes(_FULL * colour[some])
+    _write(path, head.encode(), whole[::-1, :, :POLYNOMIAL], whole[::-1, :, POLYNOMIAL:])
 
 
 def write_rti(path: str | Path, numbers: np.ndarray, mask: np.ndarray) -> None:
@@ -137,12 +141,12 @@ def write_rti(path: str | Path, numbers: np.ndarray, mask: np.ndarray) -> None:
     low, high = _ranges(numbers.reshape(terms, -1))
     scale, bias = np.maximum(high - low, 1e-6).astype("<f4"), low.astype("<f4")
     head = f"#HSH1.2\n3\n{mask.shape[1]} {mask.shape[0]} 3\n{terms} 2 1\n".encode()
-    zero = np.clip(np.rint(-_FULL * bias / scale), 0, 255).astype(np.uint8)
+    zero = _to_bytes(-_FULL * bias / scale)
     whole = np.broadcast_to(zero, (*mask.shape, 3, terms)).copy()
-    share = (np.moveaxis(numbers, 0, -1) - bias) / scale  # (n, 3, K)
-    whole[mask] = np.clip(np.rint(_FULL * share), 0, 255).astype(np.uint8)
-    with atomic_path(Path(path)) as temporary:
-        temporary.write_bytes(head + scale.tobytes() + bias.tobytes() + whole.tobytes())
+    places, flat = np.flatnonzero(mask), whole.reshape(-1, 3, terms)
+    for some in _split(len(places)):
+        flat[places[some]] = _to_bytes(_FULL * (np.moveaxis(numbers[:, some], 0, -1) - bias) / scale)
+    _write(path, head, scale, bias, whole)
 
 
 def _mean_shown(numbers: np.ndarray) -> np.ndarray:  # (n, 3)
@@ -155,5 +159,21 @@ def _mean_shown(numbers: np.ndarray) -> np.ndarray:  # (n, 3)
 
 def _ranges(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the least and the greatest of each row of numbers (K, m), but for outliers; 0 is between them."""
-    low, high = np.percentile(numbers, [_OUTLIERS, 100.0 - _OUTLIERS], axis=1)
+    found = [np.percentile(row[:: max(1, len(row) // _FEW)], [_OUTLIERS, 100.0 - _OUTLIERS]) for row in numbers]
+    low, high = np.transpose(found)
     return np.minimum(low, 0.0), np.maximum(high, 0.0)
+
+
+def _write(path: str | Path, head: bytes, *parts: np.ndarray) -> None:
+    with atomic_path(Path(path)) as temporary, temporary.open("wb") as handle:
+        handle.write(head)
+        for part in parts:
+            handle.write(np.ascontiguousarray(part).data)
+
+
+def _to_bytes(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def _split(count: int) -> list[slice]:
+    return [slice(start, start + _PART) for start in range(0, count, _PART)]

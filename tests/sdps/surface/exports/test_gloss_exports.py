@@ -14,6 +14,7 @@ from render.shared.errors import InputError
 from render.shared.imaging.srgb import from_srgb
 from sdps.core.geometry import ORTHOGRAPHIC, Camera
 from sdps.refinement.reflectance import SHAPES, shade
+from sdps.surface.exports import gloss_exports
 from sdps.surface.exports.gloss_exports import read_surface
 from sdps.surface.exports.registry import write_exports
 from sdps.surface.exports.saved_result import SavedLights, SavedResult, read_result
@@ -110,6 +111,18 @@ def test_relightable_files_are_of_the_photographs_or_else_relit(tmp_path: Path, 
     assert relit["of"].startswith("refined reflectance")
     assert (seen["of"], seen["lights"]) == ("photographs", len(LIGHTS))
     assert max(relit["rms_error"], seen["rms_error"]) < 0.1
+
+
+@pytest.mark.parametrize("seen", [False, True])
+def test_large_relightable_pictures_are_thinned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seen: bool) -> None:
+    result = refined_result(tmp_path)
+    monkeypatch.setattr(gloss_exports, "MOST_PIXELS", result.mask.sum() // 3)
+    if seen:
+        lights = SavedLights(tuple(map(str, range(len(LIGHTS)))), LIGHTS, np.ones(len(LIGHTS), np.float32))
+        result = replace(result, lights=lights, pictures=photographs(result))
+    path, about = write_exports(result, ["ptm"], tmp_path / "out")
+    assert path.read_bytes().split(b"\n")[2:4] == [b"31", b"31"]
+    assert json.loads(about.read_text())["every"] == 2
 
 
 @pytest.mark.parametrize("name", ["materials", "gltf", "ptm"])
