@@ -145,7 +145,7 @@ def _describe(result: SavedResult, found: Materials) -> dict[str, Any]:
 
 
 def _photographed(result: SavedResult, chosen: np.ndarray) -> tuple[str, np.ndarray, Pictures]:
-    """Return what is fitted, lights (L, 3), and what yields the photographs' chosen pixels (n, 3) under equal lights."""
+    """Return what is fitted, lights (L, 3), and what yields chosen pixels (n, 3) under equal lights."""
     if result.lights is None or not len(result.lights.directions):
         raise InputError(f"{result.folder}: no lights were found; use a method that finds them")
     known, source = result.lights, result.pictures
