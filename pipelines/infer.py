@@ -1,6 +1,7 @@
 """`sdps infer`: a folder of photographs under moving light in, normals, lights, depth, meshes and a page out."""
 
 import argparse
+import dataclasses
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -85,7 +86,7 @@ def main(args: argparse.Namespace) -> int:
     with bars(without=("reading", "checks", "refinement")):  # these have their own
         result, said = infer_folder(args)
         made = result.save(args.out)
-        exported = _export(args.out, exports) if exports else ""
+        exported = _export(args.out, exports, result.photos) if exports else ""
         page = write_page(args.out / "report.html", result)
     if args.self_test:
         from pipelines.evaluate.self_test import compare
@@ -101,12 +102,12 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _export(folder: Path, names: Sequence[str]) -> str:
+def _export(folder: Path, names: Sequence[str], photos: "Photographs") -> str:
     """Write exports of what was just saved, and say it, one a line; one that the result lacks something for is said."""
     from sdps.surface.exports.registry import write_exports
     from sdps.surface.exports.saved_result import read_result
 
-    result, said = read_result(folder), []
+    result, said = dataclasses.replace(read_result(folder), pictures=photos), []
     for name in names:
         try:
             made = write_exports(result, [name], folder / FOLDER)

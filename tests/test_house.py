@@ -27,7 +27,7 @@ FOLDERS = [
         "core", "data", "data.resident", "models", "training", "publishing", "inference", "refinement",
         "classical.common", "classical", "methods.fusion", "methods", "photos.light_files", "photos.pictures",
         "photos.analysis", "photos",
-        "surface", "surface.exports",
+        "surface", "surface.gloss", "surface.exports",
     )),
     "sdps",
     *(f"pipelines.{name}" for name in (

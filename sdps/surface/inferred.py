@@ -333,6 +333,7 @@ def _about_refined(found: RefinedEstimate, photos: Photographs) -> dict[str, Any
         "unexplained": [name for name, value in zip(photos.files, residual, strict=True) if value > limit],
         "body": refined.body.round(4).tolist(),
         "modes": refined.modes.round(4).tolist(),
+        "channels": refined.intensities.mean(axis=0).round(4).tolist(),
         "lobes": {"amplitudes": refined.amplitudes.round(4).tolist(), "sharpness": refined.sharpness.round(1).tolist()},
     }
 

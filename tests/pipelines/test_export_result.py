@@ -1,5 +1,6 @@
 """`sdps export` and the flags of `sdps infer` that do the same."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +50,14 @@ def test_infer_exports_what_it_saved_and_says_what_it_cannot(tmp_path: Path, cap
     lights = np.stack([0.6 * np.cos(ring), 0.6 * np.sin(ring), np.full(8, 0.8)], axis=-1)
     images, mask = folders.matte(lights, size=40)
     photos, out = folders.write_folder(tmp_path / "photos", images, mask), tmp_path / "out"
-    flags = ["--method", "pf14", "--export", "meshroom,lp", "--normals", "opengl", "--out", str(out)]
+    flags = ["--method", "pf14", "--export", "meshroom,lp,ptm", "--normals", "opengl", "--out", str(out)]
     assert main(["infer", str(photos), *flags]) == 0
     said = capsys.readouterr().out
     assert "! meshroom was not exported: " in said and "again with --focal" in said
     assert (out / "exports" / "lp" / "lights.lp").is_file()
     assert (out / "exports" / "normals-opengl" / "normal.png").is_file()
+    told = json.loads((out / "exports" / "ptm" / "ptm.json").read_text())
+    assert (told["of"], told["lights"]) == ("photographs", 8)
+    assert told["rms_error"] < 0.06
     assert main(["infer", str(photos), "--export", "nonsense", "--out", str(tmp_path / "none")]) == 2
     assert not (tmp_path / "none").exists()

@@ -8,11 +8,18 @@ from render.shared.files import write_json
 from render.shared.images import write_png
 from sdps.core.geometry import ORTHOGRAPHIC, Camera
 from sdps.photos.light_files import write_lights
+from sdps.refinement.reflectance import MODES, SHAPES
 from sdps.surface.exports.saved_result import SavedResult, read_result
 
 NAMES = ("a 1.png", "b.png", "c.png", "d.png")
 LIGHTS = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [-0.48, -0.36, 0.8], [0.0, 0.0, 1.0]])
 GAINS = np.array([[1.0, 0.9, 0.8], [1.1, 1.0, 0.9], [0.7, 0.7, 0.6], [1.3, 1.2, 1.1]])
+
+REFINED = {
+    "body": [0.0] * SHAPES, "modes": [0.0] * MODES, "channels": [1.0, 1.0, 1.0], "doubt": "",
+    "lobes": {"amplitudes": [1.2, 0.8, 0.15], "sharpness": [200.0, 80.0, 30.0]},
+}  # fmt: skip
+"""A highlight of roughness about 0.35."""
 
 
 def sphere(size: int = 61, radius: float = 24.0, camera: Camera = ORTHOGRAPHIC):
@@ -39,7 +46,7 @@ def save_result(
     nearness: np.ndarray | None = None,
     albedo: bool = True,
 ) -> SavedResult:
-    """Write a result of a surface, by default a sphere, and read it."""
+    """Write a result of a surface, by default a sphere, and read it; with `albedo`, a refined one."""
     normals, mask, z = surface or sphere(camera=camera)
     folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / "normal.npy", normals)
@@ -47,11 +54,13 @@ def save_result(
     if albedo:
         painted = np.stack([0.2 + 0.6 * mask, 0.5 * mask, 0.4 * mask], axis=-1)
         np.save(folder / "albedo.npy", painted.astype(np.float32))
+        np.save(folder / "highlights.npy", 0.4 * mask.astype(np.float32))
     write_png(folder / "mask.png", mask.astype(np.uint8) * 255)
     write_lights(folder / "lights.json", NAMES, LIGHTS, GAINS, nearness)
-    facts = {"camera": "orthographic, looking along -z"}
+    facts: dict[str, object] = {"camera": "orthographic, looking along -z"}
     if camera.is_perspective:
         numbers = {"focal": camera.focal, "principal": list(camera.middle(mask.shape))}
         facts = {"camera": "perspective, given", "camera_pixels": numbers}
-    write_json(folder / "result.json", facts | ({"pixel_size": pixel_size} if pixel_size else {}))
+    facts |= ({"refined": REFINED} if albedo else {}) | ({"pixel_size": pixel_size} if pixel_size else {})
+    write_json(folder / "result.json", facts)
     return read_result(folder)

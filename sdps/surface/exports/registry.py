@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from render.shared.errors import InputError, unknown
+from sdps.surface.exports.gloss_exports import write_gltf, write_materials, write_relightable
 from sdps.surface.exports.height_maps import write_curvatures, write_gradients, write_heights
 from sdps.surface.exports.light_exports import write_diligent, write_lp
 from sdps.surface.exports.normal_maps import CONVENTIONS, write_normals
@@ -36,6 +37,10 @@ EXPORTS: dict[str, Export] = {
     "height": Export("inspection, displacement: height as float and 16-bit TIFF, mm where known", write_heights),
     "gradients": Export("inspection: slopes dz/dx and dz/dy as TIFF", write_gradients),
     "curvature": Export("inspection: mean and Gaussian curvature as TIFF", write_curvatures),
+    "materials": Export("Blender, universal PS: base colour, roughness, metallic (if refined)", write_materials),
+    "gltf": Export("viewers, engines: mesh with these maps as .glb (if refined)", write_gltf),
+    "ptm": Export("heritage viewers: relightable .ptm (LRGB)", partial(write_relightable, "ptm")),
+    "rti": Export("heritage viewers: relightable .rti (HSH)", partial(write_relightable, "rti")),
     "lp": Export("RTIBuilder, RelightLab, Meshroom: light directions as .lp", write_lp),
     "diligent": Export("MATLAB scripts: lights as DiLiGenT's text files", write_diligent),
     "bini": Export("BiNI: normal_map.png, mask.png, K.txt", write_bini),

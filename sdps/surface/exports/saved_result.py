@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from render.shared.files import parse_json, read_json, read_text
 from render.shared.images import read_image
 from sdps.core.geometry import Camera
 from sdps.photos.light_files import read_lights
+
+if TYPE_CHECKING:
+    from sdps.inference.image_source import ImageSource
 
 _AGAIN = "run `sdps infer` again"
 _UNIT = 1.001
@@ -50,6 +53,7 @@ class SavedResult:
         camera: The camera.
         pixel_size: Millimetres that a pixel shows at depth 0; None where it is not known.
         lights: The lights; None of methods that find normals alone.
+        pictures: The photographs, where they are at hand.
 
     Raises:
         InputError: arrays of different sizes, values that are not finite, or an empty mask.
@@ -63,6 +67,7 @@ class SavedResult:
     camera: Camera
     pixel_size: float | None = None
     lights: SavedLights | None = None
+    pictures: "ImageSource | None" = None
 
     def __post_init__(self) -> None:
         shape = self.mask.shape

@@ -42,7 +42,7 @@ def test_cameras_lamps_and_pictures_are_read(tmp_path: Path) -> None:
     assert read.lights is not None and read.lights.files == NAMES
     assert np.allclose(read.lights.directions, LIGHTS, atol=1e-6) and np.allclose(read.lights.intensities, GAINS)
     assert read.lights.nearness == pytest.approx(nearness, abs=1e-5)
-    assert read.albedo is not None and read.albedo.shape == (61, 61, 3) and read.highlights is None
+    assert read.albedo is not None and read.albedo.shape == (61, 61, 3) and read.expected_error is None
 
 
 def test_folders_that_are_no_result_end_in_one_line(tmp_path: Path) -> None:

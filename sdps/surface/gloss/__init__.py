@@ -1,0 +1,1 @@
+"""How a surface shines, as glTF and relightable pictures tell it."""
