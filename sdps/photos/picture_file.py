@@ -29,6 +29,7 @@ class Picture:
         orientation: EXIF orientation tag, 1 to 8.
         layer: Which layer of an EXR file it was, empty where it has no name.
         lens: What its EXIF data say.
+        exposure: Seconds times ISO over the squared f-number, 0 where it is not known.
     """
 
     pixels: np.ndarray
@@ -37,6 +38,7 @@ class Picture:
     orientation: int = 1
     layer: str = ""
     lens: Lens = NO_LENS
+    exposure: float = 0.0
 
 
 def decode(path: Path) -> Picture:
@@ -52,7 +54,7 @@ def decode(path: Path) -> Picture:
     with _quiet(), decoding(path, name_kind(kind), "copy it again or leave it out"):
         read = DECODERS[kind](path, data)
     coding = Coding(kind, read.bits, read.pixels.dtype.kind == "f", profile_exponent(read.profile))
-    return Picture(read.pixels, read.alpha, coding, read.orientation, read.layer, read.lens)
+    return Picture(read.pixels, read.alpha, coding, read.orientation, read.layer, read.lens, read.exposure)
 
 
 def is_misnamed(name: str, kind: str) -> bool:

@@ -30,6 +30,10 @@ def resolve_gamma(gamma: str | float, coding: Coding, folders: Sequence[Path]) -
         return applied, f"values are taken as {_words(applied)}, as you said"
     if coding.floating:
         return "linear", f"values are taken as linear, because the files are {coding}"
+    if coding.kind == "RAW":
+        return "linear", (
+            "camera RAW is developed linearly, all pictures alike: daylight white balance, the sensor's own colours"
+        )
     if coding.curve is not None:
         applied = "linear" if abs(coding.curve - 1) < 0.05 else coding.curve
         applied = "srgb" if abs(coding.curve - SRGB_EXPONENT) < 0.015 else applied

@@ -1,0 +1,148 @@
+"""What cameras and phones write: RAW by LibRaw (rawpy), HEIC by libheif (pi-heif), AVIF by Pillow.
+
+The first two are optional packages. pillow-heif, the better known wrapper of libheif, is not used: its wheels hold
+x265, which is under the GPL.
+"""
+
+import importlib
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, features
+
+from render.shared.decoding import check_picture, check_unpacked, silence
+from render.shared.errors import InputError
+from sdps.photos.pictures.decoded import Decoded, join_exposure, read_exposure, read_orientation, repeat_grey
+from sdps.photos.pictures.lens import EXIF, Lens, read_lens
+
+_ORIENTATION = 274
+_TURNS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
+"""EXIF orientation by LibRaw's flip (1: left-right, 2: top-bottom, 4: transposed)."""
+_ANGLES = {0: 1, 1: 8, 2: 3, 3: 6}
+"""EXIF orientation by HEIF's rotation, in quarter turns anti-clockwise."""
+_HDR = {16: "PQ", 18: "HLG"}
+
+
+def read_raw(path: Path, data: bytes) -> Decoded:
+    """Develop a camera's RAW file, every picture in the same way, to 16 bits of linear radiance.
+
+    Black level off, the camera's daylight white balance (that of the moment may differ between the pictures), the
+    sensor's own primaries, which are not mixed so that no channel falls below 0, and bilinear interpolation, so that
+    each value is a fixed sum of what the sensor measured. Full scale is where the sensor's least amplified channel
+    saturates, not the brightest value of the picture.
+
+    Raises:
+        InputError: rawpy is missing. Errors of LibRaw pass.
+    """
+    rawpy = _require("rawpy", "raw", path, "camera RAW")
+    with silence(), rawpy.imread(io.BytesIO(data)) as raw:
+        sizes = raw.sizes
+        check_unpacked(path, 6 * sizes.raw_height * sizes.raw_width, "its pixels")
+        balance = [float(gain) for gain in raw.daylight_whitebalance[:3]]
+        if not all(0 < gain < 100 for gain in balance):
+            balance = [1.0, 1.0, 1.0]
+        pixels = raw.postprocess(
+            gamma=(1, 1), no_auto_bright=True, output_bps=16, output_color=rawpy.ColorSpace.raw, user_flip=0,
+            user_wb=[*balance, balance[1]], adjust_maximum_thr=0.0,
+            demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
+        )  # fmt: skip
+        other = getattr(raw, "other", None)
+        exposure = 0.0 if other is None else join_exposure(other.shutter_speed, other.aperture, other.iso_speed)
+    lens = _read_raw_lens(data)
+    return Decoded(repeat_grey(pixels), None, 16, None, _TURNS[sizes.flip & 7], "", lens, exposure)
+
+
+def _read_raw_lens(data: bytes) -> Lens:
+    """Return what the EXIF data of a RAW file that is laid out as TIFF say."""
+
+    def tags() -> dict[Any, Any]:
+        exif = Image.Exif()
+        exif.load(b"Exif\0\0" + data)
+        return dict(exif.get_ifd(EXIF))
+
+    return read_lens(tags)
+
+
+def read_heif(path: Path, data: bytes) -> Decoded:
+    """Decode a HEIC picture, of 8 bits or, where it has more, of 16.
+
+    Raises:
+        InputError: pi-heif is missing, or values that no display curve of sRGB's kind explains. Errors of libheif pass.
+    """
+    heif = _require("pi_heif", "heic", path, "a HEIC picture")
+    with silence():
+        picture = heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
+        wide = ";" in picture.mode
+        check_unpacked(path, picture.size[0] * picture.size[1] * len(picture.mode[:4]) * (2 if wide else 1), "it")
+        curve = (picture.info.get("nclx_profile") or {}).get("transfer_characteristics")
+        if curve in _HDR:
+            raise InputError(f"{path}: its values are coded for HDR screens ({_HDR[curve]}); switch HDR off, or save "
+                             "it as 16-bit TIFF")  # fmt: skip
+        pixels = np.array(picture)  # a copy: its memory goes with it
+    profile = picture.info.get("icc_profile")
+    pixels = pixels.reshape(*pixels.shape[:2], -1)
+    alpha = pixels[..., -1] if pixels.shape[2] in (2, 4) else None
+    turned = _find_turn(data)
+    if turned != 1:  # libheif has turned it; all kinds are handed on as the sensor saw them
+        pixels, alpha = _turn_back(pixels, turned), None if alpha is None else _turn_back(alpha, turned)
+    exif = Image.Exif()
+    exif.load(picture.info.get("exif") or b"")
+    lens, exposure = read_lens(lambda: exif.get_ifd(EXIF)), read_exposure(lambda: exif.get_ifd(EXIF))
+    return Decoded(repeat_grey(pixels), alpha, 16 if wide else 8, profile or None, turned, "", lens, exposure)
+
+
+def _find_turn(data: bytes) -> int:
+    """Return the rotation that a HEIF file asks for, as EXIF's orientation; 1 where several parts ask differently."""
+    start = data.find(b"ipco")
+    angles, place = set(), data.find(b"irot", max(start, 0))
+    while start >= 0 and place >= 0 and place + 4 < min(len(data), start + 2**20):
+        if data[place - 4 : place] == b"\0\0\0\x09":
+            angles.add(data[place + 4] & 3)
+        place = data.find(b"irot", place + 4)
+    mirrored = start >= 0 and data.find(b"\0\0\0\x09imir", start, start + 2**20) >= 0
+    return _ANGLES[angles.pop()] if len(angles) == 1 and not mirrored else 1
+
+
+def _turn_back(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Undo a rotation by 90, 180 or 270 degrees."""
+    return np.ascontiguousarray(np.rot90(pixels, {6: 1, 3: 2, 8: 3}[orientation]))
+
+
+def read_avif(path: Path, data: bytes) -> Decoded:
+    """Decode an AVIF picture to 8 bits.
+
+    Raises:
+        InputError: Pillow has no decoder for it. Pillow's errors pass.
+    """
+    if not features.check("avif"):
+        raise InputError(f"{path}: is an AVIF picture, which this Pillow cannot read: pip install 'pillow>=11.3'")
+    with Image.open(io.BytesIO(data), formats=["AVIF"]) as picture:
+        check_picture(path, picture, data)
+        exif = picture.getexif()
+        tag, profile = exif.get(_ORIENTATION, 1), picture.info.get("icc_profile")
+        lens, exposure = read_lens(lambda: exif.get_ifd(EXIF)), read_exposure(lambda: exif.get_ifd(EXIF))
+        alpha = np.asarray(picture.getchannel("A")) if "A" in picture.getbands() else None
+        pixels = np.asarray(picture.convert("RGB"))
+    return Decoded(pixels, alpha, 8, profile, read_orientation(tag), "", lens, exposure)
+
+
+def read_size(path: Path, data: bytes, kind: str) -> tuple[int, int]:
+    """Return (width, height) by the header of a file of kind `RAW` or `HEIC`; no pixel is decoded.
+
+    Raises:
+        InputError: the package is missing. Errors of the libraries pass.
+    """
+    if kind == "HEIC":
+        width, height = _require("pi_heif", "heic", path, "a HEIC picture").open_heif(io.BytesIO(data)).size
+        return int(width), int(height)
+    with silence(), _require("rawpy", "raw", path, "camera RAW").imread(io.BytesIO(data)) as raw:
+        return int(raw.sizes.raw_width), int(raw.sizes.raw_height)
+
+
+def _require(module: str, extra: str, path: Path, what: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise InputError(f"{path}: is {what}; to read it, pip install 'sdps[{extra}]'") from error
