@@ -85,6 +85,15 @@ def orient_pixels(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return np.flip(pixels, flips) if flips else pixels
 
 
+def turn_pixels(picture: Picture, orientation: int, full: tuple[int, int]) -> np.ndarray:
+    """Return a picture's pixels with sides `full` (H, W), turned as the orientation tag of all asks.
+
+    One that has other sides then, as if it had been turned before it was saved, is turned by its own tag.
+    """
+    pixels = orient_pixels(picture.pixels, orientation)
+    return pixels if pixels.shape[:2] == full else orient_pixels(picture.pixels, picture.orientation)
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep the decoders' own complaints off standard error; what matters of them is raised."""

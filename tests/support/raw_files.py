@@ -1,6 +1,7 @@
 """Camera RAW files that hold what a test wants, as DNG."""
 
 import io
+import struct
 
 import numpy as np
 import tifffile
@@ -30,11 +31,24 @@ def dng(
         (50728, "2I", 3, (*neutral, *one, *neutral), True), (50778, "H", 1, 21, True),
     ]  # fmt: skip
     if seconds is not None:
-        extra += [(33434, "2I", 1, (round(seconds * 1e6), 10**6), True), (33437, "2I", 1, (4, 1), True),
-                  (34855, "H", 1, 100, True)]  # fmt: skip
+        extra += [(_PLACE, "I", 1, 0, True)]
     file = io.BytesIO()
     tifffile.imwrite(file, mosaic, photometric=32803, extratags=extra, software=False, metadata=None, subfiletype=0)
-    return file.getvalue()
+    return file.getvalue() if seconds is None else _add_exif(file.getvalue(), seconds)
+
+
+_PLACE, _EXIF = 0x8768, 0x8769  # tifffile does not write the second
+
+
+def _add_exif(data: bytes, seconds: float) -> bytes:
+    """Append a directory of EXIF data and make the placeholder lead to it."""
+    start = len(data)
+    entry = data.index(struct.pack("<HHI", _PLACE, 4, 1))
+    rows = [struct.pack("<HHII", 33434, 5, 1, start + 42), struct.pack("<HHII", 33437, 5, 1, start + 50),
+            struct.pack("<HHIHH", 34855, 3, 1, 100, 0)]  # fmt: skip
+    directory = struct.pack("<H", 3) + b"".join(rows) + bytes(4)
+    numbers = struct.pack("<4I", round(seconds * 10**6), 10**6, 4, 1)
+    return data[:entry] + struct.pack("<HHII", _EXIF, 4, 1, start) + data[entry + 12 :] + directory + numbers
 
 
 def mosaic(image: np.ndarray) -> np.ndarray:

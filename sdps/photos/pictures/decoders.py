@@ -26,6 +26,10 @@ from sdps.photos.pictures.netpbm import read_netpbm
 
 _ORIENTATION = 274
 _PROFILE = 34675
+_PLANES = 2  # TIFF's PlanarConfiguration of channels one after another
+_INKS = 5
+_COLOURS = {_INKS: "inks (CMYK)", 8: "CIELAB", 9: "CIELAB", 10: "CIELAB", 32844: "LogL", 32845: "LogLuv"}
+_BY_TIFFFILE = (np.dtype(np.uint32), np.dtype(np.int32), np.dtype(np.int16), np.dtype(np.float16))
 _PIXELS = {b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"}
 
 
@@ -61,10 +65,40 @@ def _tiff(path: Path, data: bytes | bytearray) -> Decoded:
         orientation = int(tags[_ORIENTATION].value) if _ORIENTATION in tags else 1
         exif = tags[EXIF].value if EXIF in tags else {}
         said = read_lens(lambda: exif), read_exposure(lambda: exif)
+        _refuse_colours(path, page)
+        if page.dtype in _BY_TIFFFILE or (page.planarconfig == _PLANES and page.samplesperpixel > 1):
+            pixels = _read_page(path, page)
+            alpha = pixels[..., 3] if pixels.ndim == 3 and pixels.shape[2] == 4 else None
+            bits = 8 * page.dtype.itemsize
+            return Decoded(repeat_grey(pixels), alpha, bits, profile, read_orientation(orientation), "", *said)
         if orientation != 1:  # OpenCV turns such pictures by itself, or fails; the tag must be gone before
             data = bytearray(data)
             struct.pack_into(f"{order}H", data, tags[_ORIENTATION].valueoffset, 1)
     return _by_opencv(path, data, "TIFF", profile, orientation, *said)
+
+
+def _refuse_colours(path: Path, page: Any) -> None:
+    """Refuse a TIFF whose values are no amounts of red, green and blue, nor known to be turned into some."""
+    kind = int(page.photometric)
+    converted = kind == _INKS and page.bitspersample == 8 and page.planarconfig != _PLANES
+    what = "" if converted else _COLOURS.get(kind, "")
+    if what:
+        raise InputError(f"{path}: its colours are {what}; save it as RGB or grey")
+
+
+def _read_page(path: Path, page: Any) -> np.ndarray:  # (H, W[, C]) uint8, uint16 or float32
+    """Read what OpenCV does not: channels one after another, half floats, and integers of other kinds as floats."""
+    try:
+        pixels = page.asarray()
+    except ValueError as error:
+        if "imagecodecs" not in str(error):
+            raise
+        raise InputError(f"{path}: is compressed in a way that is not read; save it without compression") from error
+    if pixels.ndim == 3 and page.planarconfig == _PLANES:
+        pixels = np.moveaxis(pixels, 0, -1)
+    if pixels.dtype.kind in "iu" and pixels.dtype not in (np.uint8, np.uint16):
+        return (pixels / float(np.iinfo(pixels.dtype).max)).astype(np.float32)
+    return pixels.astype(np.float32) if pixels.dtype.kind == "f" else pixels
 
 
 def _by_opencv(

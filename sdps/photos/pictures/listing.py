@@ -29,7 +29,8 @@ class Listing:
     Attributes:
         files: Names of the photographs below the folder, `/` between folders, in order.
         certain: Those of them that the user or a list of names named one by one; what they look like does not matter.
-        dark: Those of them that are dark frames by their names, if they are dark.
+        dark: Dark frames by their names, if they are dark; of those in `files`, the others are photographs.
+        ambient: Pictures without the lamp by their names; not in `files`.
         masks: Names of masks below the folder, one named `mask` first.
         places: The folder and, where the photographs lie in one of its folders, that one; other files may be in either.
         notes: What was decided, in plain sentences.
@@ -41,6 +42,7 @@ class Listing:
     masks: tuple[str, ...]
     places: tuple[Path, ...]
     notes: tuple[str, ...]
+    ambient: tuple[str, ...] = ()
 
 
 def list_pictures(folder: Path, names: Sequence[str] | None = None) -> Listing:
@@ -74,9 +76,14 @@ def list_pictures(folder: Path, names: Sequence[str] | None = None) -> Listing:
     _check_count(folder, files, notes)
     masks = [name for name in there if roles.get(name) == MASK and name not in files]
     masks.sort(key=lambda name: not is_bare(name, MASK))
-    dark = tuple(name for name in files if roles.get(name) == DARK and name not in choice.certain)
+    unwanted = [name[1:] for name in names or () if name.startswith("!")]
+    dark, ambient = (
+        tuple(name for name in there if roles.get(name) == role and name not in choice.certain
+              and not any(_matches(name, pattern) for pattern in unwanted))
+        for role in (DARK, AMBIENT)
+    )  # fmt: skip
     places = (folder, folder / place) if place else (folder,)
-    return Listing(tuple(files), frozenset(choice.certain), dark, tuple(masks), places, tuple(notes))
+    return Listing(tuple(files), frozenset(choice.certain), dark, tuple(masks), places, tuple(notes), ambient)
 
 
 @dataclass(frozen=True)
@@ -96,7 +103,8 @@ def _by_list(folder: Path, listed: Path) -> _Choice:
         base = listed.parent.relative_to(folder).as_posix()
         files, place = [f"{base}/{name}" for name in files], f"{base}/{place}".rstrip("/")
     there = _pictures(folder) + _below(folder, place)
-    others = [name for name in there if name not in files and name_roles(there).get(name) != MASK]
+    roles = name_roles(there)
+    others = [name for name in there if name not in files and roles.get(name) not in (MASK, AMBIENT, DARK)]
     left = f"; not in it: {_join(others)}" if others else ""
     return _Choice(
         files, set(files), there, place, [f"{listed.name} names the {len(files)} pictures and their order{left}"]
@@ -114,7 +122,7 @@ def _by_name(folder: Path, names: Sequence[str] | None) -> _Choice:
     usual, aside = _set_aside(usual)
     files, certain = (usual, set()) if names is None else _choose(folder, names, usual, there, aside)
     notes = [] if names is None else [f"{len(files)} of {len(usual)} pictures were chosen by name"]
-    left = {name: role for name, role in roles.items() if name not in files and role != MASK}
+    left = {name: role for name, role in roles.items() if name not in files and role not in (MASK, AMBIENT)}
     notes += _name_left_out(left if names is None else {})
     return _Choice(files, certain, there, place, notes + _name_aside([name for name in aside if name not in files]))
 
@@ -253,8 +261,7 @@ def _name_left_out(roles: dict[str, str]) -> list[str]:
     kinds: dict[str, list[str]] = {}
     for name, role in roles.items():
         kinds.setdefault(role, []).append(name)
-    why = {AMBIENT: "ambient; not yet subtracted"}
-    texts = [f"{_join(names)} ({why.get(role, role + ' by name')})" for role, names in kinds.items()]
+    texts = [f"{_join(names)} ({role} by name)" for role, names in kinds.items()]
     return [f"left out: {', '.join(texts)}; --images takes what it names"] if texts else []
 
 

@@ -229,8 +229,8 @@ def good(tmp_path: Path) -> Path:
 def test_folders_without_enough_pictures(tmp_path: Path) -> None:
     assert "no such folder" in refusal(tmp_path / "nowhere")
     assert "no pictures in it; put PNG" in refusal(tmp_path)
-    (tmp_path / "a.CR2").touch()
-    assert "1 .cr2, which are not read" in refusal(tmp_path)
+    (tmp_path / "a.x3f").touch()
+    assert "1 .x3f, which are not read" in refusal(tmp_path)
     folders.write(tmp_path / "1.png", RAMP)
     assert "only one picture, 1.png" in refusal(tmp_path)
 
