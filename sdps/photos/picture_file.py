@@ -15,7 +15,7 @@ from render.shared.files import read_bytes
 from sdps.photos.pictures.decoders import DECODERS
 from sdps.photos.pictures.lens import NO_LENS, Lens
 from sdps.photos.pictures.picture_kinds import NAMED, SUFFIXES, Coding, foreign_kind, name_kind, picture_kind
-from sdps.photos.response import profile_exponent
+from sdps.photos.pictures.profiles import read_profile
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,8 @@ def decode(path: Path) -> Picture:
         raise _not_read(path, data)
     with _quiet(), decoding(path, name_kind(kind), "copy it again or leave it out"):
         read = DECODERS[kind](path, data)
-    coding = Coding(kind, read.bits, read.pixels.dtype.kind == "f", profile_exponent(read.profile))
+    profile, floating = read_profile(read.profile), read.pixels.dtype.kind == "f"
+    coding = Coding(kind, read.bits, floating, profile.exponent, profile.primaries, profile.rough)
     return Picture(read.pixels, read.alpha, coding, read.orientation, read.layer, read.lens, read.exposure)
 
 

@@ -61,15 +61,20 @@ class Coding:
         bits: Per channel.
         floating: Whether values are floating-point numbers.
         curve: Exponent of the embedded colour profile's curve, 1 for linear; None without profile.
+        primaries: Name of the profile's colour space, empty for sRGB's.
+        rough: The profile's curve is neither sRGB's nor a power.
     """
 
     kind: str
     bits: int
     floating: bool
     curve: float | None = None
+    primaries: str = ""
+    rough: bool = False
 
     def __str__(self) -> str:
         profile = "" if self.curve is None else f" with a profile of exponent {self.curve:.2f}"
+        profile += f" ({self.primaries})" if self.primaries else ""
         return f"{self.bits}-bit {'float ' if self.floating else ''}{self.kind}{profile}"
 
 
