@@ -71,9 +71,8 @@ def read_heif(path: Path, data: bytes) -> Decoded:
     Raises:
         InputError: pi-heif is missing, or values that no display curve of sRGB's kind explains. Errors of libheif pass.
     """
-    heif = _require("pi_heif", "heic", path, "a HEIC picture")
     with silence():
-        picture = heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
+        picture = _open_heif(path, data)
         wide = ";" in picture.mode
         check_unpacked(path, picture.size[0] * picture.size[1] * len(picture.mode[:4]) * (2 if wide else 1), "it")
         curve = (picture.info.get("nclx_profile") or {}).get("transfer_characteristics")
@@ -91,6 +90,58 @@ def read_heif(path: Path, data: bytes) -> Decoded:
     exif.load(picture.info.get("exif") or b"")
     lens, exposure = read_lens(lambda: exif.get_ifd(EXIF)), read_exposure(lambda: exif.get_ifd(EXIF))
     return Decoded(repeat_grey(pixels), alpha, 16 if wide else 8, profile or None, turned, "", lens, exposure)
+
+
+def _open_heif(path: Path, data: bytes) -> Any:
+    """Open a HEIC picture; no pixel is decoded.
+
+    Raises:
+        InputError: pi-heif is missing, or parts lie outside the file or have no names, which it does not survive.
+    """
+    heif = _require("pi_heif", "heic", path, "a HEIC picture")
+    if not (_parts_fit(data) and _have_names(data)):
+        raise InputError(f"{path}: damaged or truncated HEIC, its list of parts is wrong; copy it again")
+    return heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
+
+
+def _parts_fit(data: bytes) -> bool:
+    """Tell whether all parts that a HEIF file's `iloc` box lists lie inside the file (ISO/IEC 14496-12, 8.11.3)."""
+    box = data.find(b"iloc")
+    version = data[box + 4]
+    sizes = [data[box + 8] >> 4, data[box + 8] & 15, data[box + 9] >> 4, data[box + 9] & 15 if version else 0]
+    if box < 0 or version > 2 or any(size not in (0, 4, 8) for size in sizes):
+        return False
+    place, wide = box + 10, 4 if version == 2 else 2
+
+    def take(size: int) -> int:
+        nonlocal place
+        place += size
+        return int.from_bytes(data[place - size : place], "big")
+
+    for _ in range(take(wide)):
+        take(wide)
+        if version:
+            take(2)
+        take(2)
+        start = take(sizes[2])
+        for _ in range(take(2)):
+            take(sizes[3])
+            offset, length = take(sizes[0]), take(sizes[1])
+            if start + offset + length > len(data) or place > len(data):
+                return False
+    return True
+
+
+def _have_names(data: bytes) -> bool:
+    """Tell whether kinds and names of all parts, in `infe` boxes (8.11.6), are ASCII."""
+    place = data.find(b"infe")
+    while place >= 0:
+        size = int.from_bytes(data[place - 4 : place], "big")
+        kind = place + (12 if data[place + 4 : place + 5] == b"\2" else 14)
+        if not data[kind : place - 4 + size].isascii():
+            return False
+        place = data.find(b"infe", place + 4)
+    return True
 
 
 def _find_turn(data: bytes) -> int:
@@ -135,7 +186,7 @@ def read_size(path: Path, data: bytes, kind: str) -> tuple[int, int]:
         InputError: the package is missing. Errors of the libraries pass.
     """
     if kind == "HEIC":
-        width, height = _require("pi_heif", "heic", path, "a HEIC picture").open_heif(io.BytesIO(data)).size
+        width, height = _open_heif(path, data).size
         return int(width), int(height)
     with silence(), _require("rawpy", "raw", path, "camera RAW").imread(io.BytesIO(data)) as raw:
         return int(raw.sizes.raw_width), int(raw.sizes.raw_height)

@@ -128,3 +128,13 @@ def test_damage_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str], n
     with pytest.raises(InputError, match=name):
         decode(write(tmp_path / name, data[: int(part * len(data))]))
     assert capfd.readouterr() == ("", "")
+
+
+def test_lists_of_parts_that_crash_the_library_do_not_reach_it(tmp_path: Path) -> None:
+    data = (HERE / "upright.heic").read_bytes()
+    start = data.index(b"iloc") + 10 + 2  # its first item: number, construction, reference, offset, count, extents
+    wrong = (data.replace(b"Exif", b"\x99vx\xfe", 1), data[: start + 6] + b"\x7f" + data[start + 7 :], data[:70])
+    for number, some in enumerate(wrong):
+        assert some != data
+        with pytest.raises(InputError, match=rf"{number}.heic: damaged or"):
+            decode(write(tmp_path / f"{number}.heic", some))
