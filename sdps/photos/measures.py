@@ -5,7 +5,7 @@ Legend: L images, P sampled pixels of the object.
 
 import hashlib
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +37,7 @@ class Measures:
         peaks: (L,) its maximum.
         outside: Mean brightness outside the mask over that inside; 0 where the mask is the frame.
         saturated: (L,) share of the pixels with a channel at full scale.
-        tops: (L,) the highest value of a channel.
+        tops: (L,) the highest value of a channel, before anything was subtracted.
         topped: (L,) share of the pixels with a channel at it.
         casts: (L,) change of the light's colour, see `colour_casts`.
         digests: (L,) of the brightness of all pixels.
@@ -73,6 +73,7 @@ def measure(photos: Photographs) -> Measures:
     levels, peaks, saturated, tops, topped, outside = np.zeros((6, count))
     digests, settings, shifts, blocks = [], [], [], []
     tracker = Tracker(photos.mask)
+    stored = None if photos.background is None else replace(photos, background=None)
     for number in progress_bar(range(count), desc="checking", unit="picture", delay=5):
         image = photos[number : number + 1][0]
         stage("checks", number, count)
@@ -83,7 +84,7 @@ def measure(photos: Photographs) -> Measures:
         blocks.append(block_means(grey))
         observations[number] = image.reshape(-1, 3)[sample]
         inside, bright = image[photos.mask], grey[photos.mask]  # (Q, 3), (Q,)
-        highest = inside.max(-1)
+        highest = inside.max(-1) if stored is None else stored[number : number + 1][0][photos.mask].max(-1)
         levels[number], peaks[number], tops[number] = np.percentile(bright, 95), bright.max(), highest.max()
         saturated[number], topped[number] = (highest >= photos.saturation).mean(), (highest >= tops[number]).mean()
         if len(pixels) < grey.size:

@@ -72,6 +72,15 @@ def test_clipped_values_are_those_of_the_files(tmp_path: Path) -> None:
     np.testing.assert_allclose(read[0:1][0][bright < 1], LAMP[0][bright < 1], **FINE)
 
 
+def test_pictures_that_were_clipped_before_they_were_saved_are_found(tmp_path: Path) -> None:
+    write(tmp_path, ambient=ROOM)
+    for number, image in enumerate(LAMP):
+        folders.write(tmp_path / f"{number + 1}.png", np.minimum(1.2 * image + ROOM, 0.8), 16)
+    for ambient in (None, "none"):
+        texts = [finding.text for finding in photos.check(photos.load(tmp_path, ambient=ambient))]
+        assert any(text.startswith("Clipped before it was saved") for text in texts), texts
+
+
 def test_an_ambient_picture_that_does_not_fit(tmp_path: Path) -> None:
     write(tmp_path, ambient=ROOM[:-2])
     read = photos.load(tmp_path)
