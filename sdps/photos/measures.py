@@ -17,6 +17,7 @@ from sdps.core.intensities import colour_balance
 from sdps.photos.analysis.colours import colour_casts
 from sdps.photos.analysis.fall_off import FallOff, block_means, fall_off
 from sdps.photos.analysis.motion import Shift, Tracker, second_look
+from sdps.photos.pictures.camera_files import read_exif
 from sdps.photos.reading import Photographs
 from sdps.photos.response import brightness
 
@@ -79,7 +80,7 @@ def measure(photos: Photographs) -> Measures:
         stage("checks", number, count)
         grey = brightness(image)
         digests.append(hashlib.blake2b(grey.tobytes(), digest_size=16).digest())
-        settings.append(_camera_settings(photos.folder / photos.files[number]))
+        settings.append(_camera_settings(photos.folder / photos.files[number], photos.coding.kind))
         shifts.append(tracker.add(grey))
         blocks.append(block_means(grey))
         observations[number] = image.reshape(-1, 3)[sample]
@@ -127,15 +128,20 @@ def measure_spread(observations: np.ndarray) -> np.ndarray:
     return values / values[0]
 
 
-def _camera_settings(path: Path) -> dict[str, float]:
+def _camera_settings(path: Path, kind: str = "") -> dict[str, float]:
     """Return what the EXIF header says about exposure and zoom; empty where there is none."""
     if path.suffix.lower() == ".exr":
         return {}
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # of damaged tags, of size
-            if picture.format not in ("JPEG", "MPO", "TIFF"):
-                return {}
-            tags = dict(picture.getexif()) | picture.getexif().get_ifd(_EXIF)
+        with warnings.catch_warnings(action="ignore"):  # of damaged tags, of size
+            if kind in ("RAW", "HEIC"):
+                exif = read_exif(path, path.read_bytes(), kind)
+                tags = dict(exif) | exif.get_ifd(_EXIF)
+            else:
+                with Image.open(path) as picture:
+                    if picture.format not in ("JPEG", "MPO", "TIFF", "AVIF"):
+                        return {}
+                    tags = dict(picture.getexif()) | picture.getexif().get_ifd(_EXIF)
         return {name: float(np.max(tags[tag])) for tag, name in _EXPOSURE.items() if tag in tags}
     except FileNotFoundError as error:
         raise InputError(f"{path}: was removed while it was in use; start again") from error

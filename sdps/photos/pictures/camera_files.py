@@ -15,7 +15,7 @@ from PIL import Image, features
 from render.shared.decoding import check_picture, check_unpacked, silence
 from render.shared.errors import InputError
 from sdps.photos.pictures.decoded import Decoded, join_exposure, read_exposure, read_orientation, repeat_grey
-from sdps.photos.pictures.lens import EXIF, Lens, read_lens
+from sdps.photos.pictures.lens import EXIF, read_lens
 
 _ORIENTATION = 274
 _TURNS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
@@ -50,19 +50,19 @@ def read_raw(path: Path, data: bytes) -> Decoded:
         )  # fmt: skip
         other = getattr(raw, "other", None)
         exposure = 0.0 if other is None else join_exposure(other.shutter_speed, other.aperture, other.iso_speed)
-    lens = _read_raw_lens(data)
+    lens = read_lens(lambda: read_exif(path, data, "RAW").get_ifd(EXIF))
     return Decoded(repeat_grey(pixels), None, 16, None, _TURNS[sizes.flip & 7], "", lens, exposure)
 
 
-def _read_raw_lens(data: bytes) -> Lens:
-    """Return what the EXIF data of a RAW file that is laid out as TIFF say."""
+def read_exif(path: Path, data: bytes, kind: str) -> Image.Exif:
+    """Return the EXIF data of a file of kind `HEIC`, or `RAW` that is laid out as TIFF; no pixel is decoded.
 
-    def tags() -> dict[Any, Any]:
-        exif = Image.Exif()
-        exif.load(b"Exif\0\0" + data)
-        return dict(exif.get_ifd(EXIF))
-
-    return read_lens(tags)
+    Raises:
+        InputError: as `read_heif`. Errors of the libraries pass.
+    """
+    exif = Image.Exif()
+    exif.load(_open_heif(path, data).info.get("exif") or b"" if kind == "HEIC" else b"Exif\0\0" + data)
+    return exif
 
 
 def read_heif(path: Path, data: bytes) -> Decoded:

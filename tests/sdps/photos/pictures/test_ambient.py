@@ -133,3 +133,6 @@ def test_exposures_of_raw_files(tmp_path: Path) -> None:
     gains = (without[0:1] - read[0:1])[0, 12, 16] * 65535 / 1500
     assert gains.min() == pytest.approx(1.0, abs=0.01) and gains.max() < 1.3  # the daylight white balance
     assert any("times 0.5" in note for note in read.notes)
+    (tmp_path / "3.dng").write_bytes(dng(mosaic(room), seconds=0.25))
+    texts = [finding.text for finding in photos.check(photos.load(tmp_path))]
+    assert any(text.startswith("The camera changed its exposure time between the pictures (0.25") for text in texts)

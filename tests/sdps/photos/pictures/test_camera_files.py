@@ -12,6 +12,7 @@ from raw_files import dng, mosaic
 
 from render.shared.errors import InputError
 from sdps import photos
+from sdps.photos.measures import _camera_settings
 from sdps.photos.picture_file import decode, orient_pixels
 
 HERE = Path(__file__).parent
@@ -94,6 +95,8 @@ def test_heic_is_handed_on_as_the_sensor_saw_it() -> None:
     assert (upright.coding.kind, upright.orientation, turned.orientation) == ("HEIC", 1, 6)
     assert upright.pixels.shape == turned.pixels.shape == (32, 48, 3)
     np.testing.assert_allclose(upright.pixels.astype(int), turned.pixels.astype(int), atol=4)
+    settings = _camera_settings(HERE / "turned.heic", "HEIC")
+    assert settings == pytest.approx({"exposure time": 0.01, "aperture": 2.8, "ISO": 100})
     assert turned.lens.equivalent == 26 and turned.exposure == pytest.approx(100 * 0.01 / 2.8**2)
 
 
