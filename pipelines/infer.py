@@ -51,6 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gamma", default="auto", help="linear, srgb, or an exponent (default: by kind of file)")
     parser.add_argument("--images", action="append", default=None, metavar="PATTERN",
                         help="files to use, in this order; one that begins with ! leaves files out")  # fmt: skip
+    parser.add_argument("--ambient", default=None, metavar="FILE",
+                        help="picture with the lamp off, subtracted; none for none (default: *ambient*)")  # fmt: skip
+    parser.add_argument("--dark", default=None, metavar="FILE",
+                        help="picture with the lens covered, subtracted; none for none (default: *dark*)")  # fmt: skip
     parser.add_argument("--discontinuities", action="store_true", help="let the depth jump where slopes disagree")
     parser.add_argument("--refine", action=argparse.BooleanOptionalAction, default=None,
                         help="refine normals and lights until a simple model explains the photographs, and join that "
@@ -129,6 +133,7 @@ def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:
         args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
         gamma=args.gamma, names=args.images, anyway=args.anyway, scale=args.scale, focal=args.focal,
         principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance,
+        ambient=args.ambient, dark=args.dark,
     )  # fmt: skip
     findings = tuple(check(photos))
     height, width = photos.shape

@@ -5,7 +5,7 @@ Legend: L images, P sampled pixels of the object.
 
 import hashlib
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from sdps.core.intensities import colour_balance
 from sdps.photos.analysis.colours import colour_casts
 from sdps.photos.analysis.fall_off import FallOff, block_means, fall_off
 from sdps.photos.analysis.motion import Shift, Tracker, second_look
+from sdps.photos.pictures.camera_files import read_exif
 from sdps.photos.reading import Photographs
 from sdps.photos.response import brightness
 
@@ -37,7 +38,7 @@ class Measures:
         peaks: (L,) its maximum.
         outside: Mean brightness outside the mask over that inside; 0 where the mask is the frame.
         saturated: (L,) share of the pixels with a channel at full scale.
-        tops: (L,) the highest value of a channel.
+        tops: (L,) the highest value of a channel, before anything was subtracted.
         topped: (L,) share of the pixels with a channel at it.
         casts: (L,) change of the light's colour, see `colour_casts`.
         digests: (L,) of the brightness of all pixels.
@@ -73,17 +74,18 @@ def measure(photos: Photographs) -> Measures:
     levels, peaks, saturated, tops, topped, outside = np.zeros((6, count))
     digests, settings, shifts, blocks = [], [], [], []
     tracker = Tracker(photos.mask)
+    stored = None if photos.background is None else replace(photos, background=None)
     for number in progress_bar(range(count), desc="checking", unit="picture", delay=5):
         image = photos[number : number + 1][0]
         stage("checks", number, count)
         grey = brightness(image)
         digests.append(hashlib.blake2b(grey.tobytes(), digest_size=16).digest())
-        settings.append(_camera_settings(photos.folder / photos.files[number]))
+        settings.append(_camera_settings(photos.folder / photos.files[number], photos.coding.kind))
         shifts.append(tracker.add(grey))
         blocks.append(block_means(grey))
         observations[number] = image.reshape(-1, 3)[sample]
         inside, bright = image[photos.mask], grey[photos.mask]  # (Q, 3), (Q,)
-        highest = inside.max(-1)
+        highest = inside.max(-1) if stored is None else stored[number : number + 1][0][photos.mask].max(-1)
         levels[number], peaks[number], tops[number] = np.percentile(bright, 95), bright.max(), highest.max()
         saturated[number], topped[number] = (highest >= photos.saturation).mean(), (highest >= tops[number]).mean()
         if len(pixels) < grey.size:
@@ -126,15 +128,20 @@ def measure_spread(observations: np.ndarray) -> np.ndarray:
     return values / values[0]
 
 
-def _camera_settings(path: Path) -> dict[str, float]:
+def _camera_settings(path: Path, kind: str = "") -> dict[str, float]:
     """Return what the EXIF header says about exposure and zoom; empty where there is none."""
     if path.suffix.lower() == ".exr":
         return {}
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # of damaged tags, of size
-            if picture.format not in ("JPEG", "MPO", "TIFF"):
-                return {}
-            tags = dict(picture.getexif()) | picture.getexif().get_ifd(_EXIF)
+        with warnings.catch_warnings(action="ignore"):  # of damaged tags, of size
+            if kind in ("RAW", "HEIC"):
+                exif = read_exif(path, path.read_bytes(), kind)
+                tags = dict(exif) | exif.get_ifd(_EXIF)
+            else:
+                with Image.open(path) as picture:
+                    if picture.format not in ("JPEG", "MPO", "TIFF", "AVIF"):
+                        return {}
+                    tags = dict(picture.getexif()) | picture.getexif().get_ifd(_EXIF)
         return {name: float(np.max(tags[tag])) for tag, name in _EXPOSURE.items() if tag in tags}
     except FileNotFoundError as error:
         raise InputError(f"{path}: was removed while it was in use; start again") from error

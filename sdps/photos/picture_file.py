@@ -15,7 +15,7 @@ from render.shared.files import read_bytes
 from sdps.photos.pictures.decoders import DECODERS
 from sdps.photos.pictures.lens import NO_LENS, Lens
 from sdps.photos.pictures.picture_kinds import NAMED, SUFFIXES, Coding, foreign_kind, name_kind, picture_kind
-from sdps.photos.response import profile_exponent
+from sdps.photos.pictures.profiles import read_profile
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +29,7 @@ class Picture:
         orientation: EXIF orientation tag, 1 to 8.
         layer: Which layer of an EXR file it was, empty where it has no name.
         lens: What its EXIF data say.
+        exposure: Seconds times ISO over the squared f-number, 0 where it is not known.
     """
 
     pixels: np.ndarray
@@ -37,6 +38,7 @@ class Picture:
     orientation: int = 1
     layer: str = ""
     lens: Lens = NO_LENS
+    exposure: float = 0.0
 
 
 def decode(path: Path) -> Picture:
@@ -51,8 +53,9 @@ def decode(path: Path) -> Picture:
         raise _not_read(path, data)
     with _quiet(), decoding(path, name_kind(kind), "copy it again or leave it out"):
         read = DECODERS[kind](path, data)
-    coding = Coding(kind, read.bits, read.pixels.dtype.kind == "f", profile_exponent(read.profile))
-    return Picture(read.pixels, read.alpha, coding, read.orientation, read.layer, read.lens)
+    profile, floating = read_profile(read.profile), read.pixels.dtype.kind == "f"
+    coding = Coding(kind, read.bits, floating, profile.exponent, profile.primaries, profile.rough)
+    return Picture(read.pixels, read.alpha, coding, read.orientation, read.layer, read.lens, read.exposure)
 
 
 def is_misnamed(name: str, kind: str) -> bool:
@@ -81,6 +84,15 @@ def orient_pixels(pixels: np.ndarray, orientation: int) -> np.ndarray:
     # After the transposition, tags 5 to 8 are none, mirrored left-right, turned by 180 degrees, mirrored top-bottom.
     flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
     return np.flip(pixels, flips) if flips else pixels
+
+
+def turn_pixels(picture: Picture, orientation: int, full: tuple[int, int]) -> np.ndarray:
+    """Return a picture's pixels with sides `full` (H, W), turned as the orientation tag of all asks.
+
+    One that has other sides then, as if it had been turned before it was saved, is turned by its own tag.
+    """
+    pixels = orient_pixels(picture.pixels, orientation)
+    return pixels if pixels.shape[:2] == full else orient_pixels(picture.pixels, picture.orientation)
 
 
 @contextmanager

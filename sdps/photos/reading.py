@@ -10,16 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from render.shared.errors import InputError
-from render.shared.imaging.reducing import check_scale, reduce_image, smaller_shape
+from render.shared.imaging.reducing import check_scale, smaller_shape
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture
 from sdps.photos.faults import Faults
 from sdps.photos.light_files.light_choice import KnownLights, known_lights
 from sdps.photos.light_files.light_distance import LightDistance, Yardstick, find_nearness, read_distance
 from sdps.photos.picture_file import decode, orient_pixels
+from sdps.photos.pictures.ambient import Background
 from sdps.photos.pictures.lens import NOT_KNOWN, Wanted, read_wanted
 from sdps.photos.pictures.listing import Listing, list_pictures
 from sdps.photos.pictures.picture_kinds import Coding
 from sdps.photos.response import to_linear
+from sdps.photos.scaling import reduce_linear
 from sdps.photos.survey import Survey, survey
 
 
@@ -52,6 +54,7 @@ class Photographs:
         pixel_size: Millimetres per pixel, as read, at the object's mean depth; None where it is not known.
         light_nearness: (L,) float32, the object's radius over the distance of each lamp (`sdps.core.geometry`), 0 of
             distant ones; None where it is not known.
+        background: What is subtracted of every picture: the room's light and the sensor's offset; None for nothing.
         nearness_each: Where it is not known, each lamp may have a distance of its own.
     """
 
@@ -76,6 +79,7 @@ class Photographs:
     pixel_size: float | None = None
     light_nearness: np.ndarray | None = None
     nearness_each: bool = False
+    background: Background | None = None
 
     def __len__(self) -> int:
         return len(self.files)
@@ -97,17 +101,20 @@ class Photographs:
         numbers = range(len(self))[part]
         sides = (len(range(length)[some]) for length, some in zip(self.shape, (rows, columns), strict=True))
         images = np.empty((len(numbers), *sides, 3), np.float32)
+        saturation = self.saturation
         for image, number in zip(images, numbers, strict=True):
             picture = decode(self.folder / self.files[number])
             pixels = orient_pixels(picture.pixels, self.orientation)
+            if smaller_shape(pixels.shape[:2], self.scale) != self.shape:  # see turn_pixels
+                pixels = orient_pixels(picture.pixels, picture.orientation)
             if smaller_shape(pixels.shape[:2], self.scale) != self.shape or picture.coding != self.coding:
                 raise InputError(f"{self.folder / self.files[number]}: changed while it was in use; start again")
             if self.scale == 1.0:
                 to_linear(pixels[rows, columns], self.gamma, image)
             else:
-                for channel in range(3):  # one by one: a whole picture of floats may take a gigabyte
-                    linear = to_linear(pixels[..., channel], self.gamma)
-                    image[..., channel] = reduce_image(linear, self.shape)[rows, columns]
+                image[:] = reduce_linear(pixels, self.gamma, self.shape)[rows, columns]
+            if self.background is not None:
+                self.background.subtract(image, self.files[number], (rows, columns), saturation)
         return images
 
     @property
@@ -121,26 +128,20 @@ class Photographs:
 
     @property
     def saturation(self) -> float:
-        """Linear value from which on a pixel of integer files counts as saturated; infinite for floating point."""
+        """Linear value from which on a pixel of integer files counts as saturated; infinite for floating point.
+
+        Saturated values are those of the files, whatever is subtracted from others.
+        """
         return float("inf") if self.coding.floating else float(to_linear(np.array([253], np.uint8), self.gamma)[0])
 
 
 def load(
-    folder: str | Path,
-    *,
-    mask: str | Path | None = None,
-    lights: str | Path | None = None,
-    intensities: str | Path | None = None,
-    frame: str = "y-up",
-    gamma: str | float = "auto",
-    names: Sequence[str] | None = None,
-    anyway: bool = False,
-    scale: float = 1.0,
-    focal: str | float | None = None,
-    principal: str | Sequence[float] | None = None,
-    pixel_size: float | None = None,
-    light_distance: str | float | None = None,
-) -> Photographs:
+    folder: str | Path, *, mask: str | Path | None = None, lights: str | Path | None = None,
+    intensities: str | Path | None = None, frame: str = "y-up", gamma: str | float = "auto",
+    names: Sequence[str] | None = None, anyway: bool = False, scale: float = 1.0, focal: str | float | None = None,
+    principal: str | Sequence[float] | None = None, pixel_size: float | None = None,
+    light_distance: str | float | None = None, ambient: str | Path | None = None, dark: str | Path | None = None,
+) -> Photographs:  # fmt: skip
     """Look through a folder of photographs of a static object under one distant light each (docs/guides/capture.md).
 
     Every file is decoded once, one at a time, so that a damaged one is found now.
@@ -163,6 +164,9 @@ def load(
         light_distance: How far all lamps stand from the object: a number of its sizes (the longer side of its outline's
             box), `400mm`, `40cm`, `0.4m` (with `pixel_size`), or `far`. None or `auto`: as the positions in the lights
             file say, else not known; `each`: not known, and not the same for all lamps.
+        ambient: A picture without the lamp, which is subtracted in linear radiance, scaled by the exposures where EXIF
+            data tell them; None for those of the folder that are named so, `none` for none.
+        dark: A picture with the lens covered, which is subtracted as well; None and `none` as for `ambient`.
 
     Raises:
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
@@ -170,7 +174,7 @@ def load(
     distance = read_distance(light_distance)
     wanted, folder, scale = read_wanted(focal, principal, pixel_size), Path(folder), check_scale(scale)
     listing, faults = list_pictures(folder, names), Faults(anyway)
-    seen = survey(folder, listing, gamma, None if mask is None else Path(mask), faults, scale)
+    seen = survey(folder, listing, gamma, None if mask is None else Path(mask), faults, scale, (ambient, dark))
     known = _find_lights(listing, seen, lights, intensities, frame, faults)
     return _place_lamps(_assemble(folder, listing, seen, known, wanted, faults, scale), seen, known, distance)
 
@@ -198,6 +202,7 @@ def _assemble(
         notes=(*listing.notes, *seen.notes, *by.notes, *known.notes), coding=seen.coding,
         orientation=seen.orientation, overridden=tuple(faults.overridden), scale=scale, camera=by.camera,
         camera_origin=by.origin, pixel_size=by.pixel_size,
+        background=seen.background,
     )  # fmt: skip
 
 

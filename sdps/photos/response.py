@@ -1,6 +1,5 @@
-"""Values of picture files made linear, and the curves that colour profiles state."""
+"""Values of picture files made linear."""
 
-import struct
 from functools import cache
 
 import numpy as np
@@ -65,40 +64,3 @@ def display(linear: np.ndarray) -> np.ndarray:  # uint8
 @cache
 def _table(bits: int, gamma: str | float) -> np.ndarray:
     return curve(np.arange(_FULL[bits] + 1) / _FULL[bits], gamma).astype(np.float32)
-
-
-def profile_exponent(profile: bytes | None) -> float | None:
-    """Return log f(1/2) / log(1/2) of the red or grey curve f of an ICC profile; None where it tells none.
-
-    Reference: ICC.1:2022, 10.6 curveType and 10.18 parametricCurveType.
-    """
-    profile = profile or b""
-    try:
-        (count,) = struct.unpack_from(">I", profile, 128)
-        tags = {bytes(tag): offset for tag, offset, _ in struct.iter_unpack(">4sII", profile[132 : 132 + 12 * count])}
-        offset = tags[b"rTRC"] if b"rTRC" in tags else tags[b"kTRC"]
-        kind, _, number = struct.unpack_from(">4sII", profile, offset)
-        if kind == b"curv" and number == 0:
-            return 1.0
-        if kind == b"curv" and number == 1:
-            return struct.unpack_from(">H", profile, offset + 12)[0] / 256
-        if kind == b"curv":
-            table = np.frombuffer(profile, ">u2", number, offset + 12) / 65535
-            half = float(np.interp(0.5, np.linspace(0, 1, number), table))
-        elif kind == b"para":
-            form = number >> 16
-            names = ("g", "gab", "gabc", "gabcd", "gabcdef")[form]
-            values = np.frombuffer(profile, ">i4", len(names), offset + 12) / 65536
-            half = _parametric(dict(zip(names, values.tolist(), strict=True)))
-        else:
-            return None
-        return float(np.log(half) / np.log(0.5))
-    except (struct.error, TypeError, ValueError, IndexError, KeyError):
-        return None
-
-
-def _parametric(p: dict[str, float]) -> float:
-    """Evaluate an ICC parametric curve at 1/2, which lies in the power part of all curves in use."""
-    base = p.get("a", 1.0) * 0.5 + p.get("b", 0.0)
-    shift = p.get("e", 0.0) if "e" in p else (p.get("c", 0.0) if len(p) == 4 else 0.0)
-    return base ** p["g"] + shift

@@ -22,6 +22,14 @@ def reduce_grey(pixels: np.ndarray, gamma: str | float, shape: tuple[int, int]) 
     return reduce_image(np.concatenate([brightness(to_linear(some, gamma)) for some in rows]), shape)
 
 
+def reduce_linear(pixels: np.ndarray, gamma: str | float, shape: tuple[int, int]) -> np.ndarray:
+    """Return pixels (H, W, 3) as linear radiance reduced to a shape, (h, w, 3) float32, one channel at a time."""
+    image = np.empty((*shape, 3), np.float32)
+    for channel in range(3):  # a whole picture of floats may take a gigabyte
+        image[..., channel] = reduce_image(to_linear(pixels[..., channel], gamma), shape)
+    return image
+
+
 def refuse_huge(path: Path, full: tuple[int, int], shape: tuple[int, int], faults: Faults) -> None:
     """Refuse pictures that would fill the memory one by one."""
     if shape[0] * shape[1] > MOST_PIXELS:

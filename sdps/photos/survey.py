@@ -1,7 +1,7 @@
 """One look at every picture of a folder: which are photographs, that they fit together, and where the object is."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,8 @@ from render.shared.imaging.reducing import reduce_image, smaller_shape
 from render.shared.progress import progress_bar, stage
 from sdps.photos.faults import Faults
 from sdps.photos.masks import Variation, automatic_mask, bright_part
-from sdps.photos.picture_file import Picture, decode, is_misnamed, orient_pixels
+from sdps.photos.picture_file import Picture, decode, is_misnamed, orient_pixels, turn_pixels
+from sdps.photos.pictures.ambient import Background, Frame, find_frames, read_background
 from sdps.photos.pictures.contents import judge_content, like_mask
 from sdps.photos.pictures.gamma import resolve_gamma
 from sdps.photos.pictures.lens import Lens
@@ -19,10 +20,14 @@ from sdps.photos.pictures.listing import Listing
 from sdps.photos.pictures.picture_kinds import LOSSY, Coding
 from sdps.photos.pictures.picture_names import MASK, is_bare
 from sdps.photos.response import full_scale
-from sdps.photos.scaling import read_reduced_mask, reduce_grey, refuse_huge, scale_note
+from sdps.photos.scaling import read_reduced_mask, reduce_grey, reduce_linear, refuse_huge, scale_note
 
 _DARK = 0.5
 """A picture named as a dark frame is one if its mean is under this share of the others' median."""
+_BRIGHT = 0.9
+"""A picture is not without the lamp if its mean, at the same exposure, is above this share of the others' median."""
+_MANY = 8
+"""Pictures of one size and kind for each of another that is left out for it, and does not stop."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +43,7 @@ class Survey:
         left_out: Which pictures were left out for what they look like, empty for none.
         full: (H, W) of the files' pictures, once turned.
         lenses: What the EXIF data of the photographs say.
+        background: What is subtracted of every picture.
     """
 
     files: tuple[str, ...]
@@ -50,10 +56,17 @@ class Survey:
     left_out: str = ""
     full: tuple[int, int] = (0, 0)
     lenses: frozenset[Lens] = frozenset()
+    background: Background | None = None
 
 
 def survey(
-    folder: Path, listing: Listing, gamma: str | float, mask_file: Path | None, faults: Faults, scale: float = 1.0
+    folder: Path,
+    listing: Listing,
+    gamma: str | float,
+    mask_file: Path | None,
+    faults: Faults,
+    scale: float = 1.0,
+    without_lamp: tuple[str | Path | None, str | Path | None] = (None, None),
 ) -> Survey:
     """Decode every file once: photographs of one kind and size, finite in the mask, and the mask if there is none.
 
@@ -64,38 +77,49 @@ def survey(
         mask_file: The mask, None for the listing's or, without one, an automatic mask.
         faults: What becomes of faults that leave something to compute.
         scale: What the pictures' sides are multiplied by.
+        without_lamp: `ambient` and `dark` of `load`.
 
     Raises:
         InputError: pictures that cannot be used together.
     """
     masks = _read_masks(folder, listing) if mask_file is None else _Masks(mask_file, ())
-    look = _Look(folder, listing, gamma, faults, scale, masked=masks.file is not None)
-    look.through(judging=True)
-    if len(look.kept) < len(look.dropped):  # what most pictures look like is their nature
-        look = _Look(folder, listing, gamma, faults, scale, masked=masks.file is not None)
-        look.through(judging=False)
+    ambient = find_frames(folder, without_lamp[0], "--ambient", "an ambient picture", listing.ambient)
+    dark = find_frames(folder, without_lamp[1], "--dark", "a dark frame", ())
+    listing = _leave_out(folder, listing, {*ambient.paths, *dark.paths})
+    look, odd = _look_through(_Look(folder, listing, gamma, faults, scale, masked=masks.file is not None))
     left = [f"{name} ({why})" for name, why in look.dropped.items()]
     left_out = f"left out: {', '.join(left)}; --images takes what it names" if left else ""
+    left_out = "; ".join(text for text in (left_out, odd) if text)
     _check_fit(folder, look, left_out)
-    assert look.first is not None and look.variation is not None  # two pictures fit
+    assert look.first is not None  # two pictures fit
     notes = [note for note in (left_out, *masks.notes, *look.suspicious, *look.kinds(), look.why) if note]
-    notes += [*_orientation_note(look.first.orientation, look.turns), *scale_note(look.full, look.shape)]
-    if masks.file is not None:
-        mask, said = read_reduced_mask(masks.file, look.full, look.shape), f"the mask is {masks.file.name}"
-    else:
-        if not look.variation.changes().any():
-            faults.stop(
-                f"{folder}: nothing changes between the pictures; is the lamp on and moved? otherwise give a mask"
-            )
-        mask, said = automatic_mask(look.variation)
+    notes += [*_orientation_note(look), *scale_note(look.full, look.shape)]
+    mask, said = _find_mask(look, masks)
     _refuse_broken(folder, look.kept, look.broken, mask, faults)
     if (look.broken >= 0).any():
         notes.append("values that are not finite were set to 0")
+    if dark.asked is None:
+        dark = replace(dark, paths=tuple(folder / name for name in look.dark))
+    background, subtracted = read_background(ambient, dark, lambda path: _read_frame(look, path), look.exposures)
+    notes += subtracted
     return Survey(
         files=tuple(name for name in listing.files if name in look.kept), coding=look.first.coding, gamma=look.gamma,
         orientation=look.first.orientation, mask=mask, origin="automatic" if masks.file is None else "file",
         notes=(*notes, said), left_out=left_out, full=look.full, lenses=frozenset(look.lenses),
+        background=background,
     )  # fmt: skip
+
+
+def _find_mask(look: "_Look", masks: "_Masks") -> tuple[np.ndarray, str]:
+    """Return the mask (H, W) bool and a sentence about it."""
+    assert look.variation is not None
+    if masks.file is not None:
+        return read_reduced_mask(masks.file, look.full, look.shape), f"the mask is {masks.file.name}"
+    if not look.variation.changes().any():
+        look.faults.stop(
+            f"{look.folder}: nothing changes between the pictures; is the lamp on and moved? otherwise give a mask"
+        )
+    return automatic_mask(look.variation)
 
 
 @dataclass(eq=False)
@@ -113,7 +137,10 @@ class _Look:
     suspicious: list[str] = field(default_factory=list)
     groups: dict[tuple[tuple[int, ...], Coding], list[str]] = field(default_factory=dict)
     layers: dict[str, list[str]] = field(default_factory=dict)
-    turns: set[int] = field(default_factory=set)
+    turns: dict[int, list[str]] = field(default_factory=dict)
+    turned: list[str] = field(default_factory=list)  # by their own tag
+    dark: list[str] = field(default_factory=list)
+    exposures: dict[str, float] = field(default_factory=dict)
     lenses: set[Lens] = field(default_factory=set)
     first: Picture | None = None
     gamma: str | float = "linear"
@@ -130,12 +157,21 @@ class _Look:
         order = [name for name in listing.files if name not in listing.dark] + list(listing.dark)
         for number, name in enumerate(progress_bar(order, desc="photographs", unit="picture", delay=5), start=1):
             picture = decode(self.folder / name)
+            if name in listing.dark and _level(picture) < _DARK * np.median(self.levels or [0]):
+                self.dark.append(name)
+                continue
+            if name not in listing.files:
+                continue
             why = self._no_photograph(name, picture) if judging else ""
             if why:
                 self.dropped[name] = why
             else:
                 self._keep(name, picture)
             stage("reading", number, len(order))
+
+    def anew(self, listing: Listing) -> "_Look":
+        """Return a look at a listing that has seen nothing yet."""
+        return _Look(self.folder, listing, self.asked, self.faults, self.scale, self.masked)
 
     def kinds(self) -> list[str]:
         """Say which files are of another kind than their names tell, and which layers of EXR files were read."""
@@ -153,8 +189,6 @@ class _Look:
 
     def _no_photograph(self, name: str, picture: Picture) -> str:
         """Return why a picture is not a photograph, empty where it may be one."""
-        if name in self.listing.dark:
-            return "a dark frame; not yet subtracted" if _level(picture) < _DARK * np.median(self.levels or [0]) else ""
         role = judge_content(picture.pixels, lossy=picture.coding.kind in LOSSY)
         if role is None:
             return ""
@@ -166,20 +200,23 @@ class _Look:
 
     def _keep(self, name: str, picture: Picture) -> None:
         """Take a picture for a photograph."""
-        shape = picture.pixels.shape[:2]
         self.kept.append(name)
-        self.groups.setdefault((shape, picture.coding), []).append(name)
-        self.levels.append(_level(picture))
-        if picture.coding.kind == "EXR":
-            self.layers.setdefault(picture.layer, []).append(name)
         if self.first is None:
             self._begin(name, picture)
         assert self.first is not None and self.variation is not None
-        if (shape, picture.coding) != (self.first.pixels.shape[:2], self.first.coding):
-            return  # refused when all are known
-        self.turns.add(picture.orientation)
+        pixels, usual = turn_pixels(picture, self.first.orientation, self.full), self.first.pixels.shape[:2]
+        fits = pixels.shape[:2] == self.full
+        self.groups.setdefault((usual if fits else picture.pixels.shape[:2], picture.coding), []).append(name)
+        self.levels.append(_level(picture))
+        self.exposures[name] = picture.exposure
+        if picture.coding.kind == "EXR":
+            self.layers.setdefault(picture.layer, []).append(name)
+        if not fits or picture.coding != self.first.coding:
+            return  # left out or refused when all are known
+        self.turns.setdefault(picture.orientation, []).append(name)
+        if picture.pixels.shape[:2] != usual:
+            self.turned.append(name)
         self.lenses.add(picture.lens)
-        pixels = orient_pixels(picture.pixels, self.first.orientation)
         if picture.coding.floating:
             touched = reduce_image((~np.isfinite(pixels).all(-1)).astype(np.float32), self.shape) > 0
             self.broken[(self.broken < 0) & touched] = len(self.kept) - 1
@@ -195,6 +232,59 @@ class _Look:
         self.gamma, self.why = resolve_gamma(self.asked, picture.coding, self.listing.places)
         self.variation = Variation(self.shape)
         self.broken = np.full(self.shape, -1, np.int32)
+
+
+def _look_through(look: _Look) -> tuple[_Look, str]:
+    """Look at all pictures, again without a few of another size or kind; also return what is said of these."""
+    look.through(judging=True)
+    judging = len(look.kept) >= len(look.dropped)
+    if not judging:  # what most pictures look like is their nature
+        look = look.anew(look.listing)
+        look.through(judging=False)
+    usual = max(look.groups, key=lambda group: len(look.groups[group]), default=None)
+    odd = {name: group for group, names in look.groups.items() if group != usual for name in names}
+    if usual is None or not odd or _MANY * len(odd) > len(look.groups[usual]) or look.listing.certain & odd.keys():
+        return look, ""
+    (height, width), coding = usual
+    texts = [f"{name} ({other[0][1]}x{other[0][0]} pixels)" if other[0] != usual[0] else f"{name} ({other[1]})"
+             for name, other in odd.items()]  # fmt: skip
+    said = f"left out: {', '.join(texts)}; the others are {width}x{height} pixels, {coding}"
+    rest = tuple(name for name in look.listing.files if name not in odd)
+    look = look.anew(replace(look.listing, files=rest))
+    look.through(judging)
+    return look, said
+
+
+def _leave_out(folder: Path, listing: Listing, taken: set[Path]) -> Listing:
+    """Return the listing without files that are something else."""
+    places = {path.resolve() for path in taken}
+    files, dark = (tuple(name for name in names if (folder / name).resolve() not in places)
+                   for names in (listing.files, listing.dark))  # fmt: skip
+    return listing if not places else replace(listing, files=files, dark=dark)
+
+
+def _read_frame(look: _Look, path: Path) -> Frame:
+    """Read a picture without the lamp as the photographs are read."""
+    assert look.first is not None
+    picture = decode(path)
+    pixels = turn_pixels(picture, look.first.orientation, look.full)
+    why = _unfit(look, picture, pixels)
+    linear = None if why else reduce_linear(pixels, look.gamma, look.shape)
+    return Frame(linear, picture.exposure, why)
+
+
+def _unfit(look: _Look, picture: Picture, pixels: np.ndarray) -> str:
+    """Say why a picture cannot be subtracted from the photographs; empty if it can."""
+    assert look.first is not None
+    if pixels.shape[:2] != look.full:
+        (height, width), (high, wide) = pixels.shape[:2], look.full
+        return f"is {width}x{height} pixels, the photographs are {wide}x{high}"
+    if picture.coding != look.first.coding:
+        return f"is {picture.coding}, the photographs are {look.first.coding}"
+    exposure = float(np.median(list(look.exposures.values())))
+    alike = not exposure or not picture.exposure or abs(exposure / picture.exposure - 1) < 0.1
+    bright = alike and _level(picture) > _BRIGHT * float(np.median(look.levels))
+    return "is as bright as the photographs" if bright else ""
 
 
 @dataclass(frozen=True)
@@ -293,9 +383,14 @@ def _refuse_broken(folder: Path, files: Sequence[str], broken: np.ndarray, mask:
         )
 
 
-def _orientation_note(first: int, turns: set[int]) -> list[str]:
-    if len(turns) > 1:
-        return [
-            "the pictures' orientation tags differ, as happens when the camera looks down; all were turned as the first"
-        ]
-    return [] if first == 1 else ["all pictures were turned upright as their orientation tag says"]
+def _orientation_note(look: _Look) -> list[str]:
+    assert look.first is not None
+    first, notes = look.first.orientation, []
+    if look.turned:
+        verb = "was" if len(look.turned) == 1 else "were"
+        notes.append(f"{_span(look.turned)} {verb} saved turned and {verb} turned to agree by the own orientation tag")
+    odd = [name for tag, names in look.turns.items() if tag != first for name in names if name not in look.turned]
+    if odd:
+        return [*notes, f"the orientation tags of {_span(odd)} differ from the first picture's, as happens when the "
+                        "camera looks down; all were turned as the first"]  # fmt: skip
+    return [*notes, "all pictures were turned upright as their orientation tag says"] if first != 1 else notes

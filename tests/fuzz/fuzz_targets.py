@@ -110,9 +110,19 @@ def _pictures(folder: Path) -> None:
     assert cv2.imwrite(str(folder / "alpha.png"), (grey * 65535).astype(np.uint16))
     for name in ("a.bmp", "a.tga", "a.ppm", "a.webp", "jpeg.png"):
         Image.fromarray((_IMAGE * 255).astype(np.uint8)).save(folder / name, "JPEG" if name == "jpeg.png" else None)
+    tifffile.imwrite(folder / "planes.tif", np.moveaxis(_IMAGE, -1, 0).astype(np.float16), planarconfig="separate")
     (folder / "text.pgm").write_text("P2 16 12 1023\n" + " ".join(str(5 * number) for number in range(192)))
     layers = {f"View.{name}": np.ascontiguousarray(_IMAGE[..., k], np.float32) for k, name in enumerate("RGB")}
     OpenEXR.File({}, layers | {"View.Depth.Z": layers["View.R"]}).write(str(folder / "layers.exr"))
+
+
+def _camera_files(folder: Path) -> None:
+    from raw_files import dng
+
+    (folder / "a.dng").write_bytes(dng((np.resize(_IMAGE, (24, 32)) * 65535).astype(np.uint16), seconds=0.1))
+    for name in ("upright", "turned"):
+        heic = Path(__file__).parent.parent / f"sdps/photos/pictures/{name}.heic"
+        (folder / heic.name).write_bytes(heic.read_bytes())
 
 
 def _environments(folder: Path) -> None:
@@ -348,6 +358,14 @@ def _read_picture(folder: Path, path: Path) -> None:
     read_mask(path, (12, 16))
 
 
+def _read_camera_file(folder: Path, path: Path) -> None:
+    from pipelines.app.common.uploads import Limits, check_pixels
+    from sdps.photos.picture_file import decode
+
+    check_pixels(path, Limits())
+    decode(path)
+
+
 def _read_foreign_picture(folder: Path, path: Path) -> None:
     from pipelines.evaluate.benchmarks.uw_photos import _read
     from render.shared.images import read_image
@@ -453,6 +471,7 @@ TARGETS: dict[str, Target] = {
     "PBR maps": Target(write_maps, _read_maps),
     "meshes": Target(_meshes, _read_mesh),
     "photographs and masks": Target(_pictures, _read_picture),
+    "RAW and HEIC": Target(_camera_files, _read_camera_file),
     "pictures of other layouts": Target(_pictures, _read_foreign_picture, "*.[pj][np]g"),
     "environment maps": Target(_environments, _read_environment),
     "light files": Target(_light_files, _read_light_file),

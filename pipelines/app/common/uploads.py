@@ -13,7 +13,7 @@ from PIL import Image
 from render.shared.errors import InputError
 from render.shared.files import parse_json
 from sdps.photos.light_files import SUFFIXES as LIGHT_FILES
-from sdps.photos.pictures.picture_kinds import SUFFIXES
+from sdps.photos.pictures.picture_kinds import SUFFIXES, picture_kind
 
 PICTURES = tuple(SUFFIXES)
 """Suffixes of the pictures that `sdps infer` and the app read."""
@@ -116,6 +116,12 @@ def _read_size(path: Path) -> tuple[int, int]:
             head = opened.read(_EXR_HEADER)
         if head.startswith(_EXR):
             return _read_exr_size(head)
+        data = path.read_bytes()
+        kind = picture_kind(data, path.name)
+        if kind in ("RAW", "HEIC"):
+            from sdps.photos.pictures.camera_files import read_size
+
+            return read_size(path, data, kind)
         if head.startswith(_TIFF):
             import tifffile
 
@@ -124,7 +130,7 @@ def _read_size(path: Path) -> tuple[int, int]:
                 return int(page.imagewidth), int(page.imagelength)  # type: ignore[union-attr]
         with Image.open(path, formats=_list_formats()) as image:
             return image.size
-    except Image.DecompressionBombError:
+    except (Image.DecompressionBombError, InputError):
         raise
     except Exception as error:  # libraries raise many kinds of errors on damaged files
         raise InputError(f"{path.name}: cannot be read as a picture; save it again") from error

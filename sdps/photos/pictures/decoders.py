@@ -1,13 +1,13 @@
 """Decoders of every kind of picture file, each at the file's own depth.
 
 OpenCV reads PNG and TIFF, since Pillow reduces 16-bit RGB to 8 bits; Pillow reads JPEG, since OpenCV fills what a
-truncated file lacks with grey and says nothing, and BMP, TGA and WebP; OpenEXR reads EXR.
+truncated file lacks with grey and says nothing, and BMP, TGA and WebP; OpenEXR reads EXR. `camera_files.py` reads RAW,
+HEIC and AVIF.
 """
 
 import io
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,35 +19,18 @@ from PIL import Image
 from render.shared.decoding import check_picture, check_unpacked, silence
 from render.shared.errors import InputError
 from render.shared.imaging.exr_colours import read_exr_colours
-from sdps.photos.pictures.lens import EXIF, NO_LENS, Lens, read_lens
+from sdps.photos.pictures.camera_files import read_avif, read_heif, read_raw
+from sdps.photos.pictures.decoded import Decoded, read_exposure, read_orientation, repeat_grey
+from sdps.photos.pictures.lens import EXIF, Lens, read_lens
 from sdps.photos.pictures.netpbm import read_netpbm
 
 _ORIENTATION = 274
 _PROFILE = 34675
+_PLANES = 2  # TIFF's PlanarConfiguration of channels one after another
+_INKS = 5
+_COLOURS = {_INKS: "inks (CMYK)", 8: "CIELAB", 9: "CIELAB", 10: "CIELAB", 32844: "LogL", 32845: "LogLuv"}
+_BY_TIFFFILE = (np.dtype(np.uint32), np.dtype(np.int32), np.dtype(np.int16), np.dtype(np.float16))
 _PIXELS = {b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"}
-
-
-@dataclass(frozen=True, eq=False)
-class Decoded:
-    """What a file holds.
-
-    Attributes:
-        pixels: (H, W, 3) uint8, uint16 or float32, RGB as stored, not turned; grey is repeated.
-        alpha: (H, W) of the same type, None where there is none.
-        bits: Per channel in the file.
-        profile: The embedded colour profile.
-        orientation: EXIF orientation tag, 1 to 8.
-        layer: Which layer of an EXR file it was, empty where it has no name.
-        lens: What its EXIF data say.
-    """
-
-    pixels: np.ndarray
-    alpha: np.ndarray | None
-    bits: int
-    profile: bytes | None = None
-    orientation: int = 1
-    layer: str = ""
-    lens: Lens = NO_LENS
 
 
 def _png(path: Path, data: bytes) -> Decoded:
@@ -56,8 +39,8 @@ def _png(path: Path, data: bytes) -> Decoded:
         profile, exif = picture.info.get("icc_profile"), Image.Exif()
         exif.load(picture.info.get("exif", b""))  # not getexif(), which decodes the pixels
         picture.verify()  # its checksums; libpng would print
-    lens = read_lens(lambda: exif.get_ifd(EXIF))
-    return _by_opencv(path, _only_pixels(data), "PNG", profile, exif.get(_ORIENTATION, 1), lens)
+    said = read_lens(lambda: exif.get_ifd(EXIF)), read_exposure(lambda: exif.get_ifd(EXIF))
+    return _by_opencv(path, _only_pixels(data), "PNG", profile, exif.get(_ORIENTATION, 1), *said)
 
 
 def _only_pixels(data: bytes) -> bytes:
@@ -80,15 +63,52 @@ def _tiff(path: Path, data: bytes | bytearray) -> Decoded:
         tags, order = page.tags, file.byteorder
         profile = bytes(tags[_PROFILE].value) if _PROFILE in tags else None
         orientation = int(tags[_ORIENTATION].value) if _ORIENTATION in tags else 1
-        lens = read_lens(lambda: tags[EXIF].value if EXIF in tags else {})
+        exif = tags[EXIF].value if EXIF in tags else {}
+        said = read_lens(lambda: exif), read_exposure(lambda: exif)
+        _refuse_colours(path, page)
+        if page.dtype in _BY_TIFFFILE or (page.planarconfig == _PLANES and page.samplesperpixel > 1):
+            pixels = _read_page(path, page)
+            alpha = pixels[..., 3] if pixels.ndim == 3 and pixels.shape[2] == 4 else None
+            bits = 8 * page.dtype.itemsize
+            return Decoded(repeat_grey(pixels), alpha, bits, profile, read_orientation(orientation), "", *said)
         if orientation != 1:  # OpenCV turns such pictures by itself, or fails; the tag must be gone before
             data = bytearray(data)
             struct.pack_into(f"{order}H", data, tags[_ORIENTATION].valueoffset, 1)
-    return _by_opencv(path, data, "TIFF", profile, orientation, lens)
+    return _by_opencv(path, data, "TIFF", profile, orientation, *said)
+
+
+def _refuse_colours(path: Path, page: Any) -> None:
+    """Refuse a TIFF whose values are no amounts of red, green and blue, nor known to be turned into some."""
+    kind = int(page.photometric)
+    converted = kind == _INKS and page.bitspersample == 8 and page.planarconfig != _PLANES
+    what = "" if converted else _COLOURS.get(kind, "")
+    if what:
+        raise InputError(f"{path}: its colours are {what}; save it as RGB or grey")
+
+
+def _read_page(path: Path, page: Any) -> np.ndarray:  # (H, W[, C]) uint8, uint16 or float32
+    """Read what OpenCV does not: channels one after another, half floats, and integers of other kinds as floats."""
+    try:
+        pixels = page.asarray()
+    except ValueError as error:
+        if "imagecodecs" not in str(error):
+            raise
+        raise InputError(f"{path}: is compressed in a way that is not read; save it without compression") from error
+    if pixels.ndim == 3 and page.planarconfig == _PLANES:
+        pixels = np.moveaxis(pixels, 0, -1)
+    if pixels.dtype.kind in "iu" and pixels.dtype not in (np.uint8, np.uint16):
+        return (pixels / float(np.iinfo(pixels.dtype).max)).astype(np.float32)
+    return pixels.astype(np.float32) if pixels.dtype.kind == "f" else pixels
 
 
 def _by_opencv(
-    path: Path, data: bytes | bytearray, kind: str, profile: bytes | None, orientation: int, lens: Lens
+    path: Path,
+    data: bytes | bytearray,
+    kind: str,
+    profile: bytes | None,
+    orientation: int,
+    lens: Lens,
+    exposure: float = 0.0,
 ) -> Decoded:
     with silence():
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -100,9 +120,9 @@ def _by_opencv(
         raise InputError(f"{path}: pixels are {pixels.dtype}; save it with 8 or 16 bits or 32-bit floats")
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     alpha = pixels[..., 3] if channels == 4 else None
-    rgb = pixels[..., 2::-1] if channels >= 3 else _repeat_grey(pixels)
+    rgb = pixels[..., 2::-1] if channels >= 3 else repeat_grey(pixels)
     bits = 8 * pixels.dtype.itemsize
-    return Decoded(np.ascontiguousarray(rgb), alpha, bits, profile, _orientation(orientation), lens=lens)
+    return Decoded(np.ascontiguousarray(rgb), alpha, bits, profile, read_orientation(orientation), "", lens, exposure)
 
 
 def _by_pillow(*formats: str) -> Callable[[Path, bytes], Decoded]:
@@ -112,11 +132,12 @@ def _by_pillow(*formats: str) -> Callable[[Path, bytes], Decoded]:
         with Image.open(io.BytesIO(data), formats=formats) as picture:
             check_picture(path, picture, data)
             profile, orientation = picture.info.get("icc_profile"), picture.getexif().get(_ORIENTATION, 1)
-            lens, alpha = read_lens(lambda: picture.getexif().get_ifd(EXIF)), None
+            exif, alpha = picture.getexif(), None
+            lens, exposure = read_lens(lambda: exif.get_ifd(EXIF)), read_exposure(lambda: exif.get_ifd(EXIF))
             if "A" in picture.getbands() or "transparency" in picture.info:
                 alpha = np.asarray(picture.convert("RGBA"))[..., 3]
             pixels = np.asarray(picture.convert("RGB"))
-        return Decoded(pixels, alpha, 8, profile, _orientation(orientation), lens=lens)
+        return Decoded(pixels, alpha, 8, profile, read_orientation(orientation), "", lens, exposure)
 
     return decode
 
@@ -124,27 +145,16 @@ def _by_pillow(*formats: str) -> Callable[[Path, bytes], Decoded]:
 def _exr(path: Path, data: bytes) -> Decoded:
     found = read_exr_colours(path, "copy it again or leave it out")
     pixels, bits = found.pixels.astype(np.float32), 8 * found.pixels.dtype.itemsize
-    return Decoded(_repeat_grey(pixels), found.alpha, bits, layer=found.layer)
+    return Decoded(repeat_grey(pixels), found.alpha, bits, layer=found.layer)
 
 
 def _pnm(path: Path, data: bytes) -> Decoded:
     pixels = read_netpbm(path, data)
-    return Decoded(pixels if pixels.ndim == 3 else _repeat_grey(pixels), None, 8 * pixels.dtype.itemsize)
-
-
-def _repeat_grey(pixels: np.ndarray) -> np.ndarray:
-    """Return (H, W), (H, W, C) with C >= 3, or with a grey channel first, as (H, W, 3)."""
-    pixels = pixels.reshape(*pixels.shape[:2], -1)
-    wide = pixels[..., :3] if pixels.shape[2] >= 3 else pixels[..., :1]
-    return np.ascontiguousarray(np.broadcast_to(wide, (*wide.shape[:2], 3)))
-
-
-def _orientation(tag: object) -> int:
-    return tag if isinstance(tag, int) and 1 <= tag <= 8 else 1
+    return Decoded(pixels if pixels.ndim == 3 else repeat_grey(pixels), None, 8 * pixels.dtype.itemsize)
 
 
 DECODERS: dict[str, Callable[[Path, bytes], Decoded]] = {
     "PNG": _png, "TIFF": _tiff, "EXR": _exr, "PNM": _pnm, "JPEG": _by_pillow("JPEG", "MPO"), "BMP": _by_pillow("BMP"),
-    "TGA": _by_pillow("TGA"), "WebP": _by_pillow("WEBP"),
+    "TGA": _by_pillow("TGA"), "WebP": _by_pillow("WEBP"), "RAW": read_raw, "HEIC": read_heif, "AVIF": read_avif,
 }  # fmt: skip
 """By kind, from a path for messages and the whole file; all raise InputError or their library's own errors."""

@@ -6,9 +6,7 @@ from pathlib import Path
 from render.shared.errors import InputError
 from sdps.photos.pictures.listing import find_light_files
 from sdps.photos.pictures.picture_kinds import LOSSY, Coding
-
-SRGB_EXPONENT = 2.224
-"""log f(1/2) / log(1/2) of sRGB's decoding curve f, by which colour profiles with that curve are recognised."""
+from sdps.photos.pictures.profiles import name_curve
 
 _EXPONENTS = (0.3, 4.0)
 """Exponents that are taken for a display curve."""
@@ -30,10 +28,14 @@ def resolve_gamma(gamma: str | float, coding: Coding, folders: Sequence[Path]) -
         return applied, f"values are taken as {_words(applied)}, as you said"
     if coding.floating:
         return "linear", f"values are taken as linear, because the files are {coding}"
+    if coding.kind == "RAW":
+        return "linear", (
+            "camera RAW is developed linearly, all pictures alike: daylight white balance, the sensor's own colours"
+        )
     if coding.curve is not None:
-        applied = "linear" if abs(coding.curve - 1) < 0.05 else coding.curve
-        applied = "srgb" if abs(coding.curve - SRGB_EXPONENT) < 0.015 else applied
-        return applied, f"values are taken as {_words(applied)}, because the files' colour profile says so"
+        applied, about = name_curve(coding.curve), "about " if coding.rough else ""
+        stay = f"; colours stay in its primaries ({coding.primaries})" if coding.primaries else ""
+        return applied, f"values are taken as {about}{_words(applied)}, because the files' colour profile says so{stay}"
     if coding.bits == 16:
         return "linear", "values are taken as linear, because 16-bit files without colour profile mostly are"
     listed = [name for folder in folders for name in find_light_files(folder)]

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from render.shared.errors import InputError
 from render.shared.tables import natural_key, read_names
-from sdps.photos.pictures.picture_kinds import NAMED, SUFFIXES, UNREAD
+from sdps.photos.pictures.picture_kinds import NAMED, ORIGINALS, SUFFIXES, UNREAD
 from sdps.photos.pictures.picture_names import AMBIENT, DARK, MASK, is_bare, name_roles
 
 LISTS = ("names.txt", "filenames.txt")
@@ -18,6 +18,8 @@ LISTS = ("names.txt", "filenames.txt")
 _BENCHMARK = ("light_directions.txt", "light_intensities.txt", "filenames.txt", "lights.json")
 _MOST = 8
 """Names of one kind that a note lists one by one."""
+_FEWEST = 3
+"""Pictures from which on they are read, and not the RAW or HEIC files beside them, of which they may be copies."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,8 @@ class Listing:
     Attributes:
         files: Names of the photographs below the folder, `/` between folders, in order.
         certain: Those of them that the user or a list of names named one by one; what they look like does not matter.
-        dark: Those of them that are dark frames by their names, if they are dark.
+        dark: Dark frames by their names, if they are dark; of those in `files`, the others are photographs.
+        ambient: Pictures without the lamp by their names; not in `files`.
         masks: Names of masks below the folder, one named `mask` first.
         places: The folder and, where the photographs lie in one of its folders, that one; other files may be in either.
         notes: What was decided, in plain sentences.
@@ -39,6 +42,7 @@ class Listing:
     masks: tuple[str, ...]
     places: tuple[Path, ...]
     notes: tuple[str, ...]
+    ambient: tuple[str, ...] = ()
 
 
 def list_pictures(folder: Path, names: Sequence[str] | None = None) -> Listing:
@@ -72,9 +76,14 @@ def list_pictures(folder: Path, names: Sequence[str] | None = None) -> Listing:
     _check_count(folder, files, notes)
     masks = [name for name in there if roles.get(name) == MASK and name not in files]
     masks.sort(key=lambda name: not is_bare(name, MASK))
-    dark = tuple(name for name in files if roles.get(name) == DARK and name not in choice.certain)
+    unwanted = [name[1:] for name in names or () if name.startswith("!")]
+    dark, ambient = (
+        tuple(name for name in there if roles.get(name) == role and name not in choice.certain
+              and not any(_matches(name, pattern) for pattern in unwanted))
+        for role in (DARK, AMBIENT)
+    )  # fmt: skip
     places = (folder, folder / place) if place else (folder,)
-    return Listing(tuple(files), frozenset(choice.certain), dark, tuple(masks), places, tuple(notes))
+    return Listing(tuple(files), frozenset(choice.certain), dark, tuple(masks), places, tuple(notes), ambient)
 
 
 @dataclass(frozen=True)
@@ -94,7 +103,8 @@ def _by_list(folder: Path, listed: Path) -> _Choice:
         base = listed.parent.relative_to(folder).as_posix()
         files, place = [f"{base}/{name}" for name in files], f"{base}/{place}".rstrip("/")
     there = _pictures(folder) + _below(folder, place)
-    others = [name for name in there if name not in files and name_roles(there).get(name) != MASK]
+    roles = name_roles(there)
+    others = [name for name in there if name not in files and roles.get(name) not in (MASK, AMBIENT, DARK)]
     left = f"; not in it: {_join(others)}" if others else ""
     return _Choice(
         files, set(files), there, place, [f"{listed.name} names the {len(files)} pictures and their order{left}"]
@@ -104,15 +114,35 @@ def _by_list(folder: Path, listed: Path) -> _Choice:
 def _by_name(folder: Path, names: Sequence[str] | None) -> _Choice:
     there, place = _pictures(folder), ""
     roles = name_roles(there)
-    if all(name in roles for name in there):
+    if all(name in roles or _is_original(name) for name in there):
         place = _only_folder(folder, there)
         there += _below(folder, place)
         roles = name_roles(there)
     usual = [name for name in there if roles.get(name) in (None, DARK)]
-    files, certain = (usual, set()) if names is None else _choose(folder, names, usual, there)
+    usual, aside = _set_aside(usual)
+    files, certain = (usual, set()) if names is None else _choose(folder, names, usual, there, aside)
     notes = [] if names is None else [f"{len(files)} of {len(usual)} pictures were chosen by name"]
-    left = {name: role for name, role in roles.items() if name not in files and role != MASK}
-    return _Choice(files, certain, there, place, notes + _name_left_out(left if names is None else {}))
+    left = {name: role for name, role in roles.items() if name not in files and role not in (MASK, AMBIENT)}
+    notes += _name_left_out(left if names is None else {})
+    return _Choice(files, certain, there, place, notes + _name_aside([name for name in aside if name not in files]))
+
+
+def _is_original(name: str) -> bool:
+    return SUFFIXES.get(Path(name).suffix.lower()) in ORIGINALS
+
+
+def _set_aside(usual: list[str]) -> tuple[list[str], list[str]]:
+    """Split photographs into those that are read, and copies or originals of them, so that two kinds do not meet."""
+    plain, originals = ([name for name in usual if _is_original(name) == is_one] for is_one in (False, True))
+    return (plain, originals) if len(plain) >= _FEWEST or not originals else (originals, plain)
+
+
+def _name_aside(aside: Sequence[str]) -> list[str]:
+    """Say which pictures are set aside, by suffix."""
+    kinds = Counter(Path(name).suffix.lower() for name in aside)
+    counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    hint = " and ".join(f"'*{suffix}'" for suffix in dict.fromkeys(Path(name).suffix for name in aside))
+    return [f"left out: {counts} (the other pictures are read; --images {hint} takes these)"] if aside else []
 
 
 def find_light_files(folder: Path) -> list[str]:
@@ -133,18 +163,19 @@ def _below(folder: Path, place: str) -> list[str]:
     return [f"{place}/{name}" for name in _pictures(folder / place)] if place else []
 
 
-def _folders(folder: Path) -> list[str]:
-    """Return the folders in a folder that hold at least two photographs."""
-    found = []
+def _folders(folder: Path, originals: bool = True) -> list[str]:
+    """Return the folders in a folder with two photographs and more; those of `originals` if there are no others."""
+    found: dict[bool, list[str]] = {False: [], True: []}
     for path in sorted(folder.iterdir(), key=lambda path: natural_key(path.name)):
         if path.is_dir() and not path.name.startswith("."):
             try:
                 pictures = _pictures(path)
             except OSError:  # not ours to read
                 continue
-            if len(pictures) - len(name_roles(pictures)) >= 2:
-                found.append(path.name)
-    return found
+            photographs = set(pictures) - name_roles(pictures).keys()
+            if len(photographs) >= 2:
+                found[sum(map(_is_original, photographs)) > len(photographs) - 2].append(path.name)
+    return found[False] or (found[True] if originals else [])
 
 
 def _list_of(folder: Path) -> Path | None:
@@ -153,6 +184,9 @@ def _list_of(folder: Path) -> Path | None:
 
 def _only_folder(folder: Path, there: Sequence[str]) -> str:
     """Return the one folder in a folder that holds photographs, empty where there is none."""
+    if any(map(_is_original, there)):  # read where there are no copies
+        folders = _folders(folder, originals=False)
+        return folders[0] if len(folders) == 1 else ""
     folders = _folders(folder)
     if len(folders) > 1:
         what = "no photographs in it" if there else "no pictures in it"
@@ -166,8 +200,10 @@ def _read_list(path: Path) -> tuple[list[str], str]:
     best: list[str | None] = []
     for place in ("", *_folders(folder)):
         pictures = {name.lower(): name for name in reversed(_pictures(folder / place))}
-        stems = Counter(Path(name).stem for name in pictures)
-        bare = {Path(name).stem: whole for name, whole in pictures.items() if stems[Path(name).stem] == 1}
+        copies = {Path(name).stem for name in pictures if not _is_original(name)}
+        stems = Counter(Path(name).stem for name in pictures if not (_is_original(name) and Path(name).stem in copies))
+        whole = sorted(pictures.items(), key=lambda item: not _is_original(item[0]))  # copies overwrite originals
+        bare = {Path(name).stem: as_is for name, as_is in whole if stems[Path(name).stem] == 1}
         found = [_find(folder, place, name, pictures, bare) for name in names]
         if None not in found:
             files = [name for name in found if name is not None]
@@ -194,7 +230,7 @@ def _find(folder: Path, place: str, name: str, pictures: dict[str, str], bare: d
 
 
 def _choose(
-    folder: Path, names: Sequence[str], usual: Sequence[str], there: Sequence[str]
+    folder: Path, names: Sequence[str], usual: Sequence[str], there: Sequence[str], aside: Sequence[str] = ()
 ) -> tuple[list[str], set[str]]:
     """Expand patterns, in their order, and take out what those with `!` match; return those named in full as well."""
     wanted = [name for name in names if not name.startswith("!")]
@@ -204,6 +240,7 @@ def _choose(
     for name in wanted or ["*"]:
         exact = name if (folder / name).is_file() else next((file for file in there if Path(file).name == name), None)
         found = [exact] if exact is not None else [file for file in usual if _matches(file, name)]
+        found = found or [file for file in aside if _matches(file, name)]
         if not found:  # what a name says is left out, unless it is asked for
             found = [file for file in there if _matches(file, name)]
             certain.update(found)
@@ -224,8 +261,7 @@ def _name_left_out(roles: dict[str, str]) -> list[str]:
     kinds: dict[str, list[str]] = {}
     for name, role in roles.items():
         kinds.setdefault(role, []).append(name)
-    why = {AMBIENT: "ambient; not yet subtracted"}
-    texts = [f"{_join(names)} ({why.get(role, role + ' by name')})" for role, names in kinds.items()]
+    texts = [f"{_join(names)} ({role} by name)" for role, names in kinds.items()]
     return [f"left out: {', '.join(texts)}; --images takes what it names"] if texts else []
 
 

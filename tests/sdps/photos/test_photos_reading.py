@@ -15,8 +15,7 @@ from PIL import Image, ImageCms, ImageOps
 
 from render.shared.errors import InputError
 from sdps import photos
-from sdps.photos.pictures.gamma import SRGB_EXPONENT
-from sdps.photos.response import profile_exponent
+from sdps.photos.pictures.profiles import SRGB_EXPONENT, read_profile
 
 RAMP = np.stack(np.broadcast_arrays(np.linspace(0, 1, 20)[None], np.linspace(0.1, 0.9, 14)[:, None], 0.5), axis=-1)
 PAIR = np.stack([RAMP, RAMP * 0.5])  # (2, 14, 20, 3)
@@ -102,11 +101,11 @@ def test_gamma_follows_the_profile_the_folder_and_the_user(tmp_path: Path) -> No
 
 
 def test_profiles_tell_their_curve() -> None:
-    assert profile_exponent(profile()) == pytest.approx(SRGB_EXPONENT, abs=0.005)
-    assert profile_exponent(linear_profile()) == 1.0
-    assert profile_exponent(b"rubbish") is None
-    assert profile_exponent(profile()[:150]) is None
-    assert profile_exponent(None) is None
+    assert read_profile(profile()).exponent == pytest.approx(SRGB_EXPONENT, abs=0.005)
+    assert read_profile(linear_profile()).exponent == 1.0
+    assert read_profile(b"rubbish").exponent is None
+    assert read_profile(profile()[:150]).exponent is None
+    assert read_profile(None).exponent is None
 
 
 def test_a_linear_profile_makes_jpeg_linear(tmp_path: Path) -> None:
@@ -229,8 +228,8 @@ def good(tmp_path: Path) -> Path:
 def test_folders_without_enough_pictures(tmp_path: Path) -> None:
     assert "no such folder" in refusal(tmp_path / "nowhere")
     assert "no pictures in it; put PNG" in refusal(tmp_path)
-    (tmp_path / "a.CR2").touch()
-    assert "1 .cr2, which are not read" in refusal(tmp_path)
+    (tmp_path / "a.x3f").touch()
+    assert "1 .x3f, which are not read" in refusal(tmp_path)
     folders.write(tmp_path / "1.png", RAMP)
     assert "only one picture, 1.png" in refusal(tmp_path)
 

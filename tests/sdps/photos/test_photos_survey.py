@@ -12,6 +12,7 @@ from PIL import Image
 from render.shared.errors import InputError
 from render.shared.images import encode_normals, write_png
 from sdps import photos
+from sdps.photos.picture_file import orient_pixels
 
 LIGHTS = np.array([[0.5, 0, 0.8], [-0.5, 0, 0.8], [0, 0.5, 0.8], [0, -0.5, 0.8], [0.2, 0.2, 0.9]])
 IMAGES, MASK = folders.matte(LIGHTS, size=48)
@@ -85,8 +86,7 @@ def test_ambient_and_dark_frames(folder: Path) -> None:
     folders.write(folder / "dark.png", IMAGES[0] * 0.02)
     read = photos.load(folder)
     assert read.files == SHOTS
-    assert "ambient.png (ambient; not yet subtracted)" in told(read)
-    assert "dark.png (a dark frame; not yet subtracted)" in told(read)
+    assert "ambient.png was subtracted, as an ambient picture | dark.png was subtracted, as a dark frame" in told(read)
     folders.write(folder / "dark.png", IMAGES[0])  # the dark cat
     assert photos.load(folder).files == (*SHOTS, "dark.png")
 
@@ -184,3 +184,50 @@ def test_lights_that_do_not_fit_name_what_was_left_out(folder: Path) -> None:
     np.savetxt(folder / "lights.txt", np.vstack([LIGHTS, LIGHTS[:1]]))
     with pytest.raises(InputError, match=r"6 rows for 5 pictures .*left out: 0.png \(has two values only"):
         photos.load(folder, lights=folder / "lights.txt")
+
+
+@pytest.mark.parametrize("odd", [1, 4, 9])
+def test_one_of_another_size_or_kind_among_many_is_left_out(tmp_path: Path, odd: int) -> None:
+    lights = np.vstack([LIGHTS, LIGHTS[:4] * [1, 1, 0.7]])
+    images, _ = folders.matte(lights, size=48)
+    folder = folders.write_folder(tmp_path / "cat", images, bits=8)
+    usual = tuple(f"{number}.png" for number in range(1, 10) if number != odd)
+    whole = photos.load(folder, names=[f"!{odd}.png"])
+    for image, bits, words in ((images[0][:-4], 8, "80x76 pixels"), (images[0], 16, "16-bit PNG")):
+        folders.write(folder / f"{odd}.png", image, bits)
+        read = photos.load(folder)
+        assert f"left out: {odd}.png ({words}); the others are 80x80 pixels, 8-bit PNG" in told(read)
+        assert read.files == usual
+        np.testing.assert_array_equal(read.mask, whole.mask)
+        np.testing.assert_array_equal(read[0:8], whole[0:8])
+        with pytest.raises(InputError, match=rf"{odd}.png: is .*, the other 8"):
+            photos.load(folder, names=[f"{odd}.png", "*.png"])
+    folders.write(folder / f"{odd % 9 + 1}.png", images[0][:-4])
+    with pytest.raises(InputError, match=r"all pictures must have one size|keep one kind"):
+        photos.load(folder)
+
+
+@pytest.mark.parametrize("order", ["123", "132"])
+@pytest.mark.parametrize("tag", [5, 6, 7, 8])
+def test_one_that_was_saved_turned_is_turned_to_agree(tmp_path: Path, tag: int, order: str) -> None:
+    sensor = np.rint(IMAGES[:3, :-8] * 255).astype(np.uint8)  # not square
+    for name, image in zip(order, sensor, strict=True):
+        upright = orient_pixels(image, tag)
+        picture = Image.fromarray(upright if name == "2" else image)
+        exif = picture.getexif()
+        exif[274] = 1 if name == "2" else tag
+        picture.save(tmp_path / f"{name}.png", exif=exif)
+    read = photos.load(tmp_path, gamma="linear")
+    assert read.shape == (80, 72)
+    expected = np.stack([orient_pixels(image, tag) for image in sensor]) / np.float32(255)
+    np.testing.assert_allclose(read[0:3], expected[[order.index(name) for name in "123"]], atol=1e-6)
+    assert "2.png was saved turned" in told(read)
+
+
+def test_the_pictures_whose_orientation_tags_differ_are_named(tmp_path: Path) -> None:
+    for number, tag in ((1, 1), (2, 1), (3, 6)):
+        picture = Image.fromarray(np.rint(IMAGES[number] * 255).astype(np.uint8))
+        exif = picture.getexif()
+        exif[274] = tag
+        picture.save(tmp_path / f"{number}.jpg", quality=98, exif=exif)
+    assert "the orientation tags of 3.jpg differ from the first picture's" in told(photos.load(tmp_path))

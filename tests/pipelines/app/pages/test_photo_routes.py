@@ -51,6 +51,17 @@ def archive(**files: bytes) -> bytes:
     return buffer.getvalue()
 
 
+def test_an_ambient_picture_among_the_uploads_is_subtracted(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+    dim = io.BytesIO()
+    Image.fromarray(np.asarray(Image.open(hills / "1.png")) // 4).save(dim, "PNG")
+    assert client.send("PUT", f"{path}/uploads/ambient.png", dim.getvalue())[0] == 200
+    checked = client.wait(client.post(f"{path}/start/check"))
+    assert len(checked["result"]["files"]) == len(LIGHTS)
+    assert "ambient.png was subtracted, as an ambient picture" in checked["result"]["notes"]
+
+
 def test_from_files_to_a_zip(address: str, hills: Path) -> None:
     client = Client(address)
     path = client.new_set(hills)

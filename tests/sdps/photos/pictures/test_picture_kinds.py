@@ -159,9 +159,10 @@ def test_odd_profiles_and_tags_print_nothing(tmp_path: Path, capfd: pytest.Captu
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (b"\0\0\0\x18ftypheic" + bytes(90), "is a HEIC picture, which is not read; convert it"),
+        (b"\0\0\0\x18ftypheic" + bytes(90), "damaged or not a HEIC"),
         (b"GIF89a" + bytes(90), "is a GIF"),
-        (b"II*\0\x10\0\0\0CR\x02\0" + bytes(90), "is camera RAW"),
+        (b"II*\0\x10\0\0\0CR\x02\0" + bytes(90), "damaged or not camera RAW"),
+        (b"IIII" + bytes(90), "is camera RAW of a kind, which is not read; convert it"),
         (b"<!DOCTYPE html><html>", "is a web page"),
         (b"version https://git-lfs.github.com/spec/v1\n", "is a placeholder of Git LFS"),
         (b"", "the file is empty"),

@@ -27,7 +27,8 @@ def test_masks_results_and_ambient_pictures_are_named_and_left_out(tmp_path: Pat
     found = list_pictures(fill(tmp_path, *SHOTS, "x_mask.png", "x_normal_result.png", "x_ambient.png", "IMG.CR2"))
     assert (found.files, found.masks) == (SHOTS, ("x_mask.png",))
     assert "x_normal_result.png (a result by name)" in told(found)
-    assert "x_ambient.png (ambient; not yet subtracted)" in told(found)
+    assert found.ambient == ("x_ambient.png",) and "ambient" not in told(found)
+    assert not list_pictures(tmp_path, ["!*ambient*"]).ambient
     assert "left out: 1 .cr2" in told(found)
 
 
