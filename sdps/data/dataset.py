@@ -143,9 +143,11 @@ def require_lights(where: str | Path, scenes: Sequence[SceneSpec], options: Samp
         InputError: too few for equally many images, or for light that is mixed; or an environment that is not a map.
     """
     require_equal_counts(where, scenes, options.images)
-    if options.augmentation.mixed is not None:
-        require_enough(min(len(scene.lights) for scene in scenes), str(where))
-        options.augmentation.mixed.load()
+    mixed = options.augmentation.mixed
+    if mixed is not None:
+        if not mixed.sparse:
+            require_enough(min(len(scene.lights) for scene in scenes), str(where))
+        mixed.load()
 
 
 def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, rng: np.random.Generator) -> Batch:
@@ -220,11 +222,11 @@ def _mix(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return images (Q, H, W, 3) float32 under mixed light, and the directions (Q, 3) it comes from on average."""
     assert options.augmentation.mixed is not None
-    stage = LightStage(scene.light_directions(), f"scene {scene.id}")
-    weights, _ = options.augmentation.mixed.draw(stage, options.images, rng)
+    mixed = options.augmentation.mixed
+    stage = LightStage(scene.light_directions(), f"scene {scene.id}", sparse=mixed.sparse)
+    weights, _ = mixed.draw(stage, options.images, rng)
     packed = PackedImages.of(images)
-    mixed = PackedImages(mix(packed.values, weights), packed.kept)
-    return mixed[:], stage.mean_directions(weights)
+    return PackedImages(mix(packed.values, weights), packed.kept)[:], stage.mean_directions(weights)
 
 
 def choose_images(directions: np.ndarray, options: SampleOptions, rng: np.random.Generator) -> np.ndarray:  # (Q,)

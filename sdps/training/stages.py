@@ -180,6 +180,8 @@ class NormalStage(Stage):
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the network's own loss on the crops, as configured."""
+        if self.config.fewest_images and not self.config.resident:  # on a device they were drawn so
+            batch = leave_out(batch, self.config.fewest_images)
         lights, config = self.training_lights(batch), self.config
         side = config.crop or config.size
         images, mask, normals = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
@@ -240,6 +242,14 @@ def disturb(lights: Lights, seeds: list[int], limit: float) -> Lights:
     errors = torch.from_numpy(np.stack(expected)).to(lights.intensities)
     directions = functional.normalize(moved, dim=-1)
     return lights._replace(directions=directions, intensities=lights.intensities * factors, expected_error=errors)
+
+
+def leave_out(batch: Batch, fewest: int) -> Batch:
+    """Return a batch with so many images of each scene or more, as its first scene's seed draws."""
+    most = batch.images.shape[1]
+    count = int(generator(int(batch.seed[0]), "images").integers(min(fewest, most), most, endpoint=True))
+    some = {name: getattr(batch, name)[:, :count] for name in ("images", "directions", "intensities", "nearness")}
+    return batch._replace(**some)
 
 
 def placed(batch: Batch) -> Placement:

@@ -33,8 +33,8 @@ class TrainingConfig:
         batch_scenes: Scenes per optimiser step.
         accumulate: Parts a step's scenes are processed in, to save memory; must divide `batch_scenes`.
         images: Images drawn per scene and step.
-        fewest_images: Where samples are made on the device (`resident`), each step draws so many to `images`; 0: always
-            `images`.
+        fewest_images: Where samples are made on the device (`resident`) or their light is mixed, each step draws so
+            many to `images`; 0: always `images`.
         size: Side in pixels to which scenes of another size are resized.
         learning_rate: Peak learning rate.
         schedule: `halving` (after each of `halve_after`), `cosine` (to zero), `constant`, or `trapezoid`
@@ -126,9 +126,11 @@ class TrainingConfig:
             raise InputError("steps and minutes are both set; keep one of them")
         if self.batch_scenes % self.accumulate:
             raise InputError(f"accumulate {self.accumulate} must divide batch_scenes {self.batch_scenes}")
-        if self.fewest_images and not (self.resident and self.fewest_images <= self.images):
+        varies = self.resident or self.augmentation.mixed is not None
+        if self.fewest_images and not (varies and self.fewest_images <= self.images):
             raise InputError(
-                f"fewest_images {self.fewest_images} needs resident: true, and to be at most images ({self.images})"
+                f"fewest_images {self.fewest_images} needs resident: true or augmentation.mixed, and to be at most "
+                f"images ({self.images})"
             )
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 and at least 16, got {self.size}")
