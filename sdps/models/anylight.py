@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from render.shared.errors import InputError
 from render.shared.progress import stage
+from sdps.core.lighting import IRRADIANCE, harmonics
 from sdps.core.losses import NormalCriterion
 from sdps.models.base import Observations, Truth
 from sdps.models.blocks import SLOPE, Exchange, LightAttention, attend, deconv, pool
@@ -138,19 +139,23 @@ class AnyLightNet(CorrectedNetwork):
         self.fuse = nn.Sequential(
             nn.Linear(2 * width + _KNOWN, 128), nn.LeakyReLU(SLOPE), nn.Linear(128, 128), nn.LeakyReLU(SLOPE)
         )
-        self.light = nn.Linear(channels, 3)
+        self.light, self.shade = nn.Linear(channels, 9), nn.Linear(width, 1)
         self._build_map(context)
         self.size_multiple = 8
 
     def loss(self, seen: Observations, truth: Truth, criterion: NormalCriterion) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the losses of the normals, of the expected error, and of where each image's light comes from."""
+        """Return the losses of the normals, of the expected error, and of each image's light and shading."""
         fused, glance = self._encode(seen)
         normals, expected = self.correct(fused)
         loss, terms = staged_loss(StagedNormals(fused.face(fused.normals), normals, expected), truth, criterion)
+        assert truth.light is not None
         with torch.autocast(normals.device.type, enabled=False):
-            towards = functional.normalize(self.light(glance.tokens.float().mean(dim=2)), dim=-1)
-            terms["lighting_loss"] = ((towards - truth.directions).square().sum(-1) + 1e-6).sqrt().mean()
-        return loss + criterion.lighting_weight * terms["lighting_loss"], terms
+            found = self.light(glance.tokens.float().mean(dim=2))
+            terms["lighting_loss"] = (found - truth.light).abs().mean()
+            shading = self.shade(glance.surroundings.float().permute(0, 1, 3, 4, 2))[..., 0]  # (B, Q, h, w)
+            terms["shading_loss"] = shading_loss(shading, truth)
+        loss = loss + criterion.lighting_weight * terms["lighting_loss"]
+        return loss + criterion.shading_weight * terms["shading_loss"], terms
 
     def inference_seconds(self, images: int, pixels: float, box: float, views: int) -> float:
         """Return about how long inference takes: every view is seen anew."""
@@ -246,6 +251,23 @@ def object_places(mask: Tensor) -> Tensor:
     return torch.nan_to_num(placed, 0.0, 0.0, 0.0).clamp(-2.0, 2.0)
 
 
+def shading_loss(found: Tensor, truth: Truth) -> Tensor:
+    """Return the mean error of shading (B, Q, h, w), the inverse hyperbolic sine of what a matte surface would show.
+
+    Its light is of order two and reaches everything; each image's mean over the object is 1.
+    """
+    assert truth.light is not None
+    size = found.shape[-2:]
+    mask = functional.adaptive_avg_pool2d(truth.mask, size)  # (B, 1, h, w)
+    normals = functional.normalize(functional.adaptive_avg_pool2d(truth.normals, size), dim=1)
+    shown = harmonics(normals.permute(0, 2, 3, 1)) * truth.light.new_tensor(IRRADIANCE)  # (B, h, w, 9)
+    shading = torch.einsum("bhwk,bqk->bqhw", shown, truth.light).clamp(min=0.0) * mask
+    area = mask.sum(dim=(2, 3), keepdim=True).clamp(min=1e-6)  # (B, 1, 1, 1)
+    level = shading.sum(dim=(2, 3), keepdim=True) / area
+    errors = (found - torch.asinh(shading / (level + _DARK))).abs() * mask
+    return (errors.sum(dim=(2, 3), keepdim=True) / area).mean()
+
+
 def image_inputs(images: Tensor, mask: Tensor, places: Tensor, means: Tensor) -> Tensor:
     """Return what is read of each image, (B, Q, 9, h, w), sides at most `SIDE` and multiples of 8.
 
@@ -281,7 +303,7 @@ def pixel_inputs(values: Tensor, levels: Tensor, places: Tensor) -> tuple[Tensor
     relative = values / levels[:, :1]  # (n, Q, 3)
     grey = relative.mean(dim=-1)  # (n, Q)
     mean = relative.mean(dim=1)  # (n, 3)
-    spread = grey.std(dim=1, correction=0) / (grey.mean(dim=1).abs() + _DARK)
+    spread = (grey - grey.mean(dim=1, keepdim=True)).square().mean(dim=1).sqrt() / (grey.mean(dim=1).abs() + _DARK)
     full = values.amax(dim=-1) / levels[:, 1]  # 1 is as bright as anything in the image: a highlight, or clipped
     dark = torch.log(grey.clamp(min=0.0) + 0.02)
     seen = torch.cat([shares(relative, dim=1), torch.stack([torch.asinh(2.0 * grey), full, dark], dim=-1)], dim=-1)

@@ -187,8 +187,8 @@ class NormalStage(Stage):
         images, mask, normals = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
         placement = Placement(*(crop(part, batch.corner, side) for part in flatten_some(placed(batch), batch.seed)))
         seen = self.network.observe(images, mask, lights, placement=placement)
-        weights = config.gradient_weight, config.lighting_weight, config.expected_weight
-        truth = Truth(normals, mask, batch.directions, batch.intensities)
+        weights = config.gradient_weight, config.lighting_weight, config.expected_weight, config.shading_weight
+        truth = Truth(normals, mask, batch.directions, batch.intensities, batch.light)
         return self.network.loss(seen, truth, NormalCriterion(config.loss, *weights))
 
     def metrics(self, batch: Batch) -> dict[str, float]:
@@ -248,7 +248,9 @@ def leave_out(batch: Batch, fewest: int) -> Batch:
     """Return a batch with so many images of each scene or more, as its first scene's seed draws."""
     most = batch.images.shape[1]
     count = int(generator(int(batch.seed[0]), "images").integers(min(fewest, most), most, endpoint=True))
-    some = {name: getattr(batch, name)[:, :count] for name in ("images", "directions", "intensities", "nearness")}
+    some = {
+        name: getattr(batch, name)[:, :count] for name in ("images", "directions", "intensities", "nearness", "light")
+    }
     return batch._replace(**some)
 
 
