@@ -173,22 +173,19 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     # A child of the stream, so that the number does not depend on how much the sample draws.
     seed = int(rng.spawn(1)[0].integers(2**63))
     images, directions, chosen, weights = _draw_images(scene, stored.images, options, rng)
-    towards = directions if weights is None else scene.light_directions()
-    normals, mask = stored.normals, stored.mask
+    normals, mask, lamps = stored.normals, stored.mask, scene.light_directions()
     layout = lay_out(scene, stored.depth, mask, chosen)
     if options.augmentation.symmetries:
         symmetry = Symmetry(int(rng.integers(4)), bool(rng.integers(2)))
         images, normals, mask = symmetry.images(images, 1), symmetry.images(normals, 0), symmetry.images(mask, 0)
         normals, directions, layout = symmetry.vectors(normals), symmetry.vectors(directions), layout.turn(symmetry)
-        towards = symmetry.vectors(towards)
+        lamps = symmetry.vectors(lamps)
     if options.rescale and min(mask.shape) > options.size:
         images, normals, mask, layout = _rescale(images, normals, mask, layout, options, rng)
     images, normals, mask, layout = resize(images, normals, mask, layout, options.size)
     placed = place(layout, mask, directions)
     if layout.positions is not None:
         images = images / placed.irradiance[:, None, None, None]
-    light = harmonics(towards if weights is not None else placed.directions)
-    light = light if weights is None else weights @ light
     images, intensities = augment(images, mask, options.augmentation, rng)
     corner = _crop_corner(mask, options.crop, options.min_object, rng) if options.crop else (0, 0)
     return Batch(
@@ -202,8 +199,14 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
         nearness=torch.from_numpy(placed.nearness),
         places=_channels_first(placed.places),
         sights=_channels_first(placed.sights),
-        light=torch.from_numpy((light / light[:, :1]).astype(np.float32)),
+        light=torch.from_numpy(_light(lamps, weights, placed.directions)),
     )
+
+
+def _light(lamps: np.ndarray, weights: np.ndarray | None, directions: np.ndarray) -> np.ndarray:  # (Q, 9) float32
+    """Return the harmonics of the light of images that have shares (Q, L) of lamps (L, 3), or one lamp each (Q, 3)."""
+    light = harmonics(directions) if weights is None else weights @ harmonics(lamps)
+    return (light / light[:, :1]).astype(np.float32)
 
 
 def _channels_first(pictures: np.ndarray) -> Tensor:  # (..., 3, H, W) float32

@@ -74,6 +74,15 @@ class Stage(ABC):
         images = self.config.validation_images or options.images
         return replace(options, images=images, fewest=0, crop=0, rescale=False, augmentation=augmentation)
 
+    def validations(self) -> dict[str, SampleOptions]:
+        """Return what is validated on, by how its metrics end: where light is mixed, single lamps as well."""
+        options = self.validation_options()
+        mixed = options.augmentation.mixed
+        if mixed is None or not mixed.single:
+            return {"": options}
+        alone = replace(options.augmentation, mixed=replace(mixed, single=1.0, surrounded=0.0))
+        return {"": options, "_single": replace(options, augmentation=alone)}
+
     @abstractmethod
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the scalar to minimise, and named scalars to log."""
