@@ -161,6 +161,12 @@ class AnyLightNet(CorrectedNetwork):
         """Return about how long inference takes: every view is seen anew."""
         return views * (3.0e-6 * images * pixels + 2.0e-6 * box)
 
+    def directness(self, seen: Observations) -> Tensor:
+        """Return how far each image's light comes from one direction, (B, Q): 1 from a lamp, 0 from all sides alike."""
+        with torch.autocast(seen.images.device.type, enabled=False):
+            found = self.light(self._look(seen)[0].tokens.float().mean(dim=2))
+        return measure_directness(found)
+
     def encode(self, seen: Observations) -> FusedMap:
         """Return the fused map of all of a scene's images."""
         return self._encode(seen)[0]
@@ -175,11 +181,7 @@ class AnyLightNet(CorrectedNetwork):
         """Return the fused map, and what was read of the images; without gradients a few pixels at a time."""
         assert seen.mask is not None  # the network asks for it
         inside = seen.mask[:, 0] > 0.5
-        with torch.no_grad(), torch.autocast(seen.images.device.type, enabled=False):
-            levels = measure(seen.images, seen.mask)  # (B, Q, 2)
-            places = object_places(seen.mask)  # (B, 2, H, W)
-            small = image_inputs(seen.images, seen.mask, places, levels[..., 0])
-        glance = self.read(small)
+        glance, levels, places = self._look(seen)
         most = 2**62 if torch.is_grad_enabled() else max(1, _STRIP // seen.images.shape[1])
         found = []
         for number in range(len(inside)):
@@ -191,8 +193,16 @@ class AnyLightNet(CorrectedNetwork):
                 own = places[number].flatten(1)[:, some].T
                 found.append(self._per_pixel(pixels, levels[number], own, around, glance.tokens[number]))
                 stage("normals", len(found), max(len(found), -(-len(where) // most)))
-        all_found = torch.cat(found) if found else small.new_zeros(0, self.offset.out_features + 32)
+        all_found = torch.cat(found) if found else levels.new_zeros(0, self.offset.out_features + 32)
         return self.to_map(all_found, inside, seen.placement), glance
+
+    def _look(self, seen: Observations) -> tuple[Glance, Tensor, Tensor]:
+        """Return what was read of the images, their means and brightest values (B, Q, 2), and `object_places`."""
+        assert seen.mask is not None
+        with torch.no_grad(), torch.autocast(seen.images.device.type, enabled=False):
+            levels, places = measure(seen.images, seen.mask), object_places(seen.mask)
+            small = image_inputs(seen.images, seen.mask, places, levels[..., 0])
+        return self.read(small), levels, places
 
     def _around(self, read: Tensor, size: tuple[int, int], some: Tensor) -> Tensor:
         """Return what the maps (Q, C', h, w) of a scene's images say at pixels of images of a size, (n, Q, C')."""
@@ -249,6 +259,11 @@ def object_places(mask: Tensor) -> Tensor:
     radius = ((high - low).amax(dim=1, keepdim=True) + 1.0) / 2
     placed = (both - (low + high) / 2) / radius
     return torch.nan_to_num(placed, 0.0, 0.0, 0.0).clamp(-2.0, 2.0)
+
+
+def measure_directness(light: Tensor) -> Tensor:
+    """Return the length of the mean direction of light of harmonics (..., 9), at most 1."""
+    return (light[..., 1:4].norm(dim=-1) / (3.0**0.5 * light[..., 0].clamp(min=0.1))).clamp(max=1.0)
 
 
 def shading_loss(found: Tensor, truth: Truth) -> Tensor:
