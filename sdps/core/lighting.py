@@ -37,11 +37,13 @@ def harmonics(vectors: Array) -> Array:
 
     Order: 1; y, z, x; xy, yz, 3 z^2 - 1, xz, x^2 - y^2.
     """
+    xp = library(vectors)
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     first, second = 3.0**0.5, 15.0**0.5
-    squares = [second * x * y, second * y * z, 5.0**0.5 / 2 * (3.0 * z * z - 1.0), second * x * z]
-    parts = [x * 0.0 + 1.0, first * y, first * z, first * x, *squares, second / 2 * (x * x - y * y)]
-    return library(vectors).stack(parts, axis=-1)
+    low = xp.stack([x * 0.0 + 1.0, first * y, first * z, first * x], axis=-1)
+    squares = 5.0**0.5 / 2 * (3.0 * z * z - 1.0), second / 2 * (x * x - y * y)
+    high = xp.stack([second * x * y, second * y * z, squares[0], second * x * z, squares[1]], axis=-1)
+    return xp.concatenate([low, high], axis=-1)
 
 
 IRRADIANCE = (1.0, *(2.0 / 3.0,) * 3, *(1.0 / 4.0,) * 5)

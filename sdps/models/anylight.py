@@ -68,7 +68,7 @@ class Reader(nn.Module):
 
     def forward(self, seen: Tensor) -> Glance:
         """Return what images (B, Q, 9, h, w) show; h and w are multiples of 8."""
-        features = []
+        features: list[Tensor] = []
         for level in self.levels:
             features.append(level(features[-1] if features else seen))
         half, quarter, eighth = (each.flatten(0, 1) for each in features)
@@ -189,7 +189,7 @@ class AnyLightNet(CorrectedNetwork):
             values = seen.images[number].flatten(2)
             for some in where.split(most):
                 pixels = values[..., some].permute(2, 0, 1).float()  # (n, Q, 3)
-                around = self._around(glance.surroundings[number], inside.shape[1:], some)
+                around = self._around(glance.surroundings[number], (inside.shape[1], inside.shape[2]), some)
                 own = places[number].flatten(1)[:, some].T
                 found.append(self._per_pixel(pixels, levels[number], own, around, glance.tokens[number]))
                 stage("normals", len(found), max(len(found), -(-len(where) // most)))
@@ -272,7 +272,7 @@ def shading_loss(found: Tensor, truth: Truth) -> Tensor:
     Its light is of order two and reaches everything; each image's mean over the object is 1.
     """
     assert truth.light is not None
-    size = found.shape[-2:]
+    size = (found.shape[-2], found.shape[-1])
     mask = functional.adaptive_avg_pool2d(truth.mask, size)  # (B, 1, h, w)
     normals = functional.normalize(functional.adaptive_avg_pool2d(truth.normals, size), dim=1)
     shown = harmonics(normals.permute(0, 2, 3, 1)) * truth.light.new_tensor(IRRADIANCE)  # (B, h, w, 9)

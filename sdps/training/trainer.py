@@ -277,7 +277,7 @@ class Trainer:
             return {}
         trained, self.stage.network = self.stage.network, self._kept()
         self.stage.network.eval()
-        values = {}
+        values: dict[str, float] = {}
         try:
             for suffix, options in self.stage.validations().items():
                 values |= {f"val_{name}{suffix}": value for name, value in self._measure(options).items()}
