@@ -120,6 +120,7 @@ class AnyLightNet(CorrectedNetwork):
     """
 
     needs_lights = False
+    kept_bytes = 12  # twice 6: parts are joined
 
     def __init__(
         self, *, width: int = 64, blocks: int = 3, heads: int = 4, attending: int = 1, tokens: int = 6,
@@ -240,11 +241,11 @@ class AnyLightNet(CorrectedNetwork):
 
 def measure(images: Tensor, mask: Tensor) -> Tensor:
     """Return the mean and the brightest value over the object, (B, Q, 2), of images (B, Q, 3, H, W)."""
-    masks = mask[:, None]
-    grey = images.float().mean(dim=2, keepdim=True) * masks
-    mean = grey.sum(dim=(2, 3, 4)) / masks.sum(dim=(2, 3, 4)).clamp(min=1.0)
-    brightest = (images.float() * masks).amax(dim=(2, 3, 4))
-    return torch.stack([mean, brightest], dim=-1).clamp(min=1e-6)
+    area, found = mask.sum(dim=(1, 2, 3)).clamp(min=1.0), []
+    for image in images.unbind(dim=1):  # one at a time: they may be large, and kept in 16 bits
+        shown = image.float() * mask
+        found.append(torch.stack([shown.mean(dim=1).sum(dim=(1, 2)) / area, shown.amax(dim=(1, 2, 3))], dim=-1))
+    return torch.stack(found, dim=1).clamp(min=1e-6)
 
 
 def object_places(mask: Tensor) -> Tensor:
@@ -289,15 +290,19 @@ def image_inputs(images: Tensor, mask: Tensor, places: Tensor, means: Tensor) ->
     The radiance over the image's mean, the shares that each image has in a place's radiance of all, the mask, and where
     places lie from the object's middle.
     """
-    _, count, _, height, width = images.shape
+    height, width = images.shape[-2:]
     largest = max(height, width)
     scale = min(1.0, SIDE / largest)
     size = [max(8, 8 * round(scale * side / 8)) for side in (height, width)]
-    bright = images.float() * mask[:, None] / means[..., None, None, None]
-    shrunk = torch.cat([bright.flatten(1, 2), mask, places * mask], dim=1)
-    if [height, width] != size:
-        shrunk = functional.interpolate(shrunk, size, mode="area" if largest > SIDE else "nearest")
-    colours, around = shrunk[:, :-3].unflatten(1, (count, 3)), shrunk[:, None, -3:].expand(-1, count, -1, -1, -1)
+
+    def shrink(maps: Tensor) -> Tensor:
+        if [height, width] == size:
+            return maps
+        return functional.interpolate(maps, size, mode="area" if largest > SIDE else "nearest")
+
+    each = [shrink(image.float() * mask) for image in images.unbind(dim=1)]  # one at a time, as in `measure`
+    colours = torch.stack(each, dim=1) / means[..., None, None, None]
+    around = shrink(torch.cat([mask, places * mask], dim=1))[:, None].expand(-1, images.shape[1], -1, -1, -1)
     return torch.cat([torch.asinh(2.0 * colours), shares(colours, dim=1), around], dim=2)
 
 
