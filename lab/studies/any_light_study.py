@@ -21,6 +21,7 @@ import numpy as np
 from pipelines.shared.text_tables import render_text
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
+from render.shared.imaging.mixing import LightStage
 from render.shared.imaging.scene_mixing import SceneMix
 from render.shared.imaging.sensor import SensorModel
 from render.shared.seeds import generator
@@ -40,6 +41,8 @@ LIGHTS = {
 COUNTS = (4, 8, 16)
 METHODS = ("anylight", "sdps-frames", "sdps-frames+fuse", "pf14")
 _SIDE = 128
+_WIDEST = 50.0
+"""Degrees from any direction to the nearest light in scenes that surroundings are mixed from."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +57,15 @@ class Row:
 
 
 def choose(scenes: Sequence[SceneSpec], light: str, count: int) -> list[SceneSpec]:
-    """Return so many scenes, evenly spread, whose lamps are near or distant where the light wants it."""
+    """Return so many scenes, evenly spread: with near lamps or distant ones, or lit from all around to be mixed."""
     wanted = {"distant lamps": False, "near lamps": True}.get(light)
-    fit = [scene for scene in scenes if wanted is None or (scene.light_positions() is not None) == wanted]
+
+    def fits(scene: SceneSpec) -> bool:
+        if wanted is None:
+            return LightStage(scene.light_directions(), scene.id, sparse=True).gap <= _WIDEST
+        return (scene.light_positions() is not None) == wanted
+
+    fit = [scene for scene in scenes if fits(scene)]
     return [fit[index] for index in np.linspace(0, len(fit) - 1, min(count, len(fit))).round().astype(int)]
 
 
@@ -112,8 +121,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     file = args.out / "rows.jsonl"
     rows = [Row(**json.loads(line)) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
     scenes, store = list_finished(args.data, "val", skip_missing=True), SceneStore(args.data, cache=False)
+    chosen = {light: choose(scenes, light, args.scenes) for light in LIGHTS}
     wanted = [(light, scene) for number in range(args.scenes) for light in LIGHTS
-              for scene in choose(scenes, light, args.scenes)[number : number + 1]]  # fmt: skip
+              for scene in chosen[light][number : number + 1]]  # fmt: skip
     for light, scene in wanted:
         done = {row.method for row in rows if (row.light, row.scene, row.images) == (light, scene.id, COUNTS[-1])}
         if missing := [method for method in args.methods if method not in done]:

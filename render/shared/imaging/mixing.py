@@ -124,6 +124,8 @@ class LightMix:
 class LightStage:
     """The lights of a scene, dense enough that their images add up to any light from above the horizon.
 
+    `gap` is the angle in degrees from any direction above the horizon to the nearest light, at most.
+
     Args:
         lights: (L, 3) unit vectors to the lights, z > 0.
         where: What they belong to, for messages.
@@ -141,7 +143,7 @@ class LightStage:
         self._owner = self.nearest(_hemisphere())
         self._owners: dict[int, np.ndarray] = {}  # by a map's height: the light nearest to each of its pixels
         cosine = (_hemisphere() * self.directions[self._owner]).sum(1)
-        gap = float(np.degrees(np.arccos(np.clip(cosine.min(), -1.0, 1.0))))
+        self.gap = gap = float(np.degrees(np.arccos(np.clip(cosine.min(), -1.0, 1.0))))
         if gap > WIDEST_GAP and not sparse:
             raise InputError(
                 f"{where}: its lights leave a gap: up to {gap:.0f} degrees to the nearest one, {WIDEST_GAP:g} at most "

@@ -9,7 +9,7 @@ from sdps.data.scene_store import SceneStore, list_finished
 
 
 def test_a_run_goes_on_and_leaves_out_lights_without_scenes(tmp_path, capsys):
-    write_data(tmp_path / "data", ("train", "val", "val"), lights=6, size=32)
+    write_data(tmp_path / "data", ("train", "val", "val"), lights=60, size=32)
     arguments = [str(tmp_path / "data"), str(tmp_path / "out"), "--scenes", "2", "--methods", "constant"]
     assert any_light_study.main(arguments) == 0
     first = capsys.readouterr().out
