@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from sdps_samples import distant_layout
@@ -10,10 +11,15 @@ from torch import Tensor
 from torch.nn import functional
 
 from pipelines.shared import presets
+from render.shared.config import to_plain
 from render.shared.errors import InputError
+from sdps.core.first_normals import turn_to_sight
+from sdps.core.geometry import Camera, Rig
 from sdps.core.lighting import IRRADIANCE, harmonics
 from sdps.core.losses import NormalCriterion
+from sdps.data.augment import Augmentation
 from sdps.data.dataset import Batch
+from sdps.inference.estimator import Estimator
 from sdps.models.anylight import (
     SIDE,
     AnyLightNet,
@@ -25,7 +31,7 @@ from sdps.models.anylight import (
 )
 from sdps.models.base import Observations, Truth
 from sdps.models.blocks import parameter_count
-from sdps.models.checkpoint import load_weights
+from sdps.models.checkpoint import TrainedModel, load_weights
 from sdps.models.registry import MODELS, create
 from sdps.training import recipes
 from sdps.training.stage_factory import create_stage
@@ -184,6 +190,21 @@ def test_directness_tells_a_lamp_from_light_of_all_sides(trained):
     with torch.no_grad():
         found = trained.directness(observations(5))
     assert found.shape == (1, 5) and (found >= 0.0).all() and (found <= 1.0).all()
+
+
+@pytest.mark.parametrize("views", [1, 8])
+def test_a_pinhole_camera_turns_the_normals_with_its_lines_of_sight(trained, views):
+    model = TrainedModel("anylight", trained, SMALL, {"config": {"augmentation": to_plain(Augmentation())}})
+    estimator = Estimator(
+        lighting=None, normals=model, device=torch.device("cpu"), precision="float32", normal_views=views
+    )
+    images, mask = np.random.default_rng(0).random((4, 24, 24, 3)), np.ones((24, 24), bool)
+    camera = Camera(20.0)
+    flat, seen = (estimator.estimate(images, mask, rig=rig).normals for rig in (Rig(), Rig(camera)))
+    sights = torch.from_numpy(camera.sights(mask.shape)).float()
+    turned = torch.from_numpy(flat)[..., None, :] @ turn_to_sight(sights)
+    np.testing.assert_allclose(seen, turned[..., 0, :].numpy(), atol=1e-3)
+    assert np.abs(seen - flat).max() > 0.1
 
 
 def test_size_and_options():
