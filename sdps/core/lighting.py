@@ -32,6 +32,25 @@ def azimuth_elevation(directions: Array) -> tuple[Array, Array]:
     return xp.rad2deg(xp.arctan2(x, z)), xp.rad2deg(xp.arctan2(y, xp.hypot(x, z)))
 
 
+def harmonics(vectors: Array) -> Array:
+    """Return the real spherical harmonics up to order two, (..., 9), at unit vectors (..., 3), of mean square 1.
+
+    Order: 1; y, z, x; xy, yz, 3 z^2 - 1, xz, x^2 - y^2.
+    """
+    xp = library(vectors)
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    first, second = 3.0**0.5, 15.0**0.5
+    low = xp.stack([x * 0.0 + 1.0, first * y, first * z, first * x], axis=-1)
+    squares = 5.0**0.5 / 2 * (3.0 * z * z - 1.0), second / 2 * (x * x - y * y)
+    high = xp.stack([second * x * y, second * y * z, squares[0], second * x * z, squares[1]], axis=-1)
+    return xp.concatenate([low, high], axis=-1)
+
+
+IRRADIANCE = (1.0, *(2.0 / 3.0,) * 3, *(1.0 / 4.0,) * 5)
+"""Of each harmonic of light, what a Lambertian surface shows of it (Ramamoorthi & Hanrahan, SIGGRAPH 2001, eq. 8, over
+pi): under light of harmonics L a normal n sees the irradiance sum(IRRADIANCE * L * harmonics(n)) / 4 of a lamp's."""
+
+
 def unit_direction(azimuth: Array, elevation: Array) -> Array:
     """Return unit directions (..., 3) of azimuth and elevation in degrees, each (...)."""
     xp = library(azimuth)

@@ -21,7 +21,7 @@ import numpy as np
 
 from render.shared.config import check_fields
 from render.shared.errors import InputError
-from render.shared.imaging.mixing import LightMix
+from render.shared.imaging.scene_mixing import SceneMix
 from render.shared.imaging.sensor import SensorModel
 
 PAPER_TEST_FLOOR, PAPER_TEST_GAIN, PAPER_TEST_CLIP = 0.02, 1.5, 2.0
@@ -49,9 +49,10 @@ class Augmentation:
             paper): eight views for the price of one rendering.
         sensor: Cameras that record the images (`render.shared.imaging.sensor`); without it they clip and no more. Set
             `noise` to 0 with it.
-        mixed: Light of the images, mixed again for every sample from all lights of its scene, which must be a dense
-            light stage (`render.shared.imaging.mixing`); without it each image has one light. For networks that are
-            given no lights; a sample's directions are then where the light comes from on average.
+        mixed: Light of the images, mixed again for every sample from all lights of its scene
+            (`render.shared.imaging.scene_mixing`), which must be a dense light stage unless it is `sparse`; without it
+            each image has one light. For networks that are given no lights; a sample's directions are then where the
+            light comes from on average.
     """
 
     exposure: Literal["mean", "paper"] = "mean"
@@ -65,7 +66,7 @@ class Augmentation:
     frontal: float = 0.0
     symmetries: bool = False
     sensor: SensorModel | None = None
-    mixed: LightMix | None = None
+    mixed: SceneMix | None = None
 
     def __post_init__(self) -> None:
         for name in ("exposure_range", "mean_jitter", "intensity_range"):

@@ -20,6 +20,7 @@ from render.records.mirror import describe_packing
 from render.shared.errors import InputError
 from render.shared.imaging.mixing import LightStage, mix, require_enough
 from render.shared.seeds import generator
+from sdps.core.lighting import harmonics
 from sdps.core.symmetry import Symmetry
 from sdps.data.augment import Augmentation, augment
 from sdps.data.sample_geometry import Layout, lay_out, place
@@ -42,6 +43,7 @@ class Batch(NamedTuple):
     nearness: Tensor  # (B, Q) float32, rho of the lamps (`sdps.core.geometry`), 0 of distant ones
     places: Tensor  # (B, 3, S, S) float32, where pixels lie, in the object's radii from its middle; 0 outside the mask
     sights: Tensor  # (B, 3, S, S) float32, towards the camera, z = 1
+    light: Tensor  # (B, Q, 9) float32, spherical harmonics of the light of each image, the first 1
 
     def to(self, device: torch.device) -> "Batch":
         """Copy every tensor to `device`."""
@@ -143,9 +145,11 @@ def require_lights(where: str | Path, scenes: Sequence[SceneSpec], options: Samp
         InputError: too few for equally many images, or for light that is mixed; or an environment that is not a map.
     """
     require_equal_counts(where, scenes, options.images)
-    if options.augmentation.mixed is not None:
-        require_enough(min(len(scene.lights) for scene in scenes), str(where))
-        options.augmentation.mixed.load()
+    mixed = options.augmentation.mixed
+    if mixed is not None:
+        if not mixed.sparse:
+            require_enough(min(len(scene.lights) for scene in scenes), str(where))
+        mixed.load()
 
 
 def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, rng: np.random.Generator) -> Batch:
@@ -168,13 +172,14 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     """
     # A child of the stream, so that the number does not depend on how much the sample draws.
     seed = int(rng.spawn(1)[0].integers(2**63))
-    images, directions, chosen = _draw_images(scene, stored.images, options, rng)
-    normals, mask = stored.normals, stored.mask
+    images, directions, chosen, weights = _draw_images(scene, stored.images, options, rng)
+    normals, mask, lamps = stored.normals, stored.mask, scene.light_directions()
     layout = lay_out(scene, stored.depth, mask, chosen)
     if options.augmentation.symmetries:
         symmetry = Symmetry(int(rng.integers(4)), bool(rng.integers(2)))
         images, normals, mask = symmetry.images(images, 1), symmetry.images(normals, 0), symmetry.images(mask, 0)
         normals, directions, layout = symmetry.vectors(normals), symmetry.vectors(directions), layout.turn(symmetry)
+        lamps = symmetry.vectors(lamps)
     if options.rescale and min(mask.shape) > options.size:
         images, normals, mask, layout = _rescale(images, normals, mask, layout, options, rng)
     images, normals, mask, layout = resize(images, normals, mask, layout, options.size)
@@ -194,7 +199,14 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
         nearness=torch.from_numpy(placed.nearness),
         places=_channels_first(placed.places),
         sights=_channels_first(placed.sights),
+        light=torch.from_numpy(_light(lamps, weights, placed.directions)),
     )
+
+
+def _light(lamps: np.ndarray, weights: np.ndarray | None, directions: np.ndarray) -> np.ndarray:  # (Q, 9) float32
+    """Return the harmonics of the light of images that have shares (Q, L) of lamps (L, 3), or one lamp each (Q, 3)."""
+    light = harmonics(directions) if weights is None else weights @ harmonics(lamps)
+    return (light / light[:, :1]).astype(np.float32)
 
 
 def _channels_first(pictures: np.ndarray) -> Tensor:  # (..., 3, H, W) float32
@@ -204,27 +216,33 @@ def _channels_first(pictures: np.ndarray) -> Tensor:  # (..., 3, H, W) float32
 
 def _draw_images(
     scene: SceneSpec, images: np.ndarray | PackedImages, options: SampleOptions, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return images (Q, H, W, 3) float32, directions (Q, 3), and which of a scene's they are; None: mixtures of all."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Return images (Q, H, W, 3) float32, directions (Q, 3), and which of a scene they are, or their mixtures.
+
+    That is the share of each light of the scene in them, (Q, L); one of the two is None.
+    """
     directions = scene.light_directions()
     if len(images) != len(directions):
         raise InputError(f"scene {scene.id}: {len(images)} images for {len(directions)} lights; render it again")
     if options.augmentation.mixed is not None:
-        return *_mix(scene, images, options, rng), None
+        mixed, towards, weights = _mix(scene, images, options, rng)
+        return mixed, towards, None, weights
     chosen = choose_images(directions, options, rng)
-    return images[chosen].astype(np.float32), directions[chosen], chosen
+    return images[chosen].astype(np.float32), directions[chosen], chosen, None
 
 
 def _mix(
     scene: SceneSpec, images: np.ndarray | PackedImages, options: SampleOptions, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return images (Q, H, W, 3) float32 under mixed light, and the directions (Q, 3) it comes from on average."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return images (Q, H, W, 3) float32 under mixed light, the directions (Q, 3) it comes from on average, and the
+    share of each light in it, (Q, L).
+    """
     assert options.augmentation.mixed is not None
-    stage = LightStage(scene.light_directions(), f"scene {scene.id}")
-    weights, _ = options.augmentation.mixed.draw(stage, options.images, rng)
+    mixed = options.augmentation.mixed
+    stage = LightStage(scene.light_directions(), f"scene {scene.id}", sparse=mixed.sparse)
+    weights, _ = mixed.draw(stage, options.images, rng)
     packed = PackedImages.of(images)
-    mixed = PackedImages(mix(packed.values, weights), packed.kept)
-    return mixed[:], stage.mean_directions(weights)
+    return PackedImages(mix(packed.values, weights), packed.kept)[:], stage.mean_directions(weights), weights.mean(-1)
 
 
 def choose_images(directions: np.ndarray, options: SampleOptions, rng: np.random.Generator) -> np.ndarray:  # (Q,)

@@ -85,7 +85,7 @@ def normal_map(
 def _feature(network: FusionNetwork, view: AnyView, lights: Lights | None, autocast: Autocast) -> Any:
     """Return the feature of all images."""
     brightness = _brightness(network, view, lights) if network.normalised else None
-    placed = view.placed if isinstance(view, View) and network.sees_places else None
+    placed = view.placed if isinstance(view, View | TurnedView) and network.sees_places else None
     placement = None if placed is None else Placement(*placed)
     mask = view.mask
     accumulated: Any = None

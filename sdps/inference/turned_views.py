@@ -36,6 +36,13 @@ class TurnedView:
         """The mask, (1, 1, h', w')."""
         return self.symmetry.images(self.view.mask)
 
+    @property
+    def placed(self) -> tuple[Tensor, ...] | None:
+        """Where the turned pixels lie, as `View.placed`; None: it does not matter."""
+        if isinstance(self.view, KeptView) or self.view.placed is None:
+            return None
+        return tuple(self.symmetry.vectors(self.symmetry.images(each), dim=1) for each in self.view.placed)
+
     def __iter__(self) -> Iterator[tuple[slice, Tensor]]:
         """Yield which images, and these, (1, n, 3, h', w')."""
         for part, images in self.view:

@@ -14,6 +14,7 @@ from torch import nn
 
 from render.shared.config import read_yaml
 from render.shared.errors import InputError, unknown
+from sdps.models.anylight import AnyLightNet
 from sdps.models.cnnps import CNNPS
 from sdps.models.frames import FrameNet
 from sdps.models.lcnet import LCNet
@@ -93,7 +94,7 @@ def _entries() -> tuple[dict[str, ModelEntry], dict[str, Combination]]:
 
 NETWORKS: dict[str, type[nn.Module]] = {
     kind.__name__: kind
-    for kind in (LCNet, LCNetReg, LCNetSoft, LightSetNet, NENet, FrameNet, UPSFCN, UPSFCNLight, CNNPS)
+    for kind in (LCNet, LCNetReg, LCNetSoft, LightSetNet, NENet, FrameNet, AnyLightNet, UPSFCN, UPSFCNLight, CNNPS)
 }
 MODELS, COMBINATIONS = _entries()
 

@@ -188,8 +188,8 @@ class Inference:
             "gamma": photos.gamma,
             "mask": photos.mask_origin,
             "mask_pixels": int(photos.mask.sum()),
-            "light_directions": "found" if photos.light_directions is None else "given",
-            "light_intensities": "found" if photos.intensities is None else "given",
+            "light_directions": _origin(self.light_directions, photos.light_directions),
+            "light_intensities": _origin(self.intensities, photos.intensities),
             "lamps": self.lamps,
             "camera": photos.camera_summary,
             **_number_camera(photos),
@@ -293,6 +293,13 @@ def check_out(out: Path, photographs: Path) -> None:
     """
     if out.resolve() == photographs.resolve():
         raise InputError(f"--out {out}: holds the photographs; choose another folder")
+
+
+def _origin(used: np.ndarray, given: np.ndarray | None) -> str:
+    """Return where lights come from, in words."""
+    if given is not None:
+        return "given"
+    return "found" if len(used) else "not found"
 
 
 def _unit(photos: Photographs) -> str:

@@ -74,6 +74,15 @@ class Stage(ABC):
         images = self.config.validation_images or options.images
         return replace(options, images=images, fewest=0, crop=0, rescale=False, augmentation=augmentation)
 
+    def validations(self) -> dict[str, SampleOptions]:
+        """Return what is validated on, by how its metrics end: where light is mixed, single lamps as well."""
+        options = self.validation_options()
+        mixed = options.augmentation.mixed
+        if mixed is None or not mixed.single:
+            return {"": options}
+        alone = replace(options.augmentation, mixed=replace(mixed, single=1.0, surrounded=0.0))
+        return {"": options, "_single": replace(options, augmentation=alone)}
+
     @abstractmethod
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the scalar to minimise, and named scalars to log."""
@@ -180,13 +189,15 @@ class NormalStage(Stage):
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the network's own loss on the crops, as configured."""
+        if self.config.fewest_images and not self.config.resident:  # on a device they were drawn so
+            batch = leave_out(batch, self.config.fewest_images)
         lights, config = self.training_lights(batch), self.config
         side = config.crop or config.size
         images, mask, normals = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
         placement = Placement(*(crop(part, batch.corner, side) for part in flatten_some(placed(batch), batch.seed)))
         seen = self.network.observe(images, mask, lights, placement=placement)
-        weights = config.gradient_weight, config.lighting_weight, config.expected_weight
-        truth = Truth(normals, mask, batch.directions, batch.intensities)
+        weights = config.gradient_weight, config.lighting_weight, config.expected_weight, config.shading_weight
+        truth = Truth(normals, mask, batch.directions, batch.intensities, batch.light)
         return self.network.loss(seen, truth, NormalCriterion(config.loss, *weights))
 
     def metrics(self, batch: Batch) -> dict[str, float]:
@@ -240,6 +251,16 @@ def disturb(lights: Lights, seeds: list[int], limit: float) -> Lights:
     errors = torch.from_numpy(np.stack(expected)).to(lights.intensities)
     directions = functional.normalize(moved, dim=-1)
     return lights._replace(directions=directions, intensities=lights.intensities * factors, expected_error=errors)
+
+
+def leave_out(batch: Batch, fewest: int) -> Batch:
+    """Return a batch with so many images of each scene or more, as its first scene's seed draws."""
+    most = batch.images.shape[1]
+    count = int(generator(int(batch.seed[0]), "images").integers(min(fewest, most), most, endpoint=True))
+    some = {
+        name: getattr(batch, name)[:, :count] for name in ("images", "directions", "intensities", "nearness", "light")
+    }
+    return batch._replace(**some)
 
 
 def placed(batch: Batch) -> Placement:

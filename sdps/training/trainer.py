@@ -26,7 +26,7 @@ from render.shared.config import to_plain
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
-from sdps.data.dataset import Batch, SampleKey, SceneDataset, collate
+from sdps.data.dataset import Batch, SampleKey, SampleOptions, SceneDataset, collate
 from sdps.data.interrupts import StopRequest, stop_on_signal
 from sdps.data.resident.resident_scenes import ResidentScenes
 from sdps.data.sources import BatchSource, StoredScenes
@@ -275,26 +275,32 @@ class Trainer:
         """
         if not self._validates:
             return {}
-        # Opened anew: of a folder that is being rendered more scenes are there.
-        options = {"cache": self.config.cache, "skip_missing": self.config.skip_missing}
-        scenes = SceneDataset(self.data, "val", self.stage.validation_options(), **options)
         trained, self.stage.network = self.stage.network, self._kept()
         self.stage.network.eval()
-        count = min(self.config.validation_scenes, len(scenes))
-        rows = []
+        values: dict[str, float] = {}
         try:
-            for index in np.linspace(0, len(scenes) - 1, count).round().astype(int):
-                batch = collate([scenes.sample(SampleKey(int(index), 0, int(index)))])
-                assert isinstance(batch, Batch)  # `sample` raises
-                with self.arithmetic.autocast():
-                    rows.append(self.stage.metrics(batch.to(self.team.device)))
+            for suffix, options in self.stage.validations().items():
+                values |= {f"val_{name}{suffix}": value for name, value in self._measure(options).items()}
         finally:
             self.stage.network = trained
-        values = {f"val_{name}": float(np.mean([row[name] for row in rows])) for name in rows[0]}
         if values[f"val_{self.stage.goal}"] < self.best:
             self.best = values[f"val_{self.stage.goal}"]
             self.save_weights(values, "-best")
         return values
+
+    def _measure(self, options: SampleOptions) -> dict[str, float]:
+        """Return the stage's metrics averaged over samples of the `val` split."""
+        # Opened anew: of a folder that is being rendered more scenes are there.
+        config = self.config
+        scenes = SceneDataset(self.data, "val", options, cache=config.cache, skip_missing=config.skip_missing)
+        rows = []
+        count = min(config.validation_scenes, len(scenes))
+        for index in np.linspace(0, len(scenes) - 1, count).round().astype(int):
+            batch = collate([scenes.sample(SampleKey(int(index), 0, int(index)))])
+            assert isinstance(batch, Batch)  # `sample` raises
+            with self.arithmetic.autocast():
+                rows.append(self.stage.metrics(batch.to(self.team.device)))
+        return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
     @torch.no_grad()
     def _kept(self) -> nn.Module:

@@ -33,8 +33,8 @@ class TrainingConfig:
         batch_scenes: Scenes per optimiser step.
         accumulate: Parts a step's scenes are processed in, to save memory; must divide `batch_scenes`.
         images: Images drawn per scene and step.
-        fewest_images: Where samples are made on the device (`resident`), each step draws so many to `images`; 0: always
-            `images`.
+        fewest_images: Where samples are made on the device (`resident`) or their light is mixed, each step draws so
+            many to `images`; 0: always `images`.
         size: Side in pixels to which scenes of another size are resized.
         learning_rate: Peak learning rate.
         schedule: `halving` (after each of `halve_after`), `cosine` (to zero), `constant`, or `trapezoid`
@@ -126,9 +126,11 @@ class TrainingConfig:
             raise InputError("steps and minutes are both set; keep one of them")
         if self.batch_scenes % self.accumulate:
             raise InputError(f"accumulate {self.accumulate} must divide batch_scenes {self.batch_scenes}")
-        if self.fewest_images and not (self.resident and self.fewest_images <= self.images):
+        varies = self.resident or self.augmentation.mixed is not None
+        if self.fewest_images and not (varies and self.fewest_images <= self.images):
             raise InputError(
-                f"fewest_images {self.fewest_images} needs resident: true, and to be at most images ({self.images})"
+                f"fewest_images {self.fewest_images} needs resident: true or augmentation.mixed, and to be at most "
+                f"images ({self.images})"
             )
         if self.size < 16 or self.size % 4:
             raise InputError(f"size must be a multiple of 4 and at least 16, got {self.size}")
@@ -207,6 +209,7 @@ class NormalTraining(TrainingConfig):
         lighting_weight: Weight of the lighting loss next to the normal loss, for models that learn both.
         gradient_weight: Weight of the error of the normals' steps from pixel to pixel.
         expected_weight: Weight of the errors of the expected error, for models that learn it.
+        shading_weight: Weight of the errors of each image's shading, for models that learn it.
         options: Options of the network over those of its registry entry, for variants of a model.
     """
 
@@ -223,6 +226,7 @@ class NormalTraining(TrainingConfig):
     lighting_weight: float = 0.1
     gradient_weight: float = 0.0
     expected_weight: float = 0.02
+    shading_weight: float = 0.0
     options: dict[str, bool | int | float | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -233,7 +237,7 @@ class NormalTraining(TrainingConfig):
             raise InputError(f"light_blend must be in [0, 10], got {self.light_blend}")
         if not 0.0 <= self.min_object < 1.0:
             raise InputError(f"min_object must be in [0, 1), got {self.min_object}")
-        weights = "lighting_weight", "gradient_weight", "expected_weight"
+        weights = "lighting_weight", "gradient_weight", "expected_weight", "shading_weight"
         check_fields(self, "not negative", "light_error", *weights)
 
 

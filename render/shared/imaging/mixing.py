@@ -94,13 +94,13 @@ class LightMix:
             recipe = []
             for kind, share in zip(KINDS, shares / shares.sum(), strict=True):
                 if share:
-                    light, about = self._part(kind, stage, rng)
+                    light, about = self.draw_part(kind, stage, rng)
                     weight += (share * light / light.mean(1).sum()).astype(np.float32)
                     recipe.append({"kind": kind, "share": round(float(share), 4), **about})
             recipes.append({"lights": recipe})
         return weights, recipes
 
-    def _part(self, kind: str, stage: "LightStage", rng: np.random.Generator) -> tuple[np.ndarray, dict[str, Any]]:
+    def draw_part(self, kind: str, stage: "LightStage", rng: np.random.Generator) -> tuple[np.ndarray, dict[str, Any]]:
         """Draw a light of a kind: weights (L, 3) of any scale, and what it is."""
         if kind == "environment":
             name = self.environments[int(rng.integers(len(self.environments)))]
@@ -124,23 +124,27 @@ class LightMix:
 class LightStage:
     """The lights of a scene, dense enough that their images add up to any light from above the horizon.
 
+    `gap` is the angle in degrees from any direction above the horizon to the nearest light, at most.
+
     Args:
         lights: (L, 3) unit vectors to the lights, z > 0.
         where: What they belong to, for messages.
+        sparse: Take any lights, each for all directions nearest to it.
 
     Raises:
         InputError: too few lights, or a part of the hemisphere without any.
     """
 
-    def __init__(self, lights: np.ndarray, where: str) -> None:
+    def __init__(self, lights: np.ndarray, where: str, *, sparse: bool = False) -> None:
         self.directions = np.asarray(lights, np.float64).reshape(-1, 3)
-        require_enough(len(self.directions), where)
+        if not sparse:
+            require_enough(len(self.directions), where)
         self._tree = cKDTree(self.directions)
         self._owner = self.nearest(_hemisphere())
         self._owners: dict[int, np.ndarray] = {}  # by a map's height: the light nearest to each of its pixels
         cosine = (_hemisphere() * self.directions[self._owner]).sum(1)
-        gap = float(np.degrees(np.arccos(np.clip(cosine.min(), -1.0, 1.0))))
-        if gap > WIDEST_GAP:
+        self.gap = gap = float(np.degrees(np.arccos(np.clip(cosine.min(), -1.0, 1.0))))
+        if gap > WIDEST_GAP and not sparse:
             raise InputError(
                 f"{where}: its lights leave a gap: up to {gap:.0f} degrees to the nearest one, {WIDEST_GAP:g} at most "
                 f"can be mixed; {_REMEDY}"

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader
 from render.records.manifest import read_manifest
 from render.records.shards import read_shard
 from render.shared.errors import InputError
-from render.shared.imaging.mixing import LightMix
+from render.shared.imaging.scene_mixing import SceneMix
 from render.shared.imaging.sensor import SensorModel
 from sdps.core.metrics import normal_mae
 from sdps.data.augment import Augmentation
@@ -356,14 +356,14 @@ def test_a_camera_changes_no_other_draw_of_a_sample(folder: Path, exposure: str)
 
 def test_mixed_light_is_drawn_again_and_the_same_from_shards_and_cache(tmp_path: Path) -> None:
     write_stage(tmp_path)
-    alone = LightMix(environments=("constant",), environment=1.0, directional=0.0, lamp=0.0, area=0.0)
+    alone = SceneMix(environments=("constant",), environment=1.0, directional=0.0, lamp=0.0, area=0.0)
     config = options(augmentation=replace(PLAIN, mixed=alone), images=5, size=24)
     batch = SceneDataset(tmp_path, "train", config, cache=False).sample(SampleKey(1, 0, 0))
     expected = (1 + batch.normals[2]) / 4  # (1 + n_z) / 2 of the whole hemisphere, whose weights sum to 2
     inside = batch.mask[0] > 0
     assert torch.allclose(batch.images[:, :, inside], expected[inside].expand(5, 3, -1), rtol=0.02)
     assert batch.directions[:, 2].min() > 0.999
-    config = replace(config, augmentation=replace(PLAIN, mixed=LightMix()))
+    config = replace(config, augmentation=replace(PLAIN, mixed=SceneMix()))
     plain, cached = (SceneDataset(tmp_path, "train", config, cache=cache) for cache in (False, True))
     cached.sample(SampleKey(0, 0, 0))
     assert same(plain.sample(SampleKey(0, 0, 0)), cached.sample(SampleKey(0, 0, 0)))
@@ -371,8 +371,8 @@ def test_mixed_light_is_drawn_again_and_the_same_from_shards_and_cache(tmp_path:
 
 
 def test_mixed_light_needs_a_light_stage(folder: Path) -> None:
-    config = options(augmentation=Augmentation(mixed=LightMix()))
+    config = options(augmentation=Augmentation(mixed=SceneMix()))
     with pytest.raises(InputError, match="6 lights are too few to mix light from, 128 are needed"):
         SceneDataset(folder, "train", config, cache=False)
     with pytest.raises(InputError, match="set biased and frontal to 0"):
-        Augmentation(mixed=LightMix(), biased=0.5)
+        Augmentation(mixed=SceneMix(), biased=0.5)

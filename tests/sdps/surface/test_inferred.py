@@ -10,8 +10,12 @@ import photo_folders as folders
 import pytest
 
 import sdps
+from render.shared.config import to_plain
 from render.shared.errors import InputError
 from sdps.core.geometry import FAR
+from sdps.data.augment import Augmentation
+from sdps.models.checkpoint import TrainedModel, save_weights
+from sdps.models.registry import create
 
 
 def test_a_run_that_is_cut_off_leaves_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,3 +64,23 @@ def test_lamps_that_were_found_light_the_albedo_and_are_written(tmp_path: Path) 
     written = json.loads((tmp_path / "out" / "lights.json").read_text())
     far_away = [np.linalg.norm(image["position"]) for image in written["images"]]
     assert far_away == pytest.approx(0.5 / nearness, rel=1e-4)
+
+
+def test_a_network_that_finds_no_lights_gives_everything_else(tmp_path: Path) -> None:
+    lights = np.array([[0.5, 0.0, 0.8], [0.0, 0.5, 0.8], [-0.5, 0.0, 0.8], [0.0, -0.5, 0.8]])
+    images, mask = folders.matte(lights, size=40)
+    photos = sdps.load(folders.write_folder(tmp_path / "photos", images + 0.2, mask))
+    options = {"width": 16, "blocks": 1, "heads": 2, "channels": 16, "context": 0}
+    metadata = {"config": {"augmentation": to_plain(Augmentation())}}
+    weights = tmp_path / "any.safetensors"
+    save_weights(weights, TrainedModel("anylight", create("anylight", **options), options, metadata))
+    found = sdps.infer(photos, str(weights), findings=())
+    assert found.normals.shape == (*mask.shape, 3) and found.refinement is None
+    assert not len(found.light_directions) and found.albedo is None and found.residuals is None
+    assert found.expected_error is not None
+    names = {path.name for path in found.save(tmp_path / "out")}
+    assert {"mesh.ply", "normal.npy", "expected-error.npy"} <= names and "lights.json" not in names
+    written = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert written["light_directions"] == written["light_intensities"] == "not found"
+    with pytest.raises(InputError, match="refinement needs lights"):
+        sdps.infer(photos, str(weights), refine=True, findings=())

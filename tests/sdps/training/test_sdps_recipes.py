@@ -54,7 +54,7 @@ def test_what_a_run_needs() -> None:
         ({}, {"nenet": {"crop": 30}}, "nenet", "crop must be"),
         ({}, {"mine": {"base": "lcnt"}}, "mine", "unknown model 'lcnt'"),
         ({}, {"upsfcn": {"lights": "lcnet"}}, "upsfcn", "is not given lights"),
-        ({"normals": {"shading_weight": 0.1}}, {}, "nenet", "unknown key 'normals.shading_weight'"),
+        ({"normals": {"glare_weight": 0.1}}, {}, "nenet", "unknown key 'normals.glare_weight'"),
         ({}, {"mine": {"base": "attention"}}, "mine", "unknown model 'attention'"),
     ],
 )
