@@ -44,6 +44,9 @@ sphere has 1.2 and 0.49, and the sphere's mask is right.
 
 _SMALLEST = 1e-4
 
+_MESHROOM = 0.7
+"""Share of full scale from which on a mask beside Meshroom's `ps_` folder is white, as Meshroom reads it."""
+
 _STILL = 1e-6
 """Standard deviation of the brightness under which a pixel does not change."""
 
@@ -102,12 +105,13 @@ def automatic_mask(variation: Variation) -> tuple[np.ndarray, str]:
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Read a mask (H, W) bool: more than half bright, or more than half opaque where the picture has transparency.
+    """Read a mask (H, W) bool: more than half bright, or more than half opaque where the picture has transparency;
+    `<name>.png` beside a folder `ps_<name>`: more than 0.7.
 
     Raises:
         InputError: unreadable, of another size, or empty.
     """
-    mask = bright_part(decode(path))
+    mask = bright_part(decode(path), _MESHROOM if (path.parent / f"ps_{path.stem}").is_dir() else 0.5)
     if mask.shape != shape:
         raise InputError(
             f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} pixels, the pictures are {shape[1]}x{shape[0]}; draw "
@@ -118,12 +122,17 @@ def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
     return np.ascontiguousarray(mask)
 
 
-def bright_part(picture: Picture) -> np.ndarray:
-    """Return what a mask marks, (H, W) bool: what is opaque, otherwise bright, otherwise the upper of two values."""
+def bright_part(picture: Picture, level: float = 0.5) -> np.ndarray:
+    """Return what a mask marks, (H, W) bool: what is opaque, otherwise bright, otherwise the upper of two values.
+
+    Args:
+        picture: The mask.
+        level: What is bright, as a share of full scale.
+    """
     pixels = picture.pixels.max(-1)
     if picture.alpha is not None and picture.alpha.min() < picture.alpha.max():
         pixels = picture.alpha
-    limit = full_scale(pixels) / 2
+    limit = full_scale(pixels) * level
     low, high = pixels.min(), pixels.max()
     if low < high <= limit and ((pixels == low) | (pixels == high)).all():
         limit = low  # such as labels 0 and 1

@@ -141,7 +141,7 @@ def _of_views(path: Path, keys: list[str], files: Sequence[str]) -> tuple[tuple[
     for scene in sorted(path.parent.glob("*.sfm"))[:20]:
         try:
             content = parse_json(read_text(scene))
-            views = {str(view["viewId"]): base_name(str(view["path"])) for view in content["views"]}
+            views = {str(view["viewId"]): str(view["path"]) for view in content["views"]}
         except (ValueError, TypeError, KeyError):
             continue
         if set(keys) <= set(views):

@@ -26,13 +26,18 @@ def stem(name: str) -> str:
     return _SUFFIX.sub("", base_name(name))
 
 
+def _last_two(name: str) -> str:
+    """Return a name with the folder that it lies in, as far as it says so; pictures of several poses share names."""
+    return "/".join(re.split(r"[/\\]", name.strip())[-2:])
+
+
 def _plain(name: str) -> str:
     """Return a name as systems that take no notice of case compare it; macOS takes letters and accents apart."""
     return unicodedata.normalize("NFC", name).casefold()
 
 
 _KEYS: tuple[tuple[Callable[[str], str], Callable[[str], str]], ...] = (
-    (str, str), (base_name, base_name), (base_name, stem), (stem, stem),
+    (str, str), (_last_two, _last_two), (base_name, base_name), (base_name, stem), (stem, stem),
     (lambda name: _plain(base_name(name)), lambda name: _plain(base_name(name))),
     (lambda name: _plain(stem(name)), lambda name: _plain(stem(name))),
 )  # fmt: skip
