@@ -203,7 +203,8 @@ def _assemble(
         lights_name=known.name, lights_frame=known.frame,
         notes=(*pose.notes, *listing.notes, *seen.notes, *by.notes, *known.notes), coding=seen.coding,
         orientation=seen.orientation, overridden=tuple(faults.overridden), scale=scale, camera=by.camera,
-        camera_origin=by.origin, pixel_size=by.pixel_size, room=pose.room,
+        camera_origin=by.origin, pixel_size=by.pixel_size or known.image_width / seen.mask.shape[1] or None,
+        room=pose.room,
     )  # fmt: skip
 
 

@@ -427,7 +427,9 @@ def test_all_poses_of_a_folder(tmp_path: Path, capsys) -> None:
     said, wrong = capsys.readouterr()
     first, one, two, three = said.splitlines()
     assert first == "3 poses: a, b, c" and three.startswith("c: least-squares, given lights, 8 photographs, ")
-    assert one.startswith("a: least-squares, given lights, 16 photographs, ") and one.endswith(str(out / "a" / "report.html"))
+    assert one.startswith("a: least-squares, given lights, 16 photographs, ") and one.endswith(
+        str(out / "a" / "report.html")
+    )
     assert two.startswith("!! b: ") and "b.png: the mask is 9x9 pixels" in two
     assert wrong.endswith("rig: 1 of 3 poses failed, for the reasons above: b\n")
     assert sorted(path.name for path in out.iterdir()) == ["a", "c"]

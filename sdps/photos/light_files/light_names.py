@@ -5,6 +5,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -130,8 +131,9 @@ def in_order(path: Path, table: Table, files: Sequence[str]) -> tuple[np.ndarray
     missing = [file for file, place in zip(files, places, strict=True) if place is None]
     if missing:
         raise InputError(
-            f"{path}: no row for {list_names(missing)} ({len(missing)} of {len(files)} pictures lack one); its rows "
-            f"are for {list_names(names, 3)}; add what is missing or correct the names"
+            f"{path}: no row for {list_names(missing)} ({len(missing)} of {len(files)} pictures lack one); "
+            f"its rows are for {list_names(names, 3)}{_nearest(missing[0], names, places)}; add what is missing or "
+            "correct the names"
         )
     used = [place for place in places if place is not None]
     spare = [name for place, name in enumerate(names) if place not in set(used)]
@@ -139,6 +141,13 @@ def in_order(path: Path, table: Table, files: Sequence[str]) -> tuple[np.ndarray
     if spare:
         notes.append(f"rows without a picture were not used: {list_names(spare)}")
     return table.values[used], tuple(notes)
+
+
+def _nearest(file: str, names: Sequence[str], places: Sequence[int | None]) -> str:
+    """Say which row that is no other picture's is named most like a picture."""
+    spare = {_plain(stem(name)): name for place, name in enumerate(names) if place not in places}
+    found = get_close_matches(_plain(stem(file)), spare, n=1, cutoff=0.5)
+    return f", and the nearest to {file} is {spare[found[0]]}" if found else ""
 
 
 def _by_name(path: Path, names: Sequence[str], files: Sequence[str]) -> tuple[list[int | None], str]:
