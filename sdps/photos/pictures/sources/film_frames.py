@@ -15,11 +15,9 @@ import numpy as np
 from render.shared.decoding import decoding, silence
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
+from sdps.photos.pictures.picture_kinds import FILMS
 
 FLAG = "--every"
-FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv")
-"""Suffixes of films, in lower case."""
-
 ABOUT = 60
 """Frames that are kept unless the user says how many."""
 

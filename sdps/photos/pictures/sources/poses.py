@@ -67,18 +67,20 @@ class Pose:
 class Room:
     """A temporary folder that is removed with the last object that holds it, or when Python ends."""
 
-    def __init__(self) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="sdps-"))
+    def __init__(self, inside: Path | None = None) -> None:
+        """Make the folder in one that is there; None: where the system keeps such folders."""
+        self.path = Path(tempfile.mkdtemp(prefix="sdps-", dir=inside))
         weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
 
 
-def find_poses(place: str | Path, every: int | None = None) -> tuple[Pose, ...]:
+def find_poses(place: str | Path, every: int | None = None, inside: Path | None = None) -> tuple[Pose, ...]:
     """Return the poses in a folder, a ZIP or a film: at least one, in natural order.
 
     Args:
         place: A folder of photographs; one that holds several folders `ps_<pose>` or `<name>.data`; a ZIP of any of
             these; a film, or a folder with nothing but a film.
         every: Of a film, take every n-th frame; None: so that about 60 are taken.
+        inside: Where an archive or a film is taken apart; None: where the system keeps temporary folders.
 
     Raises:
         InputError: an archive or a film that cannot be read, another kind of file, `every` without a film.
@@ -87,14 +89,14 @@ def find_poses(place: str | Path, every: int | None = None) -> tuple[Pose, ...]:
     check_every(every)
     film = place if is_film(place) else _only_film(place)
     if film is not None:
-        return (_open_film(place, film, every),)
+        return (_open_film(place, film, every, Room(inside)),)
     if every is not None:
         raise InputError(f"{FLAG} {every}: {place} is no film; leave the flag out")
     if not place.is_file():
         return _in_folder(place, place)
     if place.suffix.lower() != ".zip":
         raise InputError(f"{place}: is a file; give the folder that holds the photographs, a ZIP of it, or a film")
-    room = Room()
+    room = Room(inside)
     folder = room.path / place.name
     unpack_folders(place, folder, (*SUFFIXES, *UNREAD, *LIGHT_FILES, ".sfm"))
     return tuple(replace(pose, room=room) for pose in _in_folder(place, _descend(folder)))
@@ -164,9 +166,8 @@ def _pose(asked: Path, folder: Path) -> Pose:
     return Pose(folder.name[: -len(UNIPS)], asked, folder, None, names, above, f"{folder.name}/")
 
 
-def _open_film(asked: Path, film: Path, every: int | None) -> Pose:
+def _open_film(asked: Path, film: Path, every: int | None, room: Room) -> Pose:
     """Return the frames of a film as a pose; its mask may lie beside it, as `<film>.png` or `mask.png`."""
-    room = Room()
     folder = room.path / asked.name
     mask = _beside(film, film.stem) or _beside(film, "mask")
     pose = Pose(film.stem, asked, folder, mask, None, (film.absolute().parent,), room=room)
