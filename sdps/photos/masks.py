@@ -10,6 +10,7 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from render.shared.errors import InputError
+from render.shared.imaging.reducing import reduce_mask
 from sdps.photos.picture_file import Picture, decode, orient_pixels
 from sdps.photos.response import full_scale
 
@@ -44,6 +45,9 @@ sphere has 1.2 and 0.49, and the sphere's mask is right.
 
 _SMALLEST = 1e-4
 
+_ALIKE = 0.9
+"""Share of what is opaque in some photograph that must be so in all, for it to be the object."""
+
 _MESHROOM = 0.7
 """Share of full scale from which on a mask beside Meshroom's `ps_` folder is white, as Meshroom reads it."""
 
@@ -71,6 +75,33 @@ class Variation:
     def deviation(self) -> np.ndarray:
         """Return the standard deviation over the images so far, (H, W) float32."""
         return np.sqrt(np.maximum(self.squares, 0) / max(self.count, 1))
+
+
+class CutOut:
+    """Where photographs with transparency are opaque, gathered picture by picture."""
+
+    def __init__(self) -> None:
+        self.whole = 0
+        self.inside: np.ndarray | None = None
+        self.outside: np.ndarray | None = None
+
+    def add(self, alpha: np.ndarray | None) -> None:
+        """Take in a picture's opacity, (H, W) as its pixels are turned; None of a picture without."""
+        if alpha is None or alpha.min() == alpha.max():
+            self.whole += 1
+            return
+        opaque = alpha > full_scale(alpha) / 2
+        self.inside = opaque if self.inside is None else self.inside & opaque
+        self.outside = ~opaque if self.outside is None else self.outside & ~opaque
+
+    def find(self, shape: tuple[int, int]) -> np.ndarray | None:
+        """Return what is opaque in all pictures, reduced to a shape (h, w) bool; None where some picture has no
+        transparency, or they differ in more than a tenth of the object.
+        """
+        if self.whole or self.inside is None or self.outside is None:
+            return None
+        mask = reduce_mask(self.inside, shape)
+        return mask if mask.any() and self.inside.sum() >= _ALIKE * (~self.outside).sum() else None
 
 
 def automatic_mask(variation: Variation) -> tuple[np.ndarray, str]:

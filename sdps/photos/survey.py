@@ -10,7 +10,7 @@ from render.shared.errors import InputError
 from render.shared.imaging.reducing import reduce_image, smaller_shape
 from render.shared.progress import progress_bar, stage
 from sdps.photos.faults import Faults
-from sdps.photos.masks import Variation, automatic_mask, bright_part
+from sdps.photos.masks import CutOut, Variation, automatic_mask, bright_part
 from sdps.photos.picture_file import Picture, decode, is_misnamed, orient_pixels
 from sdps.photos.pictures.contents import judge_content, like_mask
 from sdps.photos.pictures.gamma import resolve_gamma
@@ -80,8 +80,11 @@ def survey(
     assert look.first is not None and look.variation is not None  # two pictures fit
     notes = [note for note in (left_out, *masks.notes, *look.suspicious, *look.kinds(), look.why) if note]
     notes += [*_orientation_note(look.first.orientation, look.turns), *scale_note(look.full, look.shape)]
+    cut = None if masks.file is not None else look.cut.find(look.shape)
     if masks.file is not None:
         mask, said = read_reduced_mask(masks.file, look.full, look.shape), f"the mask is {masks.file.name}"
+    elif cut is not None:
+        mask, said = cut, "the mask is what is opaque in the pictures; a mask.png replaces it"
     else:
         if not look.variation.changes().any():
             faults.stop(
@@ -93,7 +96,8 @@ def survey(
         notes.append("values that are not finite were set to 0")
     return Survey(
         files=tuple(name for name in listing.files if name in look.kept), coding=look.first.coding, gamma=look.gamma,
-        orientation=look.first.orientation, mask=mask, origin="automatic" if masks.file is None else "file",
+        orientation=look.first.orientation, mask=mask,
+        origin="automatic" if masks.file is None and cut is None else "file",
         notes=(*notes, said), left_out=left_out, full=look.full, lenses=frozenset(look.lenses),
     )  # fmt: skip
 
@@ -121,6 +125,7 @@ class _Look:
     full: tuple[int, int] = (0, 0)  # sides of the pictures, once turned
     shape: tuple[int, int] = (0, 0)  # and reduced
     variation: Variation | None = None
+    cut: CutOut = field(default_factory=CutOut)
     broken: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))  # first picture with a value not finite
     levels: list[float] = field(default_factory=list)
 
@@ -184,6 +189,7 @@ class _Look:
             touched = reduce_image((~np.isfinite(pixels).all(-1)).astype(np.float32), self.shape) > 0
             self.broken[(self.broken < 0) & touched] = len(self.kept) - 1
         if not self.masked:
+            self.cut.add(None if picture.alpha is None else orient_pixels(picture.alpha, self.first.orientation))
             self.variation.add(reduce_grey(pixels, self.gamma, self.shape))
 
     def _begin(self, name: str, picture: Picture) -> None:

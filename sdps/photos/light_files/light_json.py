@@ -167,8 +167,9 @@ def _relight(path: Path, content: dict[str, Any]) -> Table:
     names = tuple(base_name(str(image["filename"])) for image in kept)
     scale = content.get("pixelSize") or content.get("scale") or 0.0  # millimetres per pixel
     width = float(scale) * float(content.get("width") or 0.0)
-    known = isinstance(dome, dict) and any(dome.get(key) for key in ("directions", "positions3d", "positionsSphere"))
-    of_dome = read_dome(path, dome, width) if known else None
+    of_dome = None
+    if isinstance(dome, dict) and any(dome.get(key) for key in ("directions", "positions3d", "positionsSphere")):
+        of_dome = read_dome(path, dome, width)
     if of_dome is not None and len(of_dome.values) == len(images) > len(kept):
         chosen = [number for number, image in enumerate(images) if not image.get("skip")]
         strengths = None if of_dome.strengths is None else of_dome.strengths[chosen]
