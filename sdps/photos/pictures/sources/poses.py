@@ -17,7 +17,7 @@ from render.shared.errors import InputError, list_names
 from render.shared.tables import natural_key
 from sdps.photos.light_files import SUFFIXES as LIGHT_FILES
 from sdps.photos.pictures.listing import LISTS
-from sdps.photos.pictures.picture_kinds import SUFFIXES, UNREAD
+from sdps.photos.pictures.picture_kinds import FILMS, SUFFIXES, UNREAD
 from sdps.photos.pictures.picture_names import MASK, name_roles
 from sdps.photos.pictures.sources.archive_files import unpack_folders
 from sdps.photos.pictures.sources.film_frames import FLAG, check_every, is_film, take_frames
@@ -87,19 +87,21 @@ def find_poses(place: str | Path, every: int | None = None, inside: Path | None 
     """
     place = Path(place)
     check_every(every)
-    film = place if is_film(place) else _only_film(place)
+    room, folder = None, place
+    if place.suffix.lower() == ".zip" and place.is_file():
+        room = Room(inside)
+        unpack_folders(place, room.path / place.name, (*SUFFIXES, *UNREAD, *FILMS, *LIGHT_FILES, ".sfm"))
+        folder = _descend(room.path / place.name)
+    film = place if is_film(place) else _only_film(folder)
     if film is not None:
-        return (_open_film(place, film, every, Room(inside)),)
+        room = room or Room(inside)
+        frames = room.path / place.name if folder is place else film.with_name(f"{film.name}.frames")
+        return (_open_film(place, film, frames, every, room),)
     if every is not None:
         raise InputError(f"{FLAG} {every}: {place} is no film; leave the flag out")
-    if not place.is_file():
-        return _in_folder(place, place)
-    if place.suffix.lower() != ".zip":
+    if place.is_file() and room is None:
         raise InputError(f"{place}: is a file; give the folder that holds the photographs, a ZIP of it, or a film")
-    room = Room(inside)
-    folder = room.path / place.name
-    unpack_folders(place, folder, (*SUFFIXES, *UNREAD, *LIGHT_FILES, ".sfm"))
-    return tuple(replace(pose, room=room) for pose in _in_folder(place, _descend(folder)))
+    return tuple(replace(pose, room=room) for pose in _in_folder(place, folder))
 
 
 def only_pose(place: "str | Path | Pose", every: int | None = None) -> Pose:
@@ -138,6 +140,9 @@ def _in_folder(asked: Path, folder: Path) -> tuple[Pose, ...]:
         poses = [_pose(asked, path) for path in below if _kind(path) == kind and len(_pictures(path)) >= _FEWEST]
         names = [pose.name.lower() for pose in poses]
         if poses and not _has_photographs(folder, names):
+            if len(poses) == 1:
+                said = f"the pictures are those of its folder {poses[0].folder.name}"
+                return (replace(poses[0], notes=(said, *poses[0].notes)),)
             twice = len(set(names)) < len(names)
             return tuple(replace(pose, name=pose.folder.name) for pose in poses) if twice else tuple(poses)
     return (Pose(folder.absolute().name, asked, folder),)
@@ -166,9 +171,8 @@ def _pose(asked: Path, folder: Path) -> Pose:
     return Pose(folder.name[: -len(UNIPS)], asked, folder, None, names, above, f"{folder.name}/")
 
 
-def _open_film(asked: Path, film: Path, every: int | None, room: Room) -> Pose:
-    """Return the frames of a film as a pose; its mask may lie beside it, as `<film>.png` or `mask.png`."""
-    folder = room.path / asked.name
+def _open_film(asked: Path, film: Path, folder: Path, every: int | None, room: Room) -> Pose:
+    """Write the frames of a film into a new folder; its mask may lie beside it, as `<film>.png` or `mask.png`."""
     mask = _beside(film, film.stem) or _beside(film, "mask")
     pose = Pose(film.stem, asked, folder, mask, None, (film.absolute().parent,), room=room)
     with pose.naming():
@@ -176,18 +180,24 @@ def _open_film(asked: Path, film: Path, every: int | None, room: Room) -> Pose:
 
 
 def _only_film(folder: Path) -> Path | None:
-    """Return the film of a folder that holds no other pictures than its mask; None where that is not so."""
+    """Return the film of a folder that holds no other pictures than its mask; None where that is not so.
+
+    Raises:
+        InputError: several.
+    """
     try:
         there = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError:  # a file, or reading it says what is wrong
         return None
-    films = [path for path in there if is_film(path) and path.is_file()]
-    if len(films) != 1:
-        return None
-    masks = {films[0].stem, "mask"}
+    films = sorted(path for path in there if is_film(path) and path.is_file())
+    masks = {"mask", *(film.stem for film in films)}
     roles = name_roles(pictures := _pictures(folder))
     alone = all(roles.get(name) == MASK or Path(name).stem in masks for name in pictures)
-    return films[0] if alone and not any(_pictures(path) for path in there if path.is_dir()) else None
+    if not films or not alone or any(_pictures(path) for path in there if path.is_dir()):
+        return None
+    if len(films) > 1:
+        raise InputError(f"{folder}: holds {len(films)} films ({list_names([film.name for film in films])}); name one")
+    return films[0]
 
 
 def _kind(folder: Path) -> str:

@@ -188,6 +188,11 @@ def test_a_film_is_its_frames(tmp_path: Path) -> None:
         grey, wanted = read[:].mean(-1)[:, MASK], np.stack(frames[::4]).mean(-1)[:, MASK]  # films blur colours
         assert np.corrcoef(grey.ravel(), wanted.ravel())[0, 1] > 0.99 and abs(grey.mean() / wanted.mean() - 1) < 0.05
     assert len(photos.load(film)) == 24  # fewer than 60
+    read = photos.load(pack(tmp_path.parent / f"{tmp_path.name}.zip", tmp_path, "a/"), every=8)
+    assert len(read) == 3 and read.mask_origin == "file"
+    write_film(tmp_path / "other.avi", frames)
+    with pytest.raises(InputError, match=r"holds 2 films \(lamp.avi, other.avi\); name one"):
+        photos.load(tmp_path)
 
 
 def test_frames_that_are_blurred_or_repeated_are_left_out(tmp_path: Path) -> None:
