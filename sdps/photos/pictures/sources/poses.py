@@ -87,7 +87,8 @@ def find_poses(place: str | Path, every: int | None = None, inside: Path | None 
     """
     place = Path(place)
     check_every(every)
-    room, folder = None, place
+    room: Room | None = None
+    folder = place
     if place.suffix.lower() == ".zip" and place.is_file():
         room = Room(inside)
         unpack_folders(place, room.path / place.name, (*SUFFIXES, *UNREAD, *FILMS, *LIGHT_FILES, ".sfm"))
