@@ -1,10 +1,10 @@
-"""`sdps infer`: a folder of photographs under moving light in, normals, lights, depth, meshes and a page out."""
+"""`sdps infer`: photographs under moving light in, normals, lights, depth, meshes and a page out."""
 
 import argparse
 import dataclasses
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from sdps.core.intensities import grey, scale_to_mean
 
 if TYPE_CHECKING:
     from sdps.api import Inference
-    from sdps.photos import Finding, Photographs
+    from sdps.photos import Finding, Photographs, Pose
     from sdps.refinement.trust import RefinedEstimate
 
 _MARKS = {"error": "!!", "warning": "! ", "note": "- "}
@@ -30,7 +30,9 @@ _MOST_SIDE = 700  # of the object, in pixels: twice that and more is thinned for
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags of `sdps infer`."""
-    parser.add_argument("folder", type=Path, nargs="?", help="photographs of a static object under moving light")
+    parser.add_argument("folder", type=Path, nargs="?", 
+                        help="photographs of a static object under moving light: a folder, one of Meshroom's poses "
+                        "(ps_*) or of .data folders, a ZIP of these, or a film")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("out/infer"), help="output folder")
     parser.add_argument("--method", default="auto", metavar="NAME",
                         help="any model or classical method: sdps, lcnet+psfcn, pf14, ... (default: auto)")  # fmt: skip
@@ -55,6 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="picture with the lamp off, subtracted; none for none (default: *ambient*)")  # fmt: skip
     parser.add_argument("--dark", default=None, metavar="FILE",
                         help="picture with the lens covered, subtracted; none for none (default: *dark*)")  # fmt: skip
+    parser.add_argument("--every", type=int, default=None, metavar="N",
+                        help="of a film, look at every N-th frame (default: so that about 60 are)")  # fmt: skip
     parser.add_argument("--discontinuities", action="store_true", help="let the depth jump where slopes disagree")
     parser.add_argument("--refine", action=argparse.BooleanOptionalAction, default=None,
                         help="refine normals and lights until a simple model explains the photographs, and join that "
@@ -87,8 +91,15 @@ def main(args: argparse.Namespace) -> int:
     if args.folder is None:
         raise InputError("name a folder of photographs, or use --self-test")
     exports = choose_exports(args.export, args.normals)
+    from sdps.api import check_out
+    from sdps.photos import find_poses
+
+    check_out(args.out, args.folder)
+    poses = find_poses(args.folder, args.every)
+    if len(poses) > 1:
+        return _infer_poses(args, poses, exports)
     with bars(without=("reading", "checks", "refinement")):  # these have their own
-        result, said = infer_folder(args)
+        result, said = infer_pose(args, poses[0], sys.stdout.write)
         made = result.save(args.out)
         exported = _export(args.out, exports, result.photos) if exports else ""
         page = write_page(args.out / "report.html", result)
@@ -121,29 +132,71 @@ def _export(folder: Path, names: Sequence[str], photos: "Photographs") -> str:
     return "".join(said)
 
 
-def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:
-    """Read the photographs, say what was found about them, and run the method; also return how many were said."""
-    from sdps.api import check_out, infer, load, plan
+def _infer_poses(args: argparse.Namespace, poses: "Sequence[Pose]", exports: Sequence[str]) -> int:
+    """Run all poses, each into a folder of its name, with a line for each; one that fails stops no other.
+
+    Raises:
+        InputError: at the end, with the names of those that failed.
+    """
+    from sdps.api import check_out
+
+    failed = []
+    sys.stdout.write(f"{len(poses)} poses: {', '.join(pose.name for pose in poses)}\n")
+    for pose in poses:
+        out = args.out / pose.name
+        try:
+            check_out(out, pose.folder)
+            with bars(without=("reading", "checks", "refinement")):
+                result, _ = infer_pose(args, pose, lambda text: None)
+                result.save(out)
+                exported = _export(out, exports, result.photos) if exports else ""
+                page = write_page(out / "report.html", result)
+        except InputError as error:
+            failed.append(pose.name)
+            sys.stdout.write(f"{_MARKS['error']} {pose.name}: {error}\n")
+        else:
+            sys.stdout.write(f"{exported}{pose.name}: {_summarise(result)}; {page}\n")
+        sys.stdout.flush()
+    if failed:
+        raise InputError(
+            f"{args.folder}: {len(failed)} of {len(poses)} poses failed, for the reasons above: {', '.join(failed)}"
+        )
+    return 0
+
+
+def _summarise(result: "Inference") -> str:
+    """Return how a pose went, in a line."""
+    parts = [f"{result.method}, {len(result.photos)} photographs, {result.seconds:.1f} s"]
+    error = result.summary().get("expected_normal_error_degrees")
+    parts += [] if error is None else [f"error of the normals to expect {error}°"]
+    warnings = sum(finding.level != "note" for finding in result.findings)
+    parts += [f"{warnings} {'warning' if warnings == 1 else 'warnings'} on the page"] if warnings else []
+    return "; ".join([*parts, result.verdict] if result.verdict else parts)
+
+
+def infer_pose(args: argparse.Namespace, pose: "Pose", tell: Callable[[str], object]) -> tuple["Inference", int]:
+    """Read the photographs, tell what was found about them, and run the method; also return how many were told."""
+    from sdps.api import infer, load, plan
     from sdps.inference.inference_config import inference_config
     from sdps.photos import check
 
     config = inference_config(args)
-    check_out(args.out, args.folder)
     photos = load(
-        args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
+        pose, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
         gamma=args.gamma, names=args.images, anyway=args.anyway, scale=args.scale, focal=args.focal,
         principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance,
         ambient=args.ambient, dark=args.dark,
     )  # fmt: skip
     findings = tuple(check(photos))
     height, width = photos.shape
-    sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is {_name_camera(photos)}\n")
-    sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
+    tell(f"{len(photos)} photographs of {width}x{height}; the camera is {_name_camera(photos)}\n")
+    tell("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
     options = {"models": args.models, "config": config, "refine": args.refine, "discontinuities": args.discontinuities}
     if args.anyway or not any(finding.level == "error" for finding in findings):
-        sys.stdout.write(f"{plan(photos, args.method, **options).describe()}\n")
+        tell(f"{plan(photos, args.method, **options).describe()}\n")
         sys.stdout.flush()
-    return infer(photos, args.method, findings=findings, anyway=args.anyway, **options), len(findings)
+    with pose.naming():
+        return infer(photos, args.method, findings=findings, anyway=args.anyway, **options), len(findings)
 
 
 def describe(findings: "Sequence[Finding]") -> str:

@@ -20,7 +20,7 @@ from starlette.staticfiles import StaticFiles
 from pipelines.app.common.jobs import Jobs
 from pipelines.app.common.refusals import Refused
 from pipelines.app.common.sessions import COOKIE, Sessions
-from pipelines.app.common.uploads import LIGHT_FILES, PICTURES, Limits, list_kinds
+from pipelines.app.common.uploads import USABLE, Limits, list_kinds
 from pipelines.app.pages import data_routes, photo_routes, studio_routes
 from pipelines.app.pages.handling import read_number
 from render.shared.errors import InputError
@@ -128,7 +128,7 @@ async def _send_page(request: Request) -> Response:
     if name not in PAGES:
         return HTMLResponse(fill(HERE / "templates" / "missing.html.j2", pages=PAGES, page=""), 404)
     limits: Limits = request.app.state.limits
-    accepted = ",".join((*PICTURES, *LIGHT_FILES, ".zip"))
+    accepted = ",".join((*USABLE, ".zip"))
     template = HERE / "templates" / f"{name}.html.j2"
     return HTMLResponse(
         fill(template, pages=PAGES, page=name, limits=limits, accepted=accepted, kinds=list_kinds()),

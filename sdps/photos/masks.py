@@ -10,6 +10,7 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from render.shared.errors import InputError
+from render.shared.imaging.reducing import reduce_mask
 from sdps.photos.picture_file import Picture, decode, orient_pixels
 from sdps.photos.response import full_scale
 
@@ -44,6 +45,12 @@ sphere has 1.2 and 0.49, and the sphere's mask is right.
 
 _SMALLEST = 1e-4
 
+_ALIKE = 0.9
+"""Share of what is opaque in some photograph that must be so in all, for it to be the object."""
+
+_MESHROOM = 0.7
+"""Share of full scale from which on a mask beside Meshroom's `ps_` folder is white, as Meshroom reads it."""
+
 _STILL = 1e-6
 """Standard deviation of the brightness under which a pixel does not change."""
 
@@ -68,6 +75,33 @@ class Variation:
     def deviation(self) -> np.ndarray:
         """Return the standard deviation over the images so far, (H, W) float32."""
         return np.sqrt(np.maximum(self.squares, 0) / max(self.count, 1))
+
+
+class CutOut:
+    """Where photographs with transparency are opaque, gathered picture by picture."""
+
+    def __init__(self) -> None:
+        self.whole = 0
+        self.inside: np.ndarray | None = None
+        self.outside: np.ndarray | None = None
+
+    def add(self, alpha: np.ndarray | None) -> None:
+        """Take in a picture's opacity, (H, W) as its pixels are turned; None of a picture without."""
+        if alpha is None or alpha.min() == alpha.max():
+            self.whole += 1
+            return
+        opaque = alpha > full_scale(alpha) / 2
+        self.inside = opaque if self.inside is None else self.inside & opaque
+        self.outside = ~opaque if self.outside is None else self.outside & ~opaque
+
+    def find(self, shape: tuple[int, int]) -> np.ndarray | None:
+        """Return what is opaque in all pictures, reduced to a shape (h, w) bool; None where some picture has no
+        transparency, or they differ in more than a tenth of the object.
+        """
+        if self.whole or self.inside is None or self.outside is None:
+            return None
+        mask = reduce_mask(self.inside, shape)
+        return mask if mask.any() and self.inside.sum() >= _ALIKE * (~self.outside).sum() else None
 
 
 def automatic_mask(variation: Variation) -> tuple[np.ndarray, str]:
@@ -102,12 +136,13 @@ def automatic_mask(variation: Variation) -> tuple[np.ndarray, str]:
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Read a mask (H, W) bool: more than half bright, or more than half opaque where the picture has transparency.
+    """Read a mask (H, W) bool: more than half bright, or more than half opaque where the picture has transparency;
+    `<name>.png` beside a folder `ps_<name>`: more than 0.7.
 
     Raises:
         InputError: unreadable, of another size, or empty.
     """
-    mask = bright_part(decode(path))
+    mask = bright_part(decode(path), _MESHROOM if (path.parent / f"ps_{path.stem}").is_dir() else 0.5)
     if mask.shape != shape:
         raise InputError(
             f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} pixels, the pictures are {shape[1]}x{shape[0]}; draw "
@@ -118,12 +153,17 @@ def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
     return np.ascontiguousarray(mask)
 
 
-def bright_part(picture: Picture) -> np.ndarray:
-    """Return what a mask marks, (H, W) bool: what is opaque, otherwise bright, otherwise the upper of two values."""
+def bright_part(picture: Picture, level: float = 0.5) -> np.ndarray:
+    """Return what a mask marks, (H, W) bool: what is opaque, otherwise bright, otherwise the upper of two values.
+
+    Args:
+        picture: The mask.
+        level: What is bright, as a share of full scale.
+    """
     pixels = picture.pixels.max(-1)
     if picture.alpha is not None and picture.alpha.min() < picture.alpha.max():
         pixels = picture.alpha
-    limit = full_scale(pixels) / 2
+    limit = full_scale(pixels) * level
     low, high = pixels.min(), pixels.max()
     if low < high <= limit and ((pixels == low) | (pixels == high)).all():
         limit = low  # such as labels 0 and 1

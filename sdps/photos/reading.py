@@ -20,6 +20,7 @@ from sdps.photos.pictures.ambient import Background
 from sdps.photos.pictures.lens import NOT_KNOWN, Wanted, read_wanted
 from sdps.photos.pictures.listing import Listing, list_pictures
 from sdps.photos.pictures.picture_kinds import Coding
+from sdps.photos.pictures.sources.poses import Pose, Room, only_pose
 from sdps.photos.response import to_linear
 from sdps.photos.scaling import reduce_linear
 from sdps.photos.survey import Survey, survey
@@ -56,6 +57,7 @@ class Photographs:
             distant ones; None where it is not known.
         background: What is subtracted of every picture: the room's light and the sensor's offset; None for nothing.
         nearness_each: Where it is not known, each lamp may have a distance of its own.
+        room: Keeps the temporary files that an archive or a film was taken apart to; None of a folder.
     """
 
     folder: Path
@@ -80,6 +82,7 @@ class Photographs:
     light_nearness: np.ndarray | None = None
     nearness_each: bool = False
     background: Background | None = None
+    room: Room | None = None
 
     def __len__(self) -> int:
         return len(self.files)
@@ -136,22 +139,22 @@ class Photographs:
 
 
 def load(
-    folder: str | Path, *, mask: str | Path | None = None, lights: str | Path | None = None,
+    folder: str | Path | Pose, *, mask: str | Path | None = None, lights: str | Path | None = None,
     intensities: str | Path | None = None, frame: str = "y-up", gamma: str | float = "auto",
     names: Sequence[str] | None = None, anyway: bool = False, scale: float = 1.0, focal: str | float | None = None,
     principal: str | Sequence[float] | None = None, pixel_size: float | None = None,
     light_distance: str | float | None = None, ambient: str | Path | None = None, dark: str | Path | None = None,
+    every: int | None = None,
 ) -> Photographs:  # fmt: skip
     """Look through a folder of photographs of a static object under one distant light each (docs/guides/capture.md).
 
     Every file is decoded once, one at a time, so that a damaged one is found now.
 
     Args:
-        folder: Pictures of one kind and size, and what may lie there with them.
+        folder: Pictures of one kind and size, and what may lie with them; a ZIP of it, a film, a pose of `find_poses`.
         mask: A picture, bright where the object is; None for the folder's mask or, without one, an automatic mask.
         lights: A lights file, or `folder` for that of the folder; None for unknown lights.
-        intensities: A file of intensities, `folder` for its light_intensities.txt, or `equal`; None for those of
-            `lights`, which are found from the photographs where it has none.
+        intensities: A file, `folder` for its light_intensities.txt, or `equal`; None for those of `lights`, else found.
         frame: Axes of the lights file: y-up, y-down, x-left, z-away, xy-swapped, several joined by commas.
         gamma: linear, srgb, the exponent of a power curve, or auto by kind of file and colour profile.
         names: Files or glob patterns to use, in this order; one that begins with `!` leaves files out.
@@ -167,42 +170,46 @@ def load(
         ambient: A picture without the lamp, which is subtracted in linear radiance, scaled by the exposures where EXIF
             data tell them; None for those of the folder that are named so, `none` for none.
         dark: A picture with the lens covered, which is subtracted as well; None and `none` as for `ambient`.
+        every: Of a film, take every n-th frame; None: so that about 60 are taken.
 
     Raises:
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
     """
-    distance = read_distance(light_distance)
-    wanted, folder, scale = read_wanted(focal, principal, pixel_size), Path(folder), check_scale(scale)
-    listing, faults = list_pictures(folder, names), Faults(anyway)
-    seen = survey(folder, listing, gamma, None if mask is None else Path(mask), faults, scale, (ambient, dark))
-    known = _find_lights(listing, seen, lights, intensities, frame, faults)
-    return _place_lamps(_assemble(folder, listing, seen, known, wanted, faults, scale), seen, known, distance)
+    wanted, distance = read_wanted(focal, principal, pixel_size), read_distance(light_distance)
+    pose, scale = only_pose(folder, every), check_scale(scale)
+    with pose.naming():
+        listing, faults = list_pictures(pose.folder, pose.names if names is None else names), Faults(anyway)
+        mask = pose.mask if mask is None else Path(mask)
+        seen = survey(pose.folder, listing, gamma, mask, faults, scale, (ambient, dark))
+        known = _find_lights(pose, listing, seen, lights, intensities, frame, faults)
+        return _place_lamps(_assemble(pose, listing, seen, known, wanted, faults, scale), seen, known, distance)
 
 
 def _find_lights(
-    listing: Listing, seen: Survey, lights: str | Path | None, intensities: str | Path | None, frame: str,
+    pose: Pose, listing: Listing, seen: Survey, lights: str | Path | None, intensities: str | Path | None, frame: str,
     faults: Faults,
 ) -> KnownLights:  # fmt: skip
     """Read the lights; their errors say what was left out of the pictures."""
+    files = tuple(f"{pose.prefix}{name}" for name in seen.files)
     try:
-        return known_lights(listing.places, seen.files, lights, intensities, frame, faults)
+        return known_lights((*listing.places, *pose.above), files, lights, intensities, frame, faults)
     except InputError as error:
         raise InputError(f"{error} ({seen.left_out})" if seen.left_out else error) from error
 
 
 def _assemble(
-    folder: Path, listing: Listing, seen: Survey, known: KnownLights, wanted: Wanted, faults: Faults, scale: float
+    pose: Pose, listing: Listing, seen: Survey, known: KnownLights, wanted: Wanted, faults: Faults, scale: float
 ) -> Photographs:
     """Put together what was found, with the camera."""
     by = wanted.find(seen.lenses, seen.full, seen.mask.shape)
     return Photographs(
-        folder=folder, files=seen.files, shape=seen.mask.shape, bits=seen.coding.bits, gamma=seen.gamma,
+        folder=pose.folder, files=seen.files, shape=seen.mask.shape, bits=seen.coding.bits, gamma=seen.gamma,
         mask=seen.mask, mask_origin=seen.origin, light_directions=known.directions, intensities=known.intensities,
         lights_name=known.name, lights_frame=known.frame,
-        notes=(*listing.notes, *seen.notes, *by.notes, *known.notes), coding=seen.coding,
+        notes=(*pose.notes, *listing.notes, *seen.notes, *by.notes, *known.notes), coding=seen.coding,
         orientation=seen.orientation, overridden=tuple(faults.overridden), scale=scale, camera=by.camera,
-        camera_origin=by.origin, pixel_size=by.pixel_size,
-        background=seen.background,
+        camera_origin=by.origin, pixel_size=by.pixel_size or known.image_width / seen.mask.shape[1] or None,
+        background=seen.background, room=pose.room,
     )  # fmt: skip
 
 

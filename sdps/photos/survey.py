@@ -10,7 +10,7 @@ from render.shared.errors import InputError
 from render.shared.imaging.reducing import reduce_image, smaller_shape
 from render.shared.progress import progress_bar, stage
 from sdps.photos.faults import Faults
-from sdps.photos.masks import Variation, automatic_mask, bright_part
+from sdps.photos.masks import CutOut, Variation, automatic_mask, bright_part
 from sdps.photos.picture_file import Picture, decode, is_misnamed, orient_pixels, turn_pixels
 from sdps.photos.pictures.ambient import Background, Frame, find_frames, read_background
 from sdps.photos.pictures.contents import judge_content, like_mask
@@ -94,7 +94,7 @@ def survey(
     assert look.first is not None  # two pictures fit
     notes = [note for note in (left_out, *masks.notes, *look.suspicious, *look.kinds(), look.why) if note]
     notes += [*_orientation_note(look), *scale_note(look.full, look.shape)]
-    mask, said = _find_mask(look, masks)
+    mask, origin, said = _find_mask(look, masks)
     _refuse_broken(folder, look.kept, look.broken, mask, faults)
     if (look.broken >= 0).any():
         notes.append("values that are not finite were set to 0")
@@ -104,22 +104,26 @@ def survey(
     notes += subtracted
     return Survey(
         files=tuple(name for name in listing.files if name in look.kept), coding=look.first.coding, gamma=look.gamma,
-        orientation=look.first.orientation, mask=mask, origin="automatic" if masks.file is None else "file",
+        orientation=look.first.orientation, mask=mask, origin=origin,
         notes=(*notes, said), left_out=left_out, full=look.full, lenses=frozenset(look.lenses),
         background=background,
     )  # fmt: skip
 
 
-def _find_mask(look: "_Look", masks: "_Masks") -> tuple[np.ndarray, str]:
-    """Return the mask (H, W) bool and a sentence about it."""
+def _find_mask(look: "_Look", masks: "_Masks") -> tuple[np.ndarray, str, str]:
+    """Return the mask (H, W) bool, whether it is from a `file` or `automatic`, and a sentence about it."""
     assert look.variation is not None
     if masks.file is not None:
-        return read_reduced_mask(masks.file, look.full, look.shape), f"the mask is {masks.file.name}"
+        return read_reduced_mask(masks.file, look.full, look.shape), "file", f"the mask is {masks.file.name}"
+    cut = look.cut.find(look.shape)
+    if cut is not None:
+        return cut, "file", "the mask is what is opaque in the pictures; a mask.png replaces it"
     if not look.variation.changes().any():
         look.faults.stop(
             f"{look.folder}: nothing changes between the pictures; is the lamp on and moved? otherwise give a mask"
         )
-    return automatic_mask(look.variation)
+    found, said = automatic_mask(look.variation)
+    return found, "automatic", said
 
 
 @dataclass(eq=False)
@@ -148,6 +152,7 @@ class _Look:
     full: tuple[int, int] = (0, 0)  # sides of the pictures, once turned
     shape: tuple[int, int] = (0, 0)  # and reduced
     variation: Variation | None = None
+    cut: CutOut = field(default_factory=CutOut)
     broken: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))  # first picture with a value not finite
     levels: list[float] = field(default_factory=list)
 
@@ -221,6 +226,8 @@ class _Look:
             touched = reduce_image((~np.isfinite(pixels).all(-1)).astype(np.float32), self.shape) > 0
             self.broken[(self.broken < 0) & touched] = len(self.kept) - 1
         if not self.masked:
+            cut = None if picture.alpha is None else replace(picture, pixels=picture.alpha)
+            self.cut.add(cut and turn_pixels(cut, self.first.orientation, self.full))
             self.variation.add(reduce_grey(pixels, self.gamma, self.shape))
 
     def _begin(self, name: str, picture: Picture) -> None:

@@ -37,7 +37,7 @@ def mutated(data: bytes, name: str, rng: random.Random) -> bytes:
     """Return another content of the file `name`, at most 1 MiB longer than before."""
     suffix = name.lower().rpartition(".")[2]
     ways: list[Callable[[bytes, random.Random], bytes]] = [_bytes]
-    if suffix in ("json", "jsonl", "yaml", "yml", "gltf", "http", "relight"):
+    if suffix in ("json", "jsonl", "yaml", "yml", "gltf", "http", "relight", "dome"):
         ways += [_words, _values_of(suffix), _values_of(suffix)]
     elif suffix in ("txt", "obj", "off", "csv", "lp") or data[:5] in (b"solid", b"ply\nf"):
         ways += [_words, _words]
@@ -104,7 +104,7 @@ def _values_of(suffix: str) -> Callable[[bytes, random.Random], bytes]:
                 number = rng.randrange(len(lines))
                 lines[number] = json.dumps(_grafted(json.loads(lines[number]), rng))
                 return ("\n".join(lines) + "\n").encode("utf-8", "surrogatepass")
-            if suffix in ("json", "gltf", "http", "relight"):
+            if suffix in ("json", "gltf", "http", "relight", "dome"):
                 return json.dumps(_grafted(json.loads(text), rng)).encode()
             return yaml.safe_dump(_grafted(yaml.safe_load(text), rng)).encode("utf-8", "surrogatepass")
         except (ValueError, yaml.YAMLError, IndexError):

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -163,6 +164,22 @@ def _light_files(folder: Path) -> None:
     write_lights(folder / "near.json", names, vectors, np.ones(6), np.linspace(0.0, 0.5, 6))
     images = [{"filename": name, "direction": dict(zip("xyz", vector, strict=True))} for name, *vector in rows]
     (folder / "project.relight").write_text(json.dumps({"images": images}))
+    places = [image["direction"] for image in images]
+    factors = [dict.fromkeys("rgb", 1.0 + number) for number in range(6)]
+    dome = {"domeDiameter": 600, "imageWidth": 90, "verticalOffset": -9, "directions": places, "ledAdjust": factors}
+    (folder / "rig.dome").write_text(json.dumps(dome))
+
+
+def _sources(folder: Path) -> None:
+    with zipfile.ZipFile(folder / "rig.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for number in range(6):
+            picture = cv2.imencode(".png", np.rint(255 * np.roll(_IMAGE, number, axis=1)).astype(np.uint8))[1]
+            archive.writestr(f"rig/ps_{number // 3}/{number}.png", picture.tobytes())
+    for name, code in (("lamp.avi", "MJPG"), ("lamp.mp4", "mp4v")):
+        film = cv2.VideoWriter(str(folder / name), cv2.VideoWriter_fourcc(*code), 25, (16, 12))
+        for number in range(8):
+            film.write(np.rint(255 * np.roll(_IMAGE, number, axis=1)).astype(np.uint8))
+        film.release()
 
 
 def _weights(folder: Path) -> None:
@@ -388,6 +405,12 @@ def _read_light_file(folder: Path, path: Path) -> None:
         read_intensities(path, files)
 
 
+def _read_source(folder: Path, path: Path) -> None:
+    from sdps.photos import find_poses
+
+    find_poses(path, inside=folder)
+
+
 def _read_weights(folder: Path, path: Path) -> None:
     from sdps.models.checkpoint import load_state, load_weights
     from sdps.publishing.learning_curves import read_metrics
@@ -475,6 +498,7 @@ TARGETS: dict[str, Target] = {
     "pictures of other layouts": Target(_pictures, _read_foreign_picture, "*.[pj][np]g"),
     "environment maps": Target(_environments, _read_environment),
     "light files": Target(_light_files, _read_light_file),
+    "archives and films": Target(_sources, _read_source),
     "weights, checkpoints, curves": Target(_weights, _read_weights),
     "model cards": Target(_run, _read_run, "[rd]*/*.*"),
     "uploads to the app": Target(fuzz_app.uploads, fuzz_app.read_upload, "uploads/*"),

@@ -2,8 +2,10 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import classical_scenes as scenes
@@ -406,3 +408,52 @@ def test_the_bench_measures_every_step(tmp_path: Path, capsys: pytest.CaptureFix
     assert large["stages"]["normals"] > 0 and large["peak_gib"] > 0 and large["expected"] > 0
     assert "million" not in (said := capsys.readouterr().out) and "minutes, expected" in said
     assert "too dark" in bench_infer.table({"pf14": {"error": "too dark"}}, bench_infer.BenchClassicalConfig(), "here")
+
+
+def test_all_poses_of_a_folder(tmp_path: Path, capsys) -> None:
+    """One line for each; one that fails stops no other, and the last line names it."""
+    normals, mask = scenes.hills(32)
+    images = scenes.lambertian(normals, mask, LIGHTS, albedo=0.7).images.astype(np.float32)
+    for name, some in (("ps_a", images), ("ps_b", images[:6]), ("ps_c", images[:8])):
+        folders.write_folder(tmp_path / "rig" / name, some)
+        folders.write(tmp_path / "rig" / f"{name[3:]}.png", mask.astype(np.float32))
+    (tmp_path / "rig" / "lights.txt").write_text(
+        "".join(f"{number} {x} {y} {z}\n" for number, (x, y, z) in enumerate(LIGHTS, start=1))
+    )
+    folders.write(tmp_path / "rig" / "b.png", np.ones((9, 9)))
+    out = tmp_path / "out"
+    flags = ["--lights", "folder", "--intensities", "equal", "--method", "least-squares", "--anyway", "--out", str(out)]
+    assert main(["infer", str(tmp_path / "rig"), *flags]) == 2
+    said, wrong = capsys.readouterr()
+    first, one, two, three = said.splitlines()
+    assert first == "3 poses: a, b, c" and three.startswith("c: least-squares, given lights, 8 photographs, ")
+    assert one.startswith("a: least-squares, given lights, 16 photographs, ") and one.endswith(
+        str(out / "a" / "report.html")
+    )
+    assert two.startswith("!! b: ") and "b.png: the mask is 9x9 pixels" in two
+    assert wrong.endswith("rig: 1 of 3 poses failed, for the reasons above: b\n")
+    assert sorted(path.name for path in out.iterdir()) == ["a", "c"]
+    for name in "ac":
+        assert [file for file in FILES if not (out / name / file).is_file()] == []
+        assert normal_mae(np.load(out / name / "normal.npy"), normals, mask) < 10.0  # shadows; else tens of degrees
+
+
+def test_a_film_and_a_zip(tmp_path: Path, capsys) -> None:
+    around = 2 * np.pi * np.arange(30) / 30
+    lights = np.stack([0.6 * np.cos(around), 0.6 * np.sin(around), np.full(30, 0.8)], axis=1)
+    images, mask = folders.matte(lights, size=32)
+    writer = cv2.VideoWriter(str(tmp_path / "lamp.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25, mask.shape[::-1])
+    for image in images:
+        writer.write(np.rint(255 * folders.to_srgb(image[..., ::-1])).astype(np.uint8))
+    writer.release()
+    flags = ["--method", "am07", "--anyway", "--every", "5"]
+    assert main(["infer", str(tmp_path / "lamp.avi"), "--out", str(tmp_path / "out"), *flags]) == 0
+    said = capsys.readouterr().out
+    assert "lamp.avi has 30 frames; one of every 5 frames was looked at, and 6 are the photographs" in said
+    assert "lamp.avi" in (tmp_path / "out" / "report.html").read_text()
+    assert len(json.loads((tmp_path / "out" / "lights.json").read_text())["images"]) == 6
+    shutil.make_archive(str(tmp_path / "cup"), "zip", folders.write_folder(tmp_path / "cup", images[::5], mask))
+    assert main(["infer", str(tmp_path / "cup.zip"), "--out", str(tmp_path / "zip"), *flags[:3]]) == 0
+    assert "the mask is mask.png" in capsys.readouterr().out
+    assert "cup is no film; leave the flag out" in fails(capsys, tmp_path / "cup", *flags, "--out", tmp_path / "no")
+    assert not list(Path(tempfile.gettempdir()).glob("sdps-*/lamp.avi"))

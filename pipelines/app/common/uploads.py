@@ -13,10 +13,12 @@ from PIL import Image
 from render.shared.errors import InputError
 from render.shared.files import parse_json
 from sdps.photos.light_files import SUFFIXES as LIGHT_FILES
-from sdps.photos.pictures.picture_kinds import SUFFIXES, picture_kind
+from sdps.photos.pictures.picture_kinds import FILMS, SUFFIXES, picture_kind
 
 PICTURES = tuple(SUFFIXES)
 """Suffixes of the pictures that `sdps infer` and the app read."""
+USABLE = (*PICTURES, *LIGHT_FILES, *FILMS)
+"""Suffixes of what may be uploaded as, or with, photographs."""
 _NAME = re.compile(r"[^\w.,()+ -]+")
 _LONGEST = 200  # bytes of a name; file systems allow 255, and we may add a prefix or suffix
 _TEXTS = (*LIGHT_FILES, ".yaml", ".yml")
@@ -42,7 +44,7 @@ class Limits:
     pixels: int = 25_000_000
 
 
-def clean_name(name: str, allowed: tuple[str, ...] = PICTURES + LIGHT_FILES) -> str:
+def clean_name(name: str, allowed: tuple[str, ...] = USABLE) -> str:
     """Return the last part of a name without unusual characters, at most 200 bytes.
 
     Raises:

@@ -169,11 +169,12 @@ def _load(
     folder: Path, *, anyway: bool, gamma: str = "auto", frame: str = "y-up", lights: bool = False, scale: float = 1.0,
     focal: str = "", light_distance: str = "auto",
 ) -> Any:  # fmt: skip
-    import sdps
+    from sdps import photos
 
     painted = folder / PAINTED
-    return sdps.load(
-        folder / PHOTOS, mask=painted if painted.is_file() else None, lights="folder" if lights else None,
+    (pose,) = photos.find_poses(folder / PHOTOS, inside=folder)  # it has no folders, so there is one
+    return photos.load(
+        pose, mask=painted if painted.is_file() else None, lights="folder" if lights else None,
         frame=frame, gamma=gamma, anyway=anyway, scale=scale,
         light_distance=light_distance, focal=f"{focal}mm" if focal[-1:].isdigit() else focal,  # as the page asks for it
     )  # fmt: skip

@@ -48,6 +48,7 @@ class Lights:
         own_frame: The file states its axes, so that no flag may turn them.
         distances: (L,) float64, of the lamps from the object's middle, in `unit`; None of a file of directions.
         unit: mm, cm, m, pixels, or objects: sizes of the object.
+        image_width: Millimetres that the pictures' whole width shows; 0 where the file does not say.
     """
 
     directions: np.ndarray
@@ -56,6 +57,7 @@ class Lights:
     own_frame: bool = False
     distances: np.ndarray | None = None
     unit: str = ""
+    image_width: float = 0.0
 
 
 def read_lights(
@@ -95,7 +97,10 @@ def read_lights(
     turned = f", turned by {frame}" if (turn != np.eye(3)).any() else ""
     how = f", axes {frame}" if table.signs == (1, 1, 1) else turned
     notes = [f"lights are those of {path.name}{how}", *said, *_describe(lengths, near)]
-    found = Lights(directions.astype(np.float32), _intensities(path, strengths, files), tuple(notes), own)
+    found = Lights(
+        directions.astype(np.float32), _intensities(path, strengths, files), tuple(notes), own,
+        image_width=table.image_width,
+    )  # fmt: skip
     if near is None:
         return found
     return replace(found, distances=np.where(lengths < ENDLESS / 2, lengths, np.inf), unit=near.unit)

@@ -27,6 +27,7 @@ class KnownLights:
         notes: Plain sentences about where they come from.
         distances: (L,) float64, of the lamps from the object's middle, in `unit`; None where the file has none.
         unit: mm, cm, m, pixels, or objects: sizes of the object.
+        image_width: Millimetres that the pictures' whole width shows; 0 where no file says.
     """
 
     directions: np.ndarray | None = None
@@ -36,6 +37,7 @@ class KnownLights:
     notes: tuple[str, ...] = ("lights are unknown and will be estimated, where the method can",)
     distances: np.ndarray | None = None
     unit: str = ""
+    image_width: float = 0.0
 
 
 def known_lights(
@@ -70,7 +72,7 @@ def known_lights(
         directions, strengths, notes, name = read.directions, read.intensities, read.notes, path.name
         found = KnownLights(
             directions=directions, name=name, frame="" if read.own_frame else frame, distances=read.distances,
-            unit=read.unit,
+            unit=read.unit, image_width=read.image_width,
         )  # fmt: skip
     if intensities is not None and str(intensities) == EQUAL:
         strengths, notes = np.ones(len(files), np.float32), (*notes, "intensities are taken for equal, as asked")

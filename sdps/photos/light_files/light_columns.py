@@ -119,7 +119,7 @@ def upright(path: Path, table: Table, count: int, want: Want, signs: Sequence[in
             return table
         return _transpose(replace(table, names=None, columns=kinds))
     if table.columns:
-        return table
+        return _transpose(table) if rows == len(table.columns) != width == count else table
     along = rows == count and width in {*want.widths, *(width + 1 for width in want.widths)}
     across = width == count and rows in want.widths
     if across and (not along or (want.lights and _columns_are_lights(path, table.values, signs))):

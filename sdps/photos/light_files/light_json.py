@@ -12,7 +12,7 @@ from render.shared.config import parse_yaml
 from render.shared.errors import InputError
 from render.shared.files import parse_json, read_text
 from sdps.photos.light_files.light_names import base_name, numbers_of
-from sdps.photos.light_files.light_positions import own_position, read_near, read_positions
+from sdps.photos.light_files.light_positions import own_position, read_dome, read_near, read_positions
 from sdps.photos.light_files.light_table import Table, counts
 
 FRAME = "x right, y up, z to the camera"
@@ -77,7 +77,7 @@ def _foreign(path: Path, content: Any, files: Sequence[str]) -> Table:
     if isinstance(content, dict) and "images" in content:
         return _relight(path, content)
     if isinstance(content, dict) and any(key in content for key in ("directions", "positions3d", "positionsSphere")):
-        return Table(_dome(content))
+        return read_dome(path, content)
     if isinstance(content, dict) and content:
         return Table(np.array([_vector(value, (3, 4, 6)) for value in content.values()]), tuple(map(str, content)))
     if isinstance(content, list) and content and all(isinstance(row, list) for row in content):
@@ -141,7 +141,7 @@ def _of_views(path: Path, keys: list[str], files: Sequence[str]) -> tuple[tuple[
     for scene in sorted(path.parent.glob("*.sfm"))[:20]:
         try:
             content = parse_json(read_text(scene))
-            views = {str(view["viewId"]): base_name(str(view["path"])) for view in content["views"]}
+            views = {str(view["viewId"]): str(view["path"]) for view in content["views"]}
         except (ValueError, TypeError, KeyError):
             continue
         if set(keys) <= set(views):
@@ -161,20 +161,23 @@ def _is_relight(content: dict[str, Any]) -> bool:
 
 
 def _relight(path: Path, content: dict[str, Any]) -> Table:
-    """Read RelightLab's project: images with a direction each, else the directions of its dome."""
-    images = content["images"]
-    rows = np.array([_vector(image.get("direction", [0.0, 0.0, 0.0])) for image in images])
-    if not rows.any() and isinstance(content.get("dome"), dict):
-        rows = _dome(content["dome"])
-    if len(rows) != len(images) or not rows.any():
+    """Read RelightLab's project: the lamps of its dome where they are near, its images' directions, or its dome's."""
+    images, dome = content["images"], content.get("dome")
+    kept = [image for image in images if not image.get("skip")]
+    names = tuple(base_name(str(image["filename"])) for image in kept)
+    scale = content.get("pixelSize") or content.get("scale") or 0.0  # millimetres per pixel
+    width = float(scale) * float(content.get("width") or 0.0)
+    of_dome = None
+    if isinstance(dome, dict) and any(dome.get(key) for key in ("directions", "positions3d", "positionsSphere")):
+        of_dome = read_dome(path, dome, width)
+    if of_dome is not None and len(of_dome.values) == len(images) > len(kept):
+        chosen = [number for number, image in enumerate(images) if not image.get("skip")]
+        strengths = None if of_dome.strengths is None else of_dome.strengths[chosen]
+        of_dome = replace(of_dome, values=of_dome.values[chosen], strengths=strengths)
+    rows = np.array([_vector(image.get("direction", [0.0, 0.0, 0.0])) for image in kept])
+    fits = of_dome is not None and len(of_dome.values) == len(kept)
+    if of_dome is not None and fits and (of_dome.near is not None or not rows.any()):
+        return replace(of_dome, names=names)
+    if not rows.any():
         raise InputError(f"{path}: its images have no light directions; find the lights in RelightLab first")
-    kept = [number for number, image in enumerate(images) if not image.get("skip")]
-    return Table(rows[kept], tuple(base_name(str(images[number]["filename"])) for number in kept))
-
-
-def _dome(dome: dict[str, Any]) -> np.ndarray:
-    """Return the vectors of RelightLab's dome, (N, 3); positions where it has no directions."""
-    for key in ("directions", "positions3d", "positionsSphere"):
-        if dome.get(key):
-            return np.array([_vector(value) for value in dome[key]])
-    raise ValueError("a dome without directions")
+    return Table(rows, names, strengths=of_dome.strengths if of_dome and fits else None, image_width=width)

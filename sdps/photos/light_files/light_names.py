@@ -5,6 +5,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -26,13 +27,18 @@ def stem(name: str) -> str:
     return _SUFFIX.sub("", base_name(name))
 
 
+def _last_two(name: str) -> str:
+    """Return a name with the folder that it lies in, as far as it says so; pictures of several poses share names."""
+    return "/".join(re.split(r"[/\\]", name.strip())[-2:])
+
+
 def _plain(name: str) -> str:
     """Return a name as systems that take no notice of case compare it; macOS takes letters and accents apart."""
     return unicodedata.normalize("NFC", name).casefold()
 
 
 _KEYS: tuple[tuple[Callable[[str], str], Callable[[str], str]], ...] = (
-    (str, str), (base_name, base_name), (base_name, stem), (stem, stem),
+    (str, str), (_last_two, _last_two), (base_name, base_name), (base_name, stem), (stem, stem),
     (lambda name: _plain(base_name(name)), lambda name: _plain(base_name(name))),
     (lambda name: _plain(stem(name)), lambda name: _plain(stem(name))),
 )  # fmt: skip
@@ -125,8 +131,9 @@ def in_order(path: Path, table: Table, files: Sequence[str]) -> tuple[np.ndarray
     missing = [file for file, place in zip(files, places, strict=True) if place is None]
     if missing:
         raise InputError(
-            f"{path}: no row for {list_names(missing)} ({len(missing)} of {len(files)} pictures lack one); its rows "
-            f"are for {list_names(names, 3)}; add what is missing or correct the names"
+            f"{path}: no row for {list_names(missing)} ({len(missing)} of {len(files)} pictures lack one); "
+            f"its rows are for {list_names(names, 3)}{_nearest(missing[0], names, places)}; add what is missing or "
+            "correct the names"
         )
     used = [place for place in places if place is not None]
     spare = [name for place, name in enumerate(names) if place not in set(used)]
@@ -134,6 +141,13 @@ def in_order(path: Path, table: Table, files: Sequence[str]) -> tuple[np.ndarray
     if spare:
         notes.append(f"rows without a picture were not used: {list_names(spare)}")
     return table.values[used], tuple(notes)
+
+
+def _nearest(file: str, names: Sequence[str], places: Sequence[int | None]) -> str:
+    """Say which row that is no other picture's is named most like a picture."""
+    spare = {_plain(stem(name)): name for place, name in enumerate(names) if place not in places}
+    found = get_close_matches(_plain(stem(file)), spare, n=1, cutoff=0.5)
+    return f", and the nearest to {file} is {spare[found[0]]}" if found else ""
 
 
 def _by_name(path: Path, names: Sequence[str], files: Sequence[str]) -> tuple[list[int | None], str]:

@@ -16,6 +16,7 @@ NEAR = "near"
 ENDLESS = 1e9
 """Distance, in any unit, at which a distant lamp stands for while a file is read."""
 
+_POSITIONS = ("positionsSphere", "positions3d")
 _OTHER_WORDS = {"px": "pixels", "pixel": "pixels", "object": "objects", "millimetres": "mm", "centimetres": "cm",
                 "metres": "m"}  # fmt: skip
 _FIELDS = ("kind", "unit", "object", "positions", "intensities")
@@ -88,6 +89,57 @@ def read_positions(path: Path, content: dict[str, Any]) -> Table:
     return Table(np.array(rows, np.float64), names, near=near)
 
 
+def read_dome(path: Path, dome: dict[str, Any], image_width: float = 0.0) -> Table:
+    """Read RelightLab's dome: {"domeDiameter", "imageWidth", "verticalOffset", "lightConfiguration", "directions",
+    "positionsSphere", "positions3d", "ledAdjust"}, in millimetres, from the middle of the picture, z to the camera.
+
+    With a diameter and the pictures' width its lamps are near ones; the positions that it holds are used if they are
+    about as long as its radius, else its directions. `ledAdjust` is what it multiplies pixels with, so intensities are
+    its inverse.
+
+    Args:
+        path: The file.
+        dome: What is in it.
+        image_width: Millimetres that the pictures' width shows, where the dome does not say.
+
+    Raises:
+        InputError: no lights in it, or values that are not numbers.
+    """
+    said = [dome.get(key) or 0.0 for key in ("domeDiameter", "imageWidth", "verticalOffset")]
+    diameter, width, offset = (_read_numbers(path, value, (1,), "size")[0] for value in said)
+    image_width, radius = width or image_width, diameter / 2
+    keys = ("positions3d", "positionsSphere") if dome.get("lightConfiguration") == "lights3d" else ("positionsSphere",)
+    lists = {key: _read_rows(path, dome.get(key)) for key in ("directions", "positionsSphere", "positions3d")}
+    directions = next((lists[key] for key in ("directions", *_POSITIONS) if len(lists[key])), None)
+    if directions is None:
+        raise InputError(f"{path}: a dome without directions; find the lights in RelightLab first")
+    adjust = dome.get("ledAdjust") or []
+    strengths = None
+    if len(adjust) == len(directions) and len({str(one) for one in adjust}) > 1:
+        factors = np.array([_read_numbers(path, [one[key] for key in "rgb"], (3,), "ledAdjust") for one in adjust])
+        strengths = None if (factors <= 0).any() else 1.0 / factors
+    if radius <= 0.0 or image_width <= 0.0:
+        more = "the width of its pictures (imageWidth)" if radius > 0.0 else "its diameter"
+        note = f"{path.name} does not say {more}, so its lamps are taken for distant"
+        return Table(directions, strengths=strengths, notes=(note,), image_width=image_width)
+    fitting = [lists[key] for key in keys if _are_about(lists[key], radius)]
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    rows = fitting[0] if fitting else directions / lengths.clip(1e-9) * radius + [0.0, 0.0, offset]
+    note = f"lamps of a dome of {diameter:g} mm, and pictures {image_width:g} mm wide"
+    return Table(rows, strengths=strengths, notes=(note,), near=Near("mm"), image_width=image_width)
+
+
+def _read_rows(path: Path, values: Any) -> np.ndarray:
+    """Return a list of {x, y, z} or [x, y, z] as (N, 3); (0, 3) where it is missing or all zeros."""
+    rows = np.array([_read_numbers(path, value, (3,), "light") for value in values or []], np.float64).reshape(-1, 3)
+    return rows if rows.any() else rows[:0]
+
+
+def _are_about(rows: np.ndarray, radius: float) -> bool:
+    """Tell whether positions are in millimetres; some versions of RelightLab wrote widths of the picture."""
+    return len(rows) > 0 and 1 / 3 < float(np.median(np.linalg.norm(rows, axis=1))) / radius < 3
+
+
 def own_position(image: dict[str, Any]) -> list[float]:
     """Return where a lamp of lights.json stands; very far in its direction, where it has no position."""
     if "position" in image:
@@ -145,7 +197,7 @@ def _read_numbers(path: Path, value: Any, sizes: tuple[int, ...], what: str) -> 
     except (TypeError, ValueError, OverflowError):
         numbers = []
     if len(values) not in sizes or len(numbers) != len(values) or not np.isfinite(numbers).all():
-        want = {(3,): "three numbers x y z", (1, 3): "a number, or three"}[sizes]
+        want = {(3,): "three numbers x y z", (1, 3): "a number, or three", (1,): "a number"}[sizes]
         raise InputError(f"{path}: {what} {str(value)[:60]!r} is not {want}, finite; correct it")
     return numbers
 

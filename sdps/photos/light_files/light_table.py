@@ -54,6 +54,7 @@ class Table:
         doubt: Why the rows may not belong to the pictures; empty where nothing speaks against it.
         notes: Plain sentences about what was done.
         near: The rows are positions of lamps, not directions; None of directions.
+        image_width: Millimetres that the pictures' whole width shows; 0 where the file does not say.
     """
 
     values: np.ndarray
@@ -66,6 +67,7 @@ class Table:
     doubt: str = ""
     notes: tuple[str, ...] = ()
     near: Near | None = None
+    image_width: float = 0.0
 
 
 def are_unit(vectors: np.ndarray) -> bool:

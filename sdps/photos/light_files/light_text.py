@@ -99,6 +99,8 @@ def _content(path: Path, text: str, want: Want) -> tuple[Heading | None, list[tu
             and len(_row(number, raw, _POINTS).values) in want.widths
         ):
             line = raw.strip()  # a name with such a sign in it
+        if line.startswith("*") and not _row(number, line, _COMMAS).values:
+            continue  # a comment of HALCON's
         words = set(re.findall(r"[^\W\d_]+", line.lower()))
         if heading is None and (not lines or (len(lines) == 1 and lines[0][1].isdecimal())):
             if comment and not line:

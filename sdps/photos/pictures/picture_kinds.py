@@ -35,6 +35,9 @@ UNREAD = {
 }
 """Suffixes of pictures and films that are not read, in lower case."""
 
+FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv")
+"""Suffixes of films, whose frames are read where nothing but a film is given, in lower case."""
+
 _STARTS = (
     (b"\x89PNG\r\n\x1a\n", "PNG"), (b"\xff\xd8\xff", "JPEG"), (b"\x76\x2f\x31\x01", "EXR"), (b"BM", "BMP"),
     (b"FUJIFILMCCD-RAW", "RAW"), (b"IIU\0", "RAW"), (b"IIRO", "RAW"), (b"IIRS", "RAW"), (b"MMOR", "RAW"),

@@ -168,6 +168,29 @@ def test_lists_and_names_decide(tmp_path: Path) -> None:
         photos.load(tmp_path)
 
 
+def test_the_mask_of_pictures_that_are_cut_out(tmp_path: Path) -> None:
+    """What is opaque in all of them; not where one has no transparency, or they disagree."""
+    mask = np.zeros(WHOLE.shape, bool)
+    mask[3:9, 4:15] = True
+
+    def cut(number: int, opaque: np.ndarray) -> None:
+        rgba = np.dstack([PAIR[number % 2], opaque])
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.rint(rgba * 255).astype(np.uint8))
+
+    for number in range(3):
+        cut(number, mask)
+    read = photos.load(tmp_path)
+    assert read.mask_origin == "file"
+    np.testing.assert_array_equal(read.mask, mask)
+    assert "the mask is what is opaque in the pictures; a mask.png replaces it" in read.notes
+    folders.write(tmp_path / "mask.png", WHOLE)
+    assert photos.load(tmp_path).mask.all()
+    (tmp_path / "mask.png").unlink()
+    for other in (WHOLE, np.roll(mask, 3, axis=1)):
+        cut(1, other)
+        assert photos.load(tmp_path).mask_origin == "automatic"
+
+
 def test_masks_of_all_sorts(tmp_path: Path) -> None:
     mask = np.zeros(WHOLE.shape)
     mask[3:9, 4:15] = 1

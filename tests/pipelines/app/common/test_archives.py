@@ -14,7 +14,7 @@ import pytest
 from app_server import Client, application, contents
 from PIL import Image
 
-from pipelines.app.common import archives
+from sdps.photos.pictures.sources import archive_files
 
 LIMITS = {"files": 20, "bytes": 4_000_000, "pixels": 200_000}
 
@@ -242,13 +242,13 @@ def test_an_archive_and_its_files_never_take_more_together_than_allowed(
     noise = [png()[:-12] + bytes(400_000) for _ in range(7)]  # a PNG's header, then anything
     data = packed(*((f"{number}.png", item) for number, item in enumerate(noise)), method=zipfile.ZIP_STORED)
     assert 0.7 * LIMITS["bytes"] < len(data) < 0.8 * LIMITS["bytes"]
-    most, extract = [0], archives._extract
+    most, extract = [0], archive_files._extract
 
     def watched(*arguments: Any) -> None:
         extract(*arguments)  # now a file is there twice, packed and unpacked, and nothing else moves
         most.extend([session.taken, sum(contents(folder).values())])
 
-    monkeypatch.setattr(archives, "_extract", watched)
+    monkeypatch.setattr(archive_files, "_extract", watched)
     answer = sent(client, f"{client.new_set()}/uploads/some.zip", data)
     assert len(most) == 1 + 2 * 7
     assert answer == (200, '{"files":7}')
@@ -272,9 +272,9 @@ def test_a_password_is_said(client: Client) -> None:
 
 
 def test_a_table_of_contents_without_end_is_not_read(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipelines.app.common import archives
+    from sdps.photos.pictures.sources import archive_files
 
-    monkeypatch.setattr(archives, "_MOST_LISTING", 100_000)
+    monkeypatch.setattr(archive_files, "MOST_LISTING", 100_000)
     data = packed(*((f"{number}.dat", b"") for number in range(3000)), ("a.png", png()))
     status, said = sent(client, f"{client.new_set()}/uploads/some.zip", data)
     assert status == 400 and "contains too many files" in said

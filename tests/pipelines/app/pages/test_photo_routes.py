@@ -9,6 +9,7 @@ import zipfile
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import OpenEXR
 import photo_folders as folders
@@ -79,6 +80,34 @@ def test_from_files_to_a_zip(address: str, hills: Path) -> None:
     assert message(client.send("GET", f"{path}/runs/1/pixel?row=9999&column=0"))
     with zipfile.ZipFile(io.BytesIO(client.get(f"{path}/runs/1/download"))) as opened:
         assert {"normal.npy", "mesh.ply", "report.html", "result.json", "relit/grazing.png"} <= set(opened.namelist())
+
+
+def test_a_film_is_taken_apart(address: str, tmp_path: Path) -> None:
+    """Alone or in a ZIP, with its mask; what is no film is refused by the checks."""
+    images, mask = folders.matte(LIGHTS, size=40)
+    writer = cv2.VideoWriter(str(tmp_path / "lamp.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25, mask.shape[::-1])
+    for image in images:
+        writer.write(np.rint(255 * folders.to_srgb(image[..., ::-1])).astype(np.uint8))
+    writer.release()
+    film, outline = (tmp_path / "lamp.avi").read_bytes(), io.BytesIO()
+    Image.fromarray(mask).save(outline, "png")
+    for name, data in (
+        ("lamp.AVI", film),
+        ("all.zip", archive(**{"a/lamp.avi": film, "a/mask.png": outline.getvalue()})),
+    ):
+        client = Client(address)
+        path = client.new_set()
+        assert client.send("PUT", f"{path}/uploads/{name}", data)[0] == 200
+        checked = client.wait(client.post(f"{path}/start/check"))
+        assert checked["state"] == "done", checked
+        assert checked["result"]["files"] == [f"frame-{number:04d}.png" for number in range(len(LIGHTS))]
+        assert checked["result"]["mask"] == ("file" if name == "all.zip" else "automatic")
+        job = client.wait(client.post(f"{path}/start/infer", {"method": "factorisation"}))
+        assert job["state"] == "done", job
+    path = client.new_set()
+    assert client.send("PUT", f"{path}/uploads/lamp.mp4", b"nothing")[0] == 200
+    job = client.wait(client.post(f"{path}/start/check"))
+    assert job["state"] == "failed" and job["message"].startswith("lamp.mp4: damaged or not a film")
 
 
 def test_a_focal_length_is_used(address: str, hills: Path) -> None:
