@@ -100,7 +100,7 @@ def _open_heif(path: Path, data: bytes) -> Any:
     """
     heif = _require("pi_heif", "heic", path, "a HEIC picture")
     if not (_parts_fit(data) and _have_names(data)):
-        raise InputError(f"{path}: damaged or truncated HEIC, its list of parts is wrong; copy it again")
+        raise InputError(f"{path}: damaged or not a HEIC (its list of parts is wrong); copy it again or leave it out")
     return heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
 
 
