@@ -3,8 +3,9 @@
 Legend: L pictures of H x W pixels.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,10 @@ import numpy as np
 from render.shared.errors import InputError
 from render.shared.imaging.reducing import check_scale, reduce_image, smaller_shape
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture
+from sdps.photos.analysis.balls.ball_flags import FLAG as BALL
+from sdps.photos.analysis.balls.ball_flags import Said, WantedBall, read_balls
+from sdps.photos.analysis.balls.ball_known import know_lights
+from sdps.photos.analysis.balls.ball_scene import FoundBall, Scene, cover_balls, match_pictures, see_balls
 from sdps.photos.faults import Faults
 from sdps.photos.light_files.light_choice import KnownLights, known_lights
 from sdps.photos.light_files.light_distance import LightDistance, Yardstick, find_nearness, read_distance
@@ -44,7 +49,7 @@ class Photographs:
         coding: Kind and depth of the files.
         orientation: EXIF orientation tag that all pictures were turned by.
         overridden: Faults that would have stopped `load`, but for `anyway`.
-        lights_name: Name of the file of the directions; empty without one.
+        lights_name: Name of the file of the directions, or the ball's; empty without one.
         lights_frame: The frame flag it was read with; empty where the file states its own frame.
         scale: What the sides of the files' pictures are multiplied by as they are read.
         camera: The camera, in pixels of the pictures as read; orthographic where nothing is known.
@@ -53,6 +58,7 @@ class Photographs:
         light_nearness: (L,) float32, the object's radius over the distance of each lamp (`sdps.core.geometry`), 0 of
             distant ones; None where it is not known.
         nearness_each: Where it is not known, each lamp may have a distance of its own.
+        balls: Those that gave the lights.
     """
 
     folder: Path
@@ -76,6 +82,7 @@ class Photographs:
     pixel_size: float | None = None
     light_nearness: np.ndarray | None = None
     nearness_each: bool = False
+    balls: tuple[FoundBall, ...] = ()
 
     def __len__(self) -> int:
         return len(self.files)
@@ -140,6 +147,7 @@ def load(
     principal: str | Sequence[float] | None = None,
     pixel_size: float | None = None,
     light_distance: str | float | None = None,
+    balls: Said | Iterable[Said] | None = None,
 ) -> Photographs:
     """Look through a folder of photographs of a static object under one distant light each (docs/guides/capture.md).
 
@@ -167,12 +175,18 @@ def load(
     Raises:
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
     """
-    distance = read_distance(light_distance)
+    distance, wanted_balls = read_distance(light_distance), read_balls(balls)
+    if wanted_balls and lights is not None:
+        raise InputError(f"{BALL}: the lights are those of --lights {lights}; keep one of the two")
     wanted, folder, scale = read_wanted(focal, principal, pixel_size), Path(folder), check_scale(scale)
     listing, faults = list_pictures(folder, names), Faults(anyway)
     seen = survey(folder, listing, gamma, None if mask is None else Path(mask), faults, scale)
     known = _find_lights(listing, seen, lights, intensities, frame, faults)
-    return _place_lamps(_assemble(folder, listing, seen, known, wanted, faults, scale), seen, known, distance)
+    photos = _assemble(folder, listing, seen, known, wanted, faults, scale)
+    if wanted_balls:
+        again = partial(load, gamma=gamma, anyway=True, scale=scale, focal=focal, principal=principal)
+        photos, known = _ask_balls(photos, seen, known, wanted_balls, distance, again)
+    return _place_lamps(photos, seen, known, distance)
 
 
 def _find_lights(
@@ -201,8 +215,48 @@ def _assemble(
     )  # fmt: skip
 
 
+def _ask_balls(
+    photos: Photographs, seen: Survey, known: KnownLights, wanted: Sequence[WantedBall], distance: LightDistance,
+    load_again: Callable[[Path], Photographs],
+) -> tuple[Photographs, KnownLights]:  # fmt: skip
+    """Take the lights from balls, and the balls out of the object."""
+    rays, balls, spheres = [], [], []
+    for place in sorted({ball.folder for ball in wanted}, key=str):
+        there = photos if place is None else load_again(place)
+        scene = Scene(there, there.camera, there.mask, there.saturation, there.scale)
+        order = None if place is None else match_pictures(photos.files, there.files, place)
+        for one, found in see_balls(scene, [ball for ball in wanted if ball.folder == place], place is not None):
+            one = one if order is None else one.take(order)
+            rays.append(one)
+            balls.append(scene.describe(one, found, place))
+            spheres += [one.view.sphere] if place is None else []
+    if spheres:
+        try:
+            left = seen.without(cover_balls(spheres, photos.shape))
+        except InputError as error:
+            raise InputError(f"{photos.folder}: {error}") from error
+        notes = (*left.notes, *(note for note in photos.notes if note not in seen.notes))
+        photos = replace(photos, mask=left.mask, notes=notes)
+    names = " and ".join(ball.text for ball in balls)
+    capture = Capture.of(photos.mask, photos.camera)
+    found = know_lights(rays, names, photos.files, capture, known, distance, _measure(photos, seen))
+    files = tuple(np.asarray(photos.files, object)[found.kept])
+    balls = [ball.take(found.kept) for ball in balls]
+    notes = (*(note for note in photos.notes if note not in known.notes), *found.known.notes, *found.notes)
+    known, name = found.known, "the balls" if len(balls) > 1 else f"the {balls[0].kind} ball"
+    photos = replace(
+        photos, files=files, balls=tuple(balls), notes=notes, lights_name=name, lights_frame="",
+        light_directions=known.directions, intensities=known.intensities,
+    )  # fmt: skip
+    return photos, known
+
+
+def _measure(photos: Photographs, seen: Survey) -> Yardstick:
+    return Yardstick(Capture.of(photos.mask).radius, photos.pixel_size, max(photos.shape) / max(seen.full))
+
+
 def _place_lamps(photos: Photographs, seen: Survey, known: KnownLights, distance: LightDistance) -> Photographs:
     """Say how near the lamps stand, where that is known."""
-    by = Yardstick(Capture.of(photos.mask).radius, photos.pixel_size, max(photos.shape) / max(seen.full))
+    by = _measure(photos, seen)
     nearness = find_nearness(distance, photos.files, by, known.distances, known.unit, known.name)
     return replace(photos, light_nearness=nearness, nearness_each=distance.each)

@@ -1,7 +1,7 @@
 """One look at every picture of a folder: which are photographs, that they fit together, and where the object is."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,9 @@ from sdps.photos.scaling import read_reduced_mask, reduce_grey, refuse_huge, sca
 _DARK = 0.5
 """A picture named as a dark frame is one if its mean is under this share of the others' median."""
 
+_ALL = 0.8
+"""Share of an automatic mask that is the ball from which on nothing else is there, if nothing else is found."""
+
 
 @dataclass(frozen=True, eq=False)
 class Survey:
@@ -38,6 +41,7 @@ class Survey:
         left_out: Which pictures were left out for what they look like, empty for none.
         full: (H, W) of the files' pictures, once turned.
         lenses: What the EXIF data of the photographs say.
+        variation: How much each pixel changes; None where the mask is a file.
     """
 
     files: tuple[str, ...]
@@ -50,6 +54,26 @@ class Survey:
     left_out: str = ""
     full: tuple[int, int] = (0, 0)
     lenses: frozenset[Lens] = frozenset()
+    variation: Variation | None = None
+
+    def without(self, covered: np.ndarray) -> "Survey":
+        """Return it with pixels (H, W) bool that are not the object's; an automatic mask is found again.
+
+        Raises:
+            InputError: nothing is left.
+        """
+        if self.variation is None:
+            mask, notes = self.mask & ~covered, self.notes
+        else:
+            found, said = automatic_mask(self.variation.without(covered))
+            lost = found.all() and covered[self.mask].mean() > _ALL
+            mask, notes = found & ~covered & (not lost), (*self.notes[:-1], said)
+        if not mask.any():
+            raise InputError(
+                "nothing but the ball is in the mask; draw a mask of the object, or name the folder of the ball's own "
+                "pictures with --ball FOLDER"
+            )
+        return replace(self, mask=mask, notes=notes)
 
 
 def survey(
@@ -95,6 +119,7 @@ def survey(
         files=tuple(name for name in listing.files if name in look.kept), coding=look.first.coding, gamma=look.gamma,
         orientation=look.first.orientation, mask=mask, origin="automatic" if masks.file is None else "file",
         notes=(*notes, said), left_out=left_out, full=look.full, lenses=frozenset(look.lenses),
+        variation=look.variation if masks.file is None else None,
     )  # fmt: skip
 
 

@@ -191,6 +191,7 @@ class Inference:
             "light_directions": "found" if photos.light_directions is None else "given",
             "light_intensities": "found" if photos.intensities is None else "given",
             "lamps": self.lamps,
+            **({"balls": [ball.tell(photos.files) for ball in photos.balls]} if photos.balls else {}),
             "camera": photos.camera_summary,
             **({"pixel_size": photos.pixel_size} if photos.pixel_size else {}),
             "frame": "x right, y up, z to the camera; lights from the surface to the light",
