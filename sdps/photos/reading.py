@@ -239,11 +239,11 @@ def _ask_balls(
         photos = replace(photos, mask=left.mask, notes=notes)
     names = " and ".join(ball.text for ball in balls)
     capture = Capture.of(photos.mask, photos.camera)
-    found = know_lights(rays, names, photos.files, capture, known, distance, _measure(photos, seen))
-    files = tuple(np.asarray(photos.files, object)[found.kept])
-    balls = [ball.take(found.kept) for ball in balls]
-    notes = (*(note for note in photos.notes if note not in known.notes), *found.known.notes, *found.notes)
-    known, name = found.known, "the balls" if len(balls) > 1 else f"the {balls[0].kind} ball"
+    lit = know_lights(rays, names, photos.files, capture, known, distance, _measure(photos, seen))
+    files = tuple(np.asarray(photos.files, object)[lit.kept])
+    balls = [ball.take(lit.kept) for ball in balls]
+    notes = (*(note for note in photos.notes if note not in known.notes), *lit.known.notes, *lit.notes)
+    known, name = lit.known, "the balls" if len(balls) > 1 else f"the {balls[0].kind} ball"
     photos = replace(
         photos, files=files, balls=tuple(balls), notes=notes, lights_name=name, lights_frame="",
         light_directions=known.directions, intensities=known.intensities,

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -46,14 +47,12 @@ def read_balls(said: Said | Iterable[Said] | None) -> tuple[WantedBall, ...]:
     Raises:
         InputError: something else, or a radius under 3 pixels.
     """
-    if said is None or (not isinstance(said, str) and not isinstance(said, Path) and not len(list(said))):
+    if said is None:
         return ()
     if isinstance(said, str | Path):
-        said = (said,)
-    every = list(said)
-    if all(isinstance(one, int | float) for one in every):
-        every = [every]
-    return tuple(_read(one) for one in every)
+        return (_read(said),)
+    every: list[Any] = list(said)
+    return (_read(every),) if every and all(isinstance(one, int | float) for one in every) else tuple(map(_read, every))
 
 
 def _read(said: Said) -> WantedBall:

@@ -83,7 +83,7 @@ def _weigh(blob: np.ndarray, light: np.ndarray, peak: float) -> tuple[np.ndarray
     """Return the pixels (h, w) bool that tell a highlight's middle, and weights; a small one's slopes count too."""
     if blob.sum() >= _SMALL:
         return blob, light[blob]
-    blob = ndimage.binary_dilation(blob, np.ones((3, 3)), iterations=2)
+    blob = ndimage.binary_dilation(blob, np.ones((3, 3), bool), iterations=2)
     return blob, np.maximum(light[blob] - _SLOPE * peak, 0.0)
 
 

@@ -127,14 +127,14 @@ def see_balls(scene: Scene, wanted: Sequence[WantedBall], alone: bool = False) -
         if outlined is not None:
             given.append((outlined, ball))
             continue
-        rays = find_balls(scene.pictures, scene.camera, scene.shape, scene.saturation, ball.kind)
-        rays = rays if alone else _leave_object(rays, scene.mask)
-        if not rays:
+        seen = find_balls(scene.pictures, scene.camera, scene.shape, scene.saturation, ball.kind)
+        seen = seen if alone else _leave_object(seen, scene.mask)
+        if not seen:
             raise InputError(
                 f"{FLAG} {AUTO}: no ball is found in the pictures; give its circle with {FLAG} x,y,radius (pixels of "
                 "the files), or photograph it alone under the same lights"
             )
-        found += [(one, True) for one in rays]
+        found += [(one, True) for one in seen]
     views = view_balls(scene.pictures, [sphere for sphere, _ in given], scene.saturation) if given else []
     traced = [(trace_rays(settle(view), ball.kind), ball) for view, (_, ball) in zip(views, given, strict=True)]
     for rays, ball in traced:

@@ -67,8 +67,10 @@ class Sphere:
             ball = cls(camera, shape, *values)
             return ball.radius * (ball.offsets(rows, columns) - 1.0)
 
-        robust = {} if near == np.inf else {"loss": "cauchy", "f_scale": near}
-        found = least_squares(miss, begin, x_scale=begin[2], xtol=1e-6, ftol=1e-6, **robust).x
+        found = least_squares(
+            miss, begin, x_scale=begin[2], xtol=1e-6, ftol=1e-6, loss="linear" if near == np.inf else "cauchy",
+            f_scale=1.0 if near == np.inf else near,
+        ).x  # fmt: skip
         return cls(camera, shape, float(found[0]), float(found[1]), abs(float(found[2])))
 
     @classmethod

@@ -135,9 +135,9 @@ class _Box:
 
     @classmethod
     def around(cls, sphere: Sphere) -> "_Box":
-        rows, columns = sphere.outline(reach=1.15)
         step = max(1, int(np.ceil(sphere.radius / _LARGEST)))
-        return cls(*_sides((rows, columns), sphere.shape, step), step)
+        down, along = _sides(sphere.outline(reach=1.15), sphere.shape, step)
+        return cls(down, along, step)
 
     @property
     def places(self) -> tuple[np.ndarray, np.ndarray]:
