@@ -6,7 +6,7 @@ enough of these lie on one ball's outline. Then every picture is asked: a chrome
 moves; on a white one Lambert's law explains the shading.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -23,8 +23,10 @@ from sdps.photos.analysis.balls.ball_views import BallView, Pictures, view_balls
 _SIDE = 640  # of the picture in which circles are looked for
 _SMALLEST, _LARGEST = 0.02, 0.5  # radius over the picture's shorter side
 _FEWEST_PIXELS = 8.0  # radius
-_PROPOSED = 12  # circles of each picture
-_ON = 0.4  # share of the radii with an edge on the outline
+_PROPOSED = 12  # circles that are looked at closely
+_PART, _VOTED = 1.7, 4  # of the radii: highest over lowest; and how many circles of each
+_AGAIN = 0.02  # radii by which circles that are one and the same may differ
+_ON = 0.35  # share of the radii with an edge on the outline
 _SAME = 0.35  # radii between the middles of one and the same ball
 _SHOWN = 0.8  # share of the pictures that must show a light
 _MATT = 0.85  # share of the variance that Lambert's law explains on a white ball that is found
@@ -77,24 +79,39 @@ def _propose(
     shorter = min(fields[0].shape)
     low = max(_SMALLEST * shorter, _FEWEST_PIXELS * factor, 5.0)
     edges = Edges.of(fields, (0.5 / factor - 0.5,) * 2, 1.0 / factor)
+    tried: list[Circle] = []
     found: list[tuple[Sphere, float]] = []
-    for field in fields:
-        picture = cv2.GaussianBlur((field * 255).astype(np.uint8), (0, 0), 1.2)
-        circles = cv2.HoughCircles(
-            picture, cv2.HOUGH_GRADIENT, 1.5, 0.06 * shorter, param1=60, param2=20, minRadius=int(low),
-            maxRadius=int(_LARGEST * shorter) + 1,
-        )  # fmt: skip
-        for x, y, radius in [] if circles is None else circles[0, :_PROPOSED]:
-            circle = Circle((x + 0.5) / factor - 0.5, (y + 0.5) / factor - 0.5, radius / factor)
-            sphere, share = refine_outline(edges, Sphere.of(circle, camera, shape))
-            if share >= _ON and sphere.radius * factor >= low:
-                found.append((sphere, share))
+    for x, y, radius in (circle for field in fields for circle in _vote(field, low, _LARGEST * shorter)):
+        circle = Circle((x + 0.5) / factor - 0.5, (y + 0.5) / factor - 0.5, radius / factor)
+        if any(max(np.abs(np.subtract(circle, other))) < _AGAIN * radius / factor for other in tried):
+            continue
+        tried.append(circle)
+        sphere, share = refine_outline(edges, Sphere.of(circle, camera, shape))
+        if share >= _ON and sphere.radius * factor >= low:
+            found.append((sphere, share))
     found.sort(key=lambda item: -item[1])
     kept: list[tuple[Sphere, float]] = []
     for sphere, share in found:
         if not any(_overlap(sphere, other) and abs(sphere.radius / other.radius - 1.0) < 0.1 for other, _ in kept):
             kept.append((sphere, share))
     return kept[:_PROPOSED]
+
+
+def _vote(field: np.ndarray, low: float, high: float) -> Iterator[np.ndarray]:
+    """Yield circles (x, y, radius) of a field (h, w), whose radii are looked for part by part; one alone would win."""
+    picture = cv2.GaussianBlur((field * 255).astype(np.uint8), (0, 0), 1.2)
+
+    def transform(way: int, least: float, most: float, steep: float, votes: float, apart: float) -> np.ndarray:
+        circles = cv2.HoughCircles(
+            picture, way, 1.5, apart, param1=steep, param2=votes, minRadius=int(least), maxRadius=int(most) + 1
+        )
+        return np.empty((0, 3)) if circles is None else circles.reshape(-1, circles.shape[-1])[:, :3].astype(np.float64)
+
+    yield from transform(cv2.HOUGH_GRADIENT_ALT, low, high, 150.0, 0.3, 2.0 * low)[:_PROPOSED]
+    while low < high:
+        most = min(_PART * low, high)
+        yield from transform(cv2.HOUGH_GRADIENT, low, most, 60.0, 20.0, max(0.3 * low, 5.0))[:_VOTED]
+        low = most
 
 
 def _overlap(one: Sphere, other: Sphere) -> bool:

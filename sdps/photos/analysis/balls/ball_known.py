@@ -8,7 +8,7 @@ import numpy as np
 from render.shared.errors import InputError, list_names
 from sdps.core.geometry import Capture
 from sdps.photos.analysis.balls.ball_flags import FLAG
-from sdps.photos.analysis.balls.ball_lights import BallLights, BallRays, join_rays
+from sdps.photos.analysis.balls.ball_lights import OUTLINED, BallLights, BallRays, join_rays
 from sdps.photos.light_files.light_choice import EQUAL, KnownLights
 from sdps.photos.light_files.light_distance import FLAG as DISTANCE
 from sdps.photos.light_files.light_distance import LightDistance, Yardstick
@@ -66,7 +66,8 @@ def know_lights(
     lights = replace(
         known, directions=found.directions[kept].astype(np.float32), intensities=strengths, name=names,
         distances=None if found.distances is None else found.distances[kept],
-        unit="" if found.distances is None else "objects", notes=_describe(found, names, known, strengths),
+        unit="" if found.distances is None else "objects",
+        notes=(*_describe(found, names, known, strengths), *_doubt_circles(rays)),
     )  # fmt: skip
     return LightsOfBalls(lights, kept, _name_left(files, found))
 
@@ -86,6 +87,12 @@ def _describe(found: BallLights, names: str, known: KnownLights, strengths: np.n
     if strengths is None:
         notes.append(f"a chrome ball gives no intensities; a network finds them (--intensities {EQUAL} if all are)")
     return (*notes, *(note for note in known.notes if note not in KnownLights.notes))
+
+
+def _doubt_circles(rays: Sequence[BallRays]) -> list[str]:
+    """Say which balls have no outline."""
+    bare = [ray.kind for ray in rays if ray.view.outlined < OUTLINED]
+    return [f"hardly any outline is seen around the {kind} ball; look whether its circle is right" for kind in bare]
 
 
 def _name_left(files: Sequence[str], found: BallLights) -> tuple[str, ...]:

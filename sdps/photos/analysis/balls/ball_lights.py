@@ -15,6 +15,8 @@ from sdps.photos.analysis.balls.ball_highlights import MISSING, Highlights, find
 from sdps.photos.analysis.balls.ball_views import BallView
 
 _MATT = 0.6  # share of the variance that Lambert's law must explain on a white ball, in most pictures
+OUTLINED = 0.15
+"""Share of a ball's outline that should be seen."""
 _UNLIT = "too little of the white ball is lit"
 _FARTHEST = 50.0  # object sizes, beyond which a lamp is distant
 
@@ -94,8 +96,11 @@ def trace_rays(view: BallView, kind: str = "") -> BallRays:
 
 
 def tell_kind(view: BallView) -> str:
-    """Return `white` where Lambert's law explains what the ball shows in most pictures, else `chrome`."""
-    return WHITE if np.median(view.shaded[1]) >= _MATT else CHROME
+    """Return `white` where Lambert's law explains what the ball shows in most pictures, else `chrome`.
+
+    It explains a part of a matt object nearly as well, so that some of a white ball's outline must be seen.
+    """
+    return WHITE if view.outlined >= OUTLINED and np.median(view.shaded[1]) >= _MATT else CHROME
 
 
 def _trace_white(view: BallView) -> BallRays:

@@ -10,11 +10,13 @@ from sdps.photos.analysis.balls.ball_spheres import Sphere
 from sdps.photos.analysis.balls.ball_views import BallView
 
 _RAYS = 360
-_NEAR = 0.012, 1.5  # how far from it, in radii and pixels of the picture looked at; the larger counts
-_BANDS = 0.1, 0.06, 0.04  # about the outline, in radii, where edges are looked for
+_NEAR = 0.006, 0.8  # how far edges may lie from it, in radii and pixels of the picture looked at; the larger counts
+_BANDS = (0.1, 2.5), (0.06, 1.5), (0.04, 1.0)  # about the outline, in radii, where edges are looked for; times `_NEAR`
 _ACROSS = 1.5  # slope across the outline over that along it
 _FAINT = 0.01  # slope per pixel, of brightness from 0 to 1, that is no edge
-_FEW = 0.24  # share of the outline with an edge under which it is none
+_ARC, _GAP = 15, 2  # rays of an arc that counts, and that may be missing in it
+_WEAK = 0.5  # of the steepest edge about the outline
+_FEW = 0.1  # share of the outline that is seen under which it is none
 _SEEN = 0.75  # and above which it moves a circle that was named
 _ALSO = 0.8  # of what logarithms show that brightness must show as well
 _MOST = 0.03, 2.0  # how far: radii, and pixels; the larger counts
@@ -68,8 +70,8 @@ def refine_outline(edges: Edges, sphere: Sphere) -> tuple[Sphere, float]:
         The ball, and the share of its outline that has an edge on it.
     """
     share = 0.0
-    for band in _BANDS:
-        near = max(_NEAR[0] * sphere.radius, _NEAR[1] * edges.step)
+    for band, wide in _BANDS:
+        near = wide * max(_NEAR[0] * sphere.radius, _NEAR[1] * edges.step)
         half = int(np.ceil(2 * band * sphere.radius / edges.step)) + 3
         reaches = 1.0 + np.arange(-half, half + 1) * band / (half - 3)
         lines = [sphere.outline(_RAYS, reach) for reach in reaches]
@@ -80,8 +82,9 @@ def refine_outline(edges: Edges, sphere: Sphere) -> tuple[Sphere, float]:
         there &= (rows >= 0) & (rows <= sphere.shape[0] - 1) & (columns >= 0) & (columns <= sphere.shape[1] - 1)
         if there.sum() < _RAYS // 5:
             return sphere, 0.0
+        seen = np.flatnonzero(there)
         sphere, on = _fit(sphere, (rows[there], columns[there]), near)
-        share = float(on.sum()) / _RAYS
+        share = _measure_arcs(np.isin(np.arange(_RAYS), seen[on]))
         if share < _FEW:
             break
     return sphere, share
@@ -90,7 +93,7 @@ def refine_outline(edges: Edges, sphere: Sphere) -> tuple[Sphere, float]:
 def _nearest_peaks(steep: np.ndarray, middle: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the place along each radius (steps, rays) of the peak nearest to a step, and whether there is one."""
     inner = steep[1:-1]
-    peaks = (inner >= steep[:-2]) & (inner > steep[2:]) & (inner > np.maximum(_FAINT, 0.3 * steep.max(0)))
+    peaks = (inner >= steep[:-2]) & (inner > steep[2:]) & (inner > np.maximum(_FAINT, _WEAK * steep.max(0)))
     off = np.where(peaks, np.abs(np.arange(1, len(steep) - 1) - middle)[:, None], len(steep))
     best = np.argmin(off, axis=0) + 1
     rays = np.arange(steep.shape[1])
@@ -110,10 +113,18 @@ def _fit(sphere: Sphere, points: tuple[np.ndarray, np.ndarray], near: float) -> 
     """Fit a ball to the points (N,) that agree with one, and say which do."""
     rows, columns = points
     sphere = Sphere.through(sphere.camera, sphere.shape, rows, columns, sphere, 0.5 * near)
-    on = sphere.radius * np.abs(sphere.offsets(rows, columns) - 1.0) <= near
-    if on.sum() >= _RAYS // 5:
-        sphere = Sphere.through(sphere.camera, sphere.shape, rows[on], columns[on], sphere, near)
+    for wide in (2.0, 1.4, 1.0):
+        on = sphere.radius * np.abs(sphere.offsets(rows, columns) - 1.0) <= wide * near
+        if on.sum() >= _RAYS // 6:
+            sphere = Sphere.through(sphere.camera, sphere.shape, rows[on], columns[on], sphere, near)
     return sphere, sphere.radius * np.abs(sphere.offsets(rows, columns) - 1.0) <= near
+
+
+def _measure_arcs(on: np.ndarray) -> float:
+    """Return the share of an outline that is seen in arcs; places (N,) bool that hit it by chance make up none."""
+    around = np.concatenate([on, on, on])
+    closed = ndimage.binary_closing(around, np.ones(_GAP + 1, bool))
+    return float(ndimage.binary_opening(closed, np.ones(_ARC, bool))[len(on) : 2 * len(on)].mean())
 
 
 def settle(view: BallView) -> BallView:
@@ -125,15 +136,16 @@ def settle(view: BallView) -> BallView:
     grey, old, step = view.grey, view.sphere, float(view.rows[1, 0] - view.rows[0, 0])
     fields, first = [grey.mean(0), grey.max(0), grey.std(0)], (float(view.rows[0, 0]), float(view.columns[0, 0]))
     new, share = refine_outline(Edges.of([flatten(field) for field in fields], first, step), old)
-    rim = np.abs(view.offsets - 1.0) < _BANDS[0]
+    rim = np.abs(view.offsets - 1.0) < _BANDS[0][0]
     plain = [np.clip(field / max(float(np.percentile(field[rim], 95)), 1e-9), 0.0, 1.0) for field in fields]
     last, seen = refine_outline(Edges.of(plain, first, step), new)
     if seen > _ALSO * share:
         new, share = last, seen
     moved = max(float(np.hypot(new.x - old.x, new.y - old.y)), abs(new.radius - old.radius))
-    if share < _SEEN or moved > max(_MOST[0] * old.radius, _MOST[1]):
-        return view
-    return replace(view, sphere=new)
+    far = moved > max(_MOST[0] * old.radius, _MOST[1])
+    if share < _SEEN or far:
+        return replace(view, outlined=0.0 if far else share)
+    return replace(view, sphere=new, outlined=share)
 
 
 def flatten(field: np.ndarray) -> np.ndarray:

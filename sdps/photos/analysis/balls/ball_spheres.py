@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from sdps.core.geometry import Camera
 
 _OUTLINE = 64
+_ROUNDS = 30
 
 
 class Circle(NamedTuple):
@@ -59,19 +59,21 @@ class Sphere:
         column, row = camera.middle(shape)
         if start is None:
             x, y = columns.mean(), rows.mean()
-            begin = [x - column, row - y, np.hypot(columns - x, rows - y).mean()]
-        else:
-            begin = [start.x, start.y, start.radius]
-
-        def miss(values: np.ndarray) -> np.ndarray:
-            ball = cls(camera, shape, *values)
-            return ball.radius * (ball.offsets(rows, columns) - 1.0)
-
-        found = least_squares(
-            miss, begin, x_scale=begin[2], xtol=1e-6, ftol=1e-6, loss="linear" if near == np.inf else "cauchy",
-            f_scale=1.0 if near == np.inf else near,
-        ).x  # fmt: skip
-        return cls(camera, shape, float(found[0]), float(found[1]), abs(float(found[2])))
+            start = cls(camera, shape, x - column, row - y, np.hypot(columns - x, rows - y).mean())
+        values = np.array([start.x, start.y, start.radius])
+        at, sight = start._lines(rows, columns)
+        for _ in range(_ROUNDS):  # of Gauss and Newton
+            off = at - [values[0], values[1], 0.0]
+            off = off - (off * sight).sum(-1, keepdims=True) * sight
+            lengths = np.maximum(np.linalg.norm(off, axis=-1), 1e-9)
+            weights = 1.0 / (1.0 + ((lengths - values[2]) / near) ** 2)
+            slopes = np.column_stack([off[:, :2] / lengths[:, None], np.ones(len(off))])
+            weighted = slopes * weights[:, None]
+            step = np.linalg.lstsq(weighted.T @ slopes, weighted.T @ (lengths - values[2]), rcond=None)[0]
+            values = values + step
+            if np.abs(step).max() < 1e-6 * abs(values[2]):
+                break
+        return cls(camera, shape, float(values[0]), float(values[1]), max(abs(float(values[2])), 1e-3))
 
     @classmethod
     def of(cls, circle: Circle, camera: Camera, shape: tuple[int, int]) -> "Sphere":

@@ -35,6 +35,7 @@ class BallView:
         rows, columns: (h, w) of the picture, where the window's pixels have their middles.
         colours: (L, h, w, 3) float32, radiance.
         clipped: (L, h, w) bool, some channel is saturated.
+        outlined: Share of the ball's outline that is seen.
     """
 
     sphere: Sphere
@@ -42,6 +43,7 @@ class BallView:
     columns: np.ndarray
     colours: np.ndarray
     clipped: np.ndarray
+    outlined: float = 1.0
 
     @cached_property
     def grey(self) -> np.ndarray:
