@@ -13,7 +13,6 @@ import numpy as np
 from render.shared.errors import InputError
 from render.shared.imaging.reducing import check_scale, reduce_image, smaller_shape
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture
-from sdps.photos.analysis.balls.ball_flags import FLAG as BALL
 from sdps.photos.analysis.balls.ball_flags import Said, WantedBall, read_balls
 from sdps.photos.analysis.balls.ball_known import know_lights
 from sdps.photos.analysis.balls.ball_scene import FoundBall, Scene, cover_balls, match_pictures, see_balls
@@ -143,12 +142,9 @@ def load(
     names: Sequence[str] | None = None,
     anyway: bool = False,
     scale: float = 1.0,
-    focal: str | float | None = None,
-    principal: str | Sequence[float] | None = None,
-    pixel_size: float | None = None,
-    light_distance: str | float | None = None,
-    balls: Said | Iterable[Said] | None = None,
-) -> Photographs:
+    focal: str | float | None = None, principal: str | Sequence[float] | None = None, pixel_size: float | None = None,
+    light_distance: str | float | None = None, balls: Said | Iterable[Said] | None = None,
+) -> Photographs:  # fmt: skip
     """Look through a folder of photographs of a static object under one distant light each (docs/guides/capture.md).
 
     Every file is decoded once, one at a time, so that a damaged one is found now.
@@ -171,21 +167,19 @@ def load(
         light_distance: How far all lamps stand from the object: a number of its sizes (the longer side of its outline's
             box), `400mm`, `40cm`, `0.4m` (with `pixel_size`), or `far`. None or `auto`: as the positions in the lights
             file say, else not known; `each`: not known, and not the same for all lamps.
+        balls: Balls that show the lights, in place of `lights` (`sdps.photos.analysis.balls.ball_flags.read_balls`).
 
     Raises:
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
     """
-    distance, wanted_balls = read_distance(light_distance), read_balls(balls)
-    if wanted_balls and lights is not None:
-        raise InputError(f"{BALL}: the lights are those of --lights {lights}; keep one of the two")
+    distance, shown_by = read_distance(light_distance), read_balls(balls, lights)
     wanted, folder, scale = read_wanted(focal, principal, pixel_size), Path(folder), check_scale(scale)
     listing, faults = list_pictures(folder, names), Faults(anyway)
     seen = survey(folder, listing, gamma, None if mask is None else Path(mask), faults, scale)
     known = _find_lights(listing, seen, lights, intensities, frame, faults)
     photos = _assemble(folder, listing, seen, known, wanted, faults, scale)
-    if wanted_balls:
-        again = partial(load, gamma=gamma, anyway=True, scale=scale, focal=focal, principal=principal)
-        photos, known = _ask_balls(photos, seen, known, wanted_balls, distance, again)
+    again = partial(load, gamma=gamma, anyway=True, scale=scale, focal=focal, principal=principal)
+    photos, known = _ask_balls(photos, seen, known, shown_by, distance, again) if shown_by else (photos, known)
     return _place_lamps(photos, seen, known, distance)
 
 

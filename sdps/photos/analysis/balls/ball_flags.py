@@ -38,17 +38,20 @@ class WantedBall:
     folder: Path | None = None
 
 
-def read_balls(said: Said | Iterable[Said] | None) -> tuple[WantedBall, ...]:
+def read_balls(said: Said | Iterable[Said] | None, lights: str | Path | None = None) -> tuple[WantedBall, ...]:
     """Read `x,y,radius`, `auto`, a folder, or `folder:x,y,radius`, each with `chrome:` or `white:` before it or not.
 
     Args:
         said: One ball or several; a ball in the pictures may be three numbers.
+        lights: Other lights, which may not be given as well.
 
     Raises:
-        InputError: something else, or a radius under 3 pixels.
+        InputError: something else, a radius under 3 pixels, or two kinds of lights.
     """
-    if said is None:
+    if said is None or (not isinstance(said, str | Path) and not (said := list(said))):
         return ()
+    if lights is not None:
+        raise InputError(f"{FLAG}: the lights are those of --lights {lights}; keep one of the two")
     if isinstance(said, str | Path):
         return (_read(said),)
     every: list[Any] = list(said)

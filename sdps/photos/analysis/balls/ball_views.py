@@ -84,7 +84,7 @@ def view_balls(pictures: Pictures, spheres: Sequence[Sphere], saturation: float)
             clipped = box.reduce((part >= saturation).any(-1).astype(np.float32)) > 0.0
             rows.append((box.reduce(part), clipped))
     return [
-        BallView(sphere, *box.places, *(np.array(values) for values in zip(*rows, strict=True)))
+        BallView(sphere, *box.places, np.array([part for part, _ in rows]), np.array([cut for _, cut in rows]))
         for box, sphere, rows in zip(boxes, spheres, kept, strict=True)
     ]
 
