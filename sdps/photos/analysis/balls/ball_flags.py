@@ -48,14 +48,12 @@ def read_balls(said: Said | Iterable[Said] | None, lights: str | Path | None = N
     Raises:
         InputError: something else, a radius under 3 pixels, or two kinds of lights.
     """
-    if said is None or (not isinstance(said, str | Path) and not (said := list(said))):
-        return ()
-    if lights is not None:
+    every: list[Any] = [said] if isinstance(said, str | Path) else list(said or ())
+    if every and all(isinstance(one, int | float) for one in every):
+        every = [every]
+    if every and lights is not None:
         raise InputError(f"{FLAG}: the lights are those of --lights {lights}; keep one of the two")
-    if isinstance(said, str | Path):
-        return (_read(said),)
-    every: list[Any] = list(said)
-    return (_read(every),) if every and all(isinstance(one, int | float) for one in every) else tuple(map(_read, every))
+    return tuple(map(_read, every))
 
 
 def _read(said: Said) -> WantedBall:
