@@ -14,6 +14,7 @@ from pipelines.evaluate.report import page as report
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table, Tile
 from pipelines.export_result import FOLDER, add_normals, choose_exports
 from pipelines.shared import network_flags, pictures
+from pipelines.shared.ball_pictures import draw_ball, draw_circles
 from render.shared.errors import InputError
 from render.shared.progress import bars, stage
 from sdps.core.intensities import grey, scale_to_mean
@@ -41,6 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lights", default=None, metavar="FILE|folder",
                         help="known light directions: rows x y z, .lp, .csv, .npy, .npz, .mat, lights.json, JSON of "
                         "Meshroom or RelightLab; folder: the file of lights among the photographs")  # fmt: skip
+    parser.add_argument("--ball", action="append", default=None, metavar="X,Y,R|auto|FOLDER",
+                        help="a chrome or white ball that shows the lights, in place of --lights: its circle in "
+                        "pixels of the files, auto to find it, or a folder of pictures of it alone, FOLDER or "
+                        "FOLDER:x,y,r; chrome: or white: before it says its kind; two balls give positions "
+                        "(repeatable)")  # fmt: skip
     parser.add_argument("--intensities", default=None, metavar="FILE|folder|equal",
                         help="known light intensities; equal if all lights are alike (default: those of --lights, else "
                         "found by a network)")  # fmt: skip
@@ -184,7 +190,7 @@ def infer_pose(args: argparse.Namespace, pose: "Pose", tell: Callable[[str], obj
     photos = load(
         pose, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
         gamma=args.gamma, names=args.images, anyway=args.anyway, scale=args.scale, focal=args.focal,
-        principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance,
+        principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance, balls=args.ball,
         ambient=args.ambient, dark=args.dark,
     )  # fmt: skip
     findings = tuple(check(photos))
@@ -257,7 +263,7 @@ def _section(result: "Inference") -> SectionWriter:
     lit = photos.window(_brightest(result), *box)[0]
     shown = pictures.tone_map(lit, pictures.auto_exposure(lit[None], mask[box]))
     tiles = [
-        Tile("a photograph", shown),
+        Tile("a photograph", shown if not photos.balls else _draw_whole(photos, _brightest(result), mask)),
         Tile(f"mask ({photos.mask_origin})", _tint_outside(shown, mask[box])),
         Tile("normals", pictures.normal_map(result.normals[box], mask[box]), "normals"),
         Tile("depth, near is bright", depth_picture(result, box)),
@@ -265,6 +271,8 @@ def _section(result: "Inference") -> SectionWriter:
     if len(result.light_directions):
         tiles.append(Tile("lights, seen from the camera", pictures.light_plot(result.light_directions, result.gains)))
     writer.strip("Photograph, mask, normals, depth, lights", tiles)
+    if photos.balls:
+        writer.strip("What gave the lights", [draw_ball(ball) for ball in photos.balls])
     writer.strip("The surface from the left, the front and the right", [("", strip(result.depth, 360))], wide=True)
     relit = [(name.replace("-", " "), pictures.tone_map(result.relit_view(name, box))) for name in RELIT]
     writer.strip("Under lights of our choice (matt, with cast shadows)", relit)
@@ -275,6 +283,15 @@ def _section(result: "Inference") -> SectionWriter:
     elif result.expected_error is not None:
         writer.strip("How sure the network is", [_draw_expected_errors(result.expected_error[box], mask[box])])
     return writer
+
+
+def _draw_whole(photos: "Photographs", part: slice, mask: np.ndarray) -> np.ndarray:
+    """Return a whole photograph, every n-th pixel where they are very many, with its balls."""
+    every = max(1, max(photos.shape) // (2 * _MOST_SIDE))
+    steps = slice(None, None, every), slice(None, None, every)
+    seen = photos.window(part, *steps)
+    shown = pictures.tone_map(seen[0], pictures.auto_exposure(seen, mask[steps]))
+    return draw_circles(shown, photos.balls, photos.scale / every)
 
 
 def _box(mask: np.ndarray) -> tuple[slice, slice]:

@@ -265,7 +265,8 @@ def _question_lights(
     )
     if fit is None:
         return intensities, ()
-    level, text = advise(fit, photos.files, photos.lights_name, photos.lights_frame)
+    remedy = "look whether the circle is right, and whether the same lamps lit both" if photos.balls else ""
+    level, text = advise(fit, photos.files, photos.lights_name, photos.lights_frame, remedy)
     return intensities, (Finding(level, text),)
 
 

@@ -76,6 +76,13 @@ class Variation:
         """Return the standard deviation over the images so far, (H, W) float32."""
         return np.sqrt(np.maximum(self.squares, 0) / max(self.count, 1))
 
+    def without(self, covered: np.ndarray) -> "Variation":
+        """Return it with pixels (H, W) bool that are dark and do not change."""
+        other = Variation((covered.shape[0], covered.shape[1]))
+        other.mean, other.squares = np.where(covered, 0.0, self.mean), np.where(covered, 0.0, self.squares)
+        other.count = self.count
+        return other
+
 
 class CutOut:
     """Where photographs with transparency are opaque, gathered picture by picture."""

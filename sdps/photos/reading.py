@@ -3,8 +3,9 @@
 Legend: L pictures of H x W pixels.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ import numpy as np
 from render.shared.errors import InputError
 from render.shared.imaging.reducing import check_scale, smaller_shape
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture
+from sdps.photos.analysis.balls.ball_flags import Said, WantedBall, read_balls
+from sdps.photos.analysis.balls.ball_known import know_lights
+from sdps.photos.analysis.balls.ball_scene import FoundBall, Scene, cover_balls, match_pictures, see_balls
 from sdps.photos.faults import Faults
 from sdps.photos.light_files.light_choice import KnownLights, known_lights
 from sdps.photos.light_files.light_distance import LightDistance, Yardstick, find_nearness, read_distance
@@ -47,7 +51,7 @@ class Photographs:
         coding: Kind and depth of the files.
         orientation: EXIF orientation tag that all pictures were turned by.
         overridden: Faults that would have stopped `load`, but for `anyway`.
-        lights_name: Name of the file of the directions; empty without one.
+        lights_name: Name of the file of the directions, or the ball's; empty without one.
         lights_frame: The frame flag it was read with; empty where the file states its own frame.
         scale: What the sides of the files' pictures are multiplied by as they are read.
         camera: The camera, in pixels of the pictures as read; orthographic where nothing is known.
@@ -58,6 +62,7 @@ class Photographs:
         background: What is subtracted of every picture: the room's light and the sensor's offset; None for nothing.
         nearness_each: Where it is not known, each lamp may have a distance of its own.
         room: Keeps the temporary files that an archive or a film was taken apart to; None of a folder.
+        balls: Those that gave the lights.
     """
 
     folder: Path
@@ -83,6 +88,7 @@ class Photographs:
     nearness_each: bool = False
     background: Background | None = None
     room: Room | None = None
+    balls: tuple[FoundBall, ...] = ()
 
     def __len__(self) -> int:
         return len(self.files)
@@ -143,8 +149,8 @@ def load(
     intensities: str | Path | None = None, frame: str = "y-up", gamma: str | float = "auto",
     names: Sequence[str] | None = None, anyway: bool = False, scale: float = 1.0, focal: str | float | None = None,
     principal: str | Sequence[float] | None = None, pixel_size: float | None = None,
-    light_distance: str | float | None = None, ambient: str | Path | None = None, dark: str | Path | None = None,
-    every: int | None = None,
+    light_distance: str | float | None = None, balls: Said | Iterable[Said] | None = None,
+    ambient: str | Path | None = None, dark: str | Path | None = None, every: int | None = None,
 ) -> Photographs:  # fmt: skip
     """Look through a folder of photographs of a static object under one distant light each (docs/guides/capture.md).
 
@@ -167,22 +173,37 @@ def load(
         light_distance: How far all lamps stand from the object: a number of its sizes (the longer side of its outline's
             box), `400mm`, `40cm`, `0.4m` (with `pixel_size`), or `far`. None or `auto`: as the positions in the lights
             file say, else not known; `each`: not known, and not the same for all lamps.
-        ambient: A picture without the lamp, which is subtracted in linear radiance, scaled by the exposures where EXIF
-            data tell them; None for those of the folder that are named so, `none` for none.
-        dark: A picture with the lens covered, which is subtracted as well; None and `none` as for `ambient`.
+        balls: Balls that show the lights, in place of `lights` (`sdps.photos.analysis.balls.ball_flags.read_balls`).
+        ambient: A picture without the lamp, subtracted at the photographs' exposure; None: those named so; `none`.
+        dark: A picture with the lens covered, subtracted as well; None and `none` as for `ambient`.
         every: Of a film, take every n-th frame; None: so that about 60 are taken.
 
     Raises:
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
     """
-    wanted, distance = read_wanted(focal, principal, pixel_size), read_distance(light_distance)
-    pose, scale = only_pose(folder, every), check_scale(scale)
+    wanted, distance, shown_by = (
+        read_wanted(focal, principal, pixel_size),
+        read_distance(light_distance),
+        read_balls(balls, lights),
+    )
+    pose, scale, faults = only_pose(folder, every), check_scale(scale), Faults(anyway)
     with pose.naming():
-        listing, faults = list_pictures(pose.folder, pose.names if names is None else names), Faults(anyway)
-        mask = pose.mask if mask is None else Path(mask)
-        seen = survey(pose.folder, listing, gamma, mask, faults, scale, (ambient, dark))
+        listing, seen = _look(pose, names, mask, gamma, faults, scale, (ambient, dark))
         known = _find_lights(pose, listing, seen, lights, intensities, frame, faults)
-        return _place_lamps(_assemble(pose, listing, seen, known, wanted, faults, scale), seen, known, distance)
+        photos = _assemble(pose, listing, seen, known, wanted, faults, scale)
+        again = partial(load, gamma=gamma, anyway=True, scale=scale, focal=focal, principal=principal)
+        photos, known = _ask_balls(photos, seen, known, shown_by, distance, again) if shown_by else (photos, known)
+        return _place_lamps(photos, seen, known, distance)
+
+
+def _look(
+    pose: Pose, names: Sequence[str] | None, mask: str | Path | None, gamma: str | float, faults: Faults, scale: float,
+    without_lamp: tuple[str | Path | None, str | Path | None],
+) -> tuple[Listing, Survey]:  # fmt: skip
+    """List the pictures, and look at all of them."""
+    listing = list_pictures(pose.folder, pose.names if names is None else names)
+    mask_file = pose.mask if mask is None else Path(mask)
+    return listing, survey(pose.folder, listing, gamma, mask_file, faults, scale, without_lamp)
 
 
 def _find_lights(
@@ -213,8 +234,48 @@ def _assemble(
     )  # fmt: skip
 
 
+def _ask_balls(
+    photos: Photographs, seen: Survey, known: KnownLights, wanted: Sequence[WantedBall], distance: LightDistance,
+    load_again: Callable[[Path], Photographs],
+) -> tuple[Photographs, KnownLights]:  # fmt: skip
+    """Take the lights from balls, and the balls out of the object."""
+    rays, balls, spheres = [], [], []
+    for place in sorted({ball.folder for ball in wanted}, key=str):
+        there = photos if place is None else load_again(place)
+        scene = Scene(there, there.camera, there.mask, there.saturation, there.scale)
+        order = None if place is None else match_pictures(photos.files, there.files, place)
+        for one, found in see_balls(scene, [ball for ball in wanted if ball.folder == place], place is not None):
+            one = one if order is None else one.take(order)
+            rays.append(one)
+            balls.append(scene.describe(one, found, place))
+            spheres += [one.view.sphere] if place is None else []
+    if spheres:
+        try:
+            left = seen.without(cover_balls(spheres, photos.shape))
+        except InputError as error:
+            raise InputError(f"{photos.folder}: {error}") from error
+        notes = (*left.notes, *(note for note in photos.notes if note not in seen.notes))
+        photos = replace(photos, mask=left.mask, notes=notes)
+    names = " and ".join(ball.text for ball in balls)
+    capture = Capture.of(photos.mask, photos.camera)
+    lit = know_lights(rays, names, photos.files, capture, known, distance, _measure(photos, seen))
+    files = tuple(np.asarray(photos.files, object)[lit.kept])
+    balls = [ball.take(lit.kept) for ball in balls]
+    notes = (*(note for note in photos.notes if note not in known.notes), *lit.known.notes, *lit.notes)
+    known, name = lit.known, "the balls" if len(balls) > 1 else f"the {balls[0].kind} ball"
+    photos = replace(
+        photos, files=files, balls=tuple(balls), notes=notes, lights_name=name, lights_frame="",
+        light_directions=known.directions, intensities=known.intensities,
+    )  # fmt: skip
+    return photos, known
+
+
+def _measure(photos: Photographs, seen: Survey) -> Yardstick:
+    return Yardstick(Capture.of(photos.mask).radius, photos.pixel_size, max(photos.shape) / max(seen.full))
+
+
 def _place_lamps(photos: Photographs, seen: Survey, known: KnownLights, distance: LightDistance) -> Photographs:
     """Say how near the lamps stand, where that is known."""
-    by = Yardstick(Capture.of(photos.mask).radius, photos.pixel_size, max(photos.shape) / max(seen.full))
+    by = _measure(photos, seen)
     nearness = find_nearness(distance, photos.files, by, known.distances, known.unit, known.name)
     return replace(photos, light_nearness=nearness, nearness_each=distance.each)

@@ -29,6 +29,9 @@ _BRIGHT = 0.9
 _MANY = 8
 """Pictures of one size and kind for each of another that is left out for it, and does not stop."""
 
+_ALL = 0.8
+"""Share of an automatic mask that is the ball from which on nothing else is there, if nothing else is found."""
+
 
 @dataclass(frozen=True, eq=False)
 class Survey:
@@ -44,6 +47,7 @@ class Survey:
         full: (H, W) of the files' pictures, once turned.
         lenses: What the EXIF data of the photographs say.
         background: What is subtracted of every picture.
+        variation: How much each pixel changes; None where the mask is a file.
     """
 
     files: tuple[str, ...]
@@ -57,6 +61,26 @@ class Survey:
     full: tuple[int, int] = (0, 0)
     lenses: frozenset[Lens] = frozenset()
     background: Background | None = None
+    variation: Variation | None = None
+
+    def without(self, covered: np.ndarray) -> "Survey":
+        """Return it with pixels (H, W) bool that are not the object's; an automatic mask is found again.
+
+        Raises:
+            InputError: nothing is left.
+        """
+        if self.variation is None:
+            mask, notes = self.mask & ~covered, self.notes
+        else:
+            found, said = automatic_mask(self.variation.without(covered))
+            lost = found.all() and covered[self.mask].mean() > _ALL
+            mask, notes = found & ~covered & (not lost), (*self.notes[:-1], said)
+        if not mask.any():
+            raise InputError(
+                "nothing but the ball is in the mask; draw a mask of the object, or name the folder of the ball's own "
+                "pictures with --ball FOLDER"
+            )
+        return replace(self, mask=mask, notes=notes)
 
 
 def survey(
@@ -106,7 +130,7 @@ def survey(
         files=tuple(name for name in listing.files if name in look.kept), coding=look.first.coding, gamma=look.gamma,
         orientation=look.first.orientation, mask=mask, origin=origin,
         notes=(*notes, said), left_out=left_out, full=look.full, lenses=frozenset(look.lenses),
-        background=background,
+        background=background, variation=look.variation if origin == "automatic" else None,
     )  # fmt: skip
 
 

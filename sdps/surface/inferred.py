@@ -191,6 +191,7 @@ class Inference:
             "light_directions": _origin(self.light_directions, photos.light_directions),
             "light_intensities": _origin(self.intensities, photos.intensities),
             "lamps": self.lamps,
+            **({"balls": [ball.tell(photos.files) for ball in photos.balls]} if photos.balls else {}),
             "camera": photos.camera_summary,
             **_number_camera(photos),
             **({"pixel_size": photos.pixel_size} if photos.pixel_size else {}),

@@ -2,6 +2,7 @@
 
 import asyncio
 import io
+import re
 import threading
 import zipfile
 from pathlib import Path
@@ -32,6 +33,7 @@ _TASKS = ("example", "check", "infer")
 _MOST_MASK = 32 * 2**20
 _MOST_RUNS = 20
 _MOST_SETS = 12
+_MOST_BALLS, _BALL = 8, re.compile(r"(?:chrome:|white:)?(?:auto|-?[0-9.]{1,20}(?:,-?[0-9.]{1,20}){2})")
 _PACKING = threading.Lock()
 
 
@@ -115,6 +117,7 @@ async def start_task(request: Request) -> Response:
     if task != "example":
         arguments |= {"gamma": _read_choice(asked, "gamma", _GAMMAS), "lights": asked.get("lights") is True}
         arguments["frame"] = str(asked.get("frame", "y-up"))[:40]
+        arguments["balls"] = _read_balls(asked.get("balls"))
     run = None
     if task == "infer":
         runs = [int(path.name) for path in (place / "runs").glob("*")]
@@ -141,6 +144,14 @@ def _read_choice(asked: dict[str, Any], key: str, known: tuple[str, ...]) -> str
     if value not in known:
         raise InputError(f"{key}: must be one of {', '.join(known)}")
     return value
+
+
+def _read_balls(said: Any) -> list[str]:
+    """Return balls in the pictures; a folder, which `sdps.load` takes as well, is none."""
+    balls = [] if said is None else said
+    if not isinstance(balls, list) or len(balls) > _MOST_BALLS or not all(_BALL.fullmatch(str(one)) for one in balls):
+        raise InputError(f"balls: must be at most {_MOST_BALLS} circles x,y,radius, or auto")
+    return [str(one) for one in balls]
 
 
 async def send_file(request: Request) -> Response:

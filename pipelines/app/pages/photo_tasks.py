@@ -5,7 +5,7 @@ A set of photographs is a folder with `photos` (what was uploaded), `painted.png
 """
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,7 @@ def check(place: str, **options: Any) -> dict[str, Any]:
 
     Args:
         place: The set's folder.
-        options: `gamma`, `frame`, `lights` (use the lights file among the photographs).
+        options: `gamma`, `frame`, `lights` (use the lights file among the photographs), `balls` of `sdps.load`.
 
     Returns:
         What the page shows.
@@ -82,9 +82,17 @@ def check(place: str, **options: Any) -> dict[str, Any]:
         "files": list(photos.files), "width": width, "height": height, "bits": photos.bits, "gamma": str(photos.gamma),
         "mask": photos.mask_origin if not (folder / PAINTED).is_file() else "painted",
         "pixels": int(photos.mask.sum()), "notes": list(photos.notes), "lit": photos.light_directions is not None,
+        "balls": [_show_ball(ball) for ball in photos.balls],
         "findings": [{"level": item.level, "text": item.text, "images": list(item.images)} for item in findings],
         "lights_there": _has_lights(folder / PHOTOS), "methods": list_methods(photos.light_directions is not None),
     }  # fmt: skip
+
+
+def _show_ball(ball: Any) -> dict[str, Any]:
+    """Return what the page draws of a ball, in pixels of the files."""
+    spots = ball.highlights[np.isfinite(ball.highlights[:, 0])].round(2).tolist()
+    circle = {key: round(value, 2) for key, value in ball.circle._asdict().items()}
+    return {**circle, "kind": ball.kind, "highlights": spots}
 
 
 def list_methods(lit: bool) -> list[dict[str, str]]:
@@ -167,7 +175,7 @@ def _measure_error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float
 
 def _load(
     folder: Path, *, anyway: bool, gamma: str = "auto", frame: str = "y-up", lights: bool = False, scale: float = 1.0,
-    focal: str = "", light_distance: str = "auto",
+    focal: str = "", light_distance: str = "auto", balls: Sequence[str] = (),
 ) -> Any:  # fmt: skip
     from sdps import photos
 
@@ -175,7 +183,7 @@ def _load(
     (pose,) = photos.find_poses(folder / PHOTOS, inside=folder)  # it has no folders, so there is one
     return photos.load(
         pose, mask=painted if painted.is_file() else None, lights="folder" if lights else None,
-        frame=frame, gamma=gamma, anyway=anyway, scale=scale,
+        frame=frame, gamma=gamma, anyway=anyway, scale=scale, balls=balls,
         light_distance=light_distance, focal=f"{focal}mm" if focal[-1:].isdigit() else focal,  # as the page asks for it
     )  # fmt: skip
 

@@ -1,5 +1,6 @@
 // The page "Photographs".
 
+import { BallCircles } from "./ball_circles.js";
 import { $, ask, element, follow, post, seconds, showError } from "./jobs.js";
 import { MaskPainter } from "./mask_painter.js";
 import { MeshView } from "./mesh_view.js";
@@ -7,6 +8,7 @@ import { LightPad, Reflectance } from "./relight.js";
 
 const state = { set: null, checked: null, runs: [], run: null, mesh: null, thumbs: [] };
 const painter = new MaskPainter($("mask"), () => { $("mask-use").disabled = $("mask-reset").disabled = false; });
+const balls = new BallCircles($("ball-circles"), $("mask"), $("balls"), () => { $("ball-use").disabled = false; });
 const inSet = (path) => `/photographs/sets/${state.set}/${path}`;
 
 // ---- Loading ----
@@ -14,6 +16,7 @@ const inSet = (path) => `/photographs/sets/${state.set}/${path}`;
 async function begin() {
   state.set = (await post("/photographs/sets")).set;
   state.runs = [];
+  balls.balls = [];
   for (const id of ["review", "choose", "results"]) $(id).hidden = true;
 }
 
@@ -68,12 +71,12 @@ async function listDropped(transfer) {
 
 // ---- Checks and mask ----
 
-const options = () => ({ gamma: $("gamma").value, lights: $("lights").checked, frame: $("frame").value });
+const options = () => ({ gamma: $("gamma").value, lights: $("lights").checked, frame: $("frame").value, balls: balls.values() });
 
-async function check() {
+async function check(more = {}) {
   const box = $("load-status");
   try {
-    const found = await follow(await post(inSet("start/check"), options()), box, "Checks");
+    const found = await follow(await post(inSet("start/check"), { ...options(), ...more }), box, "Checks");
     if (found) review(found);
   } catch (error) { showError(box, error); }
 }
@@ -96,7 +99,8 @@ function review(found) {
   if (found.methods.some(({ name }) => name === chosen)) $("method").value = chosen;
   describeMethod();
   painter.load(inSet(`files/view/picture.jpg?${stamp}`), inSet(`files/view/mask.png?${stamp}`));
-  $("mask-use").disabled = true;
+  balls.load(found.width, found.height, found.balls);
+  $("mask-use").disabled = $("ball-use").disabled = true;
   $("mask-reset").disabled = found.mask !== "painted";
   $("review").hidden = $("choose").hidden = false;
   $("review").scrollIntoView({ behavior: "smooth" });
@@ -265,6 +269,9 @@ for (const [id, adding] of [["brush-add", true], ["brush-take", false]]) $(id).a
 $("brush-size").addEventListener("input", () => { painter.radius = Number($("brush-size").value); });
 $("mask-use").addEventListener("click", async () => sendMask(await painter.blob()));
 $("mask-reset").addEventListener("click", () => sendMask(new Blob([])));
+$("ball-find").addEventListener("click", () => check({ balls: ["auto"] }));
+$("ball-add").addEventListener("click", () => balls.add());
+$("ball-use").addEventListener("click", () => check());
 $("method").addEventListener("change", describeMethod);
 for (const id of ["gamma", "lights", "frame"]) $(id).addEventListener("change", () => { if (id !== "frame" || $("lights").checked) check(); });
 $("form").addEventListener("submit", infer);

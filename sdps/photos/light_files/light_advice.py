@@ -13,7 +13,7 @@ _FAR = 30.0
 _SAID = "the lights that a network finds in the photographs"
 
 
-def advise(fit: LightFit, files: Sequence[str], name: str, frame: str) -> tuple[str, str]:
+def advise(fit: LightFit, files: Sequence[str], name: str, frame: str, remedy: str = "") -> tuple[str, str]:
     """Return how grave it is that lights do not fit (`error`, `warning` or `note`), and a sentence with the remedy.
 
     Args:
@@ -21,15 +21,16 @@ def advise(fit: LightFit, files: Sequence[str], name: str, frame: str) -> tuple[
         files: (L,) names of the pictures.
         name: Name of the file of lights.
         frame: The frame flag it was read with; empty where the file states its own frame.
+        remedy: What to do where they do not fit and are of no file; empty for the lights of one.
     """
     apart, better = fit.given.apart, fit.better
     if better is not None:
         remedies = [text for text in (_order(better, files), _axes(better, frame, fit.sure)) if text]
         return "error", (
             f"the lights of {name} do not fit the photographs: they are {apart:.0f} degrees from {_SAID}; "
-            f"{', and '.join(remedies)}"
+            f"{remedy or ', and '.join(remedies)}"
         )
-    if not fit.sure:
+    if not fit.sure and not remedy:
         turned = _flag(AXES[3], frame)
         return "note", (
             f"the lights of {name} are half a turn from {_SAID}; without an outline nothing shows which is right: "
@@ -39,6 +40,8 @@ def advise(fit: LightFit, files: Sequence[str], name: str, frame: str) -> tuple[
         return "warning", (
             f"the lights of {name} are {apart:.0f} degrees from {_SAID}, and no other reading of the file fits better; "
             "are they those of these photographs?"
+            if not remedy
+            else f"the lights of {name} are {apart:.0f} degrees from {_SAID}; {remedy}"
         )
     return "note", f"the lights of {name} are {apart:.0f} degrees from {_SAID}, on average"
 

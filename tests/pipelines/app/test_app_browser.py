@@ -8,6 +8,9 @@ import photo_folders as folders
 import pytest
 from app_data import write_run
 from app_server import eventually, serving
+from ball_scenes import LIGHTS as BALL_LIGHTS
+from ball_scenes import paint
+from ball_scenes import write as write_balls
 from browser_pages import WIDTHS, launched, needs_browser, watched
 from sdps_scenes import hemisphere_lights
 
@@ -65,6 +68,34 @@ def test_photographs(page, address: str, tmp_path: Path) -> None:
     with page.expect_download() as download:
         page.click("#download")
     assert download.value.suggested_filename == "sdps-infer.zip"
+
+
+def test_balls(page, address: str, tmp_path: Path) -> None:
+    pictures = [paint(lamp, 1.0, chrome=[(85.0, 40.0, 30.0)]) for lamp in BALL_LIGHTS]
+    page.goto(f"{address}/photographs")
+    page.set_input_files("#files", sorted(write_balls(tmp_path / "in", pictures).iterdir()))
+    page.wait_for_selector("#findings li")
+    page.click("#ball-find")
+    radius = page.get_by_label("Ball 1: radius")
+    radius.wait_for()
+    assert abs(float(radius.input_value()) - 30.0) < 0.5 and page.locator(".ball-spot").count() == len(pictures)
+    page.locator(".ball").scroll_into_view_if_needed()
+    box = page.locator(".ball").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 20, y)
+    page.mouse.up()
+    column = page.get_by_label("Ball 1: column")
+    assert float(column.input_value()) > 216.0  # from 214.5
+    column.fill("214")
+    page.keyboard.press("Tab")
+    page.click("#ball-use")
+    assert eventually(lambda: page.locator(".ball-spot").count() == len(pictures))
+    page.click("#ball-add")
+    page.get_by_label("Ball 2: column").wait_for()
+    page.get_by_role("button", name="Remove ball 2").click()
+    assert page.locator(".ball").count() == 1
 
 
 def test_a_bad_upload_gets_one_line(page, address: str, tmp_path: Path) -> None:

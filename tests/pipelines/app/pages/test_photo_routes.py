@@ -15,6 +15,9 @@ import OpenEXR
 import photo_folders as folders
 import pytest
 from app_server import Client, serving
+from ball_scenes import LIGHTS as BALL_LIGHTS
+from ball_scenes import paint
+from ball_scenes import write as write_balls
 from PIL import Image
 from sdps_scenes import hemisphere_lights
 
@@ -139,6 +142,24 @@ def test_a_distance_of_the_lamps_is_used(address: str, hills: Path) -> None:
     assert found["distances"] == [4.0] * len(found["files"])
     job = infer(light_distance="near")
     assert job["state"] == "failed" and "--light-distance" in job["message"]
+
+
+def test_balls_are_found_and_used(address: str, tmp_path: Path) -> None:
+    balls = [(85.0, 45.0, 28.0), (85.0, -45.0, 30.0)]
+    client = Client(address)
+    path = client.new_set(write_balls(tmp_path, [paint(lamp, 1.0, chrome=balls) for lamp in BALL_LIGHTS]))
+    found = client.wait(client.post(f"{path}/start/check", {"balls": ["auto"]}))["result"]
+    assert found["lit"] and [ball["kind"] for ball in found["balls"]] == ["chrome", "chrome"]
+    assert all(len(ball["highlights"]) == len(BALL_LIGHTS) for ball in found["balls"])
+    named = [f"{ball['x']},{ball['y']},{ball['radius']}" for ball in found["balls"]]
+    job = client.wait(client.post(f"{path}/start/infer", {"method": "least-squares", "balls": named[:1]}))
+    assert np.abs(np.array(job["result"]["lights"]) - BALL_LIGHTS).max() < 0.03
+    job = client.wait(client.post(f"{path}/start/check", {"balls": ["60,60,20"]}))
+    assert job["state"] == "failed" and "shows no light" in job["message"]
+    for bad in (["/etc"], ["/etc:1,2,9"], "auto", ["auto"] * 9, [{}]):
+        assert "balls: must be" in message(
+            client.send("POST", f"{path}/start/check", json.dumps({"balls": bad}).encode())
+        )
 
 
 def test_a_painted_mask_is_used(address: str, hills: Path) -> None:

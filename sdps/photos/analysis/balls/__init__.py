@@ -1,0 +1,1 @@
+"""Chrome and white balls in pictures, and the lights they give."""

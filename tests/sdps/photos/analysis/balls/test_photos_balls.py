@@ -1,0 +1,146 @@
+"""Lights from chrome and white balls: traced pictures whose lamps are known, and the real sphere."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ball_scenes import FOCAL, GAINS, LIGHTS, OBJECT, SHAPE, flag, hit, paint, write
+
+from render.shared.errors import InputError
+from sdps.core.geometry import Camera, Capture
+from sdps.photos import load
+from sdps.photos.analysis.balls.ball_flags import read_balls
+from sdps.photos.analysis.balls.ball_spheres import Circle, Sphere
+from sdps.photos.picture_file import decode
+
+DATA = "shared/data/uw_psm_photos.zip"
+REAL = next((place / DATA for place in Path(__file__).resolve().parents if (place / DATA).is_file()), Path(DATA))
+
+
+def angles(found, true):
+    true = true / np.linalg.norm(true, axis=1, keepdims=True)
+    return np.degrees(np.arccos(np.clip((found * true).sum(1), -1.0, 1.0)))
+
+
+@pytest.mark.parametrize("focal", [np.inf, FOCAL])
+@pytest.mark.parametrize("found", [False, True])
+def test_a_chrome_ball_gives_directions(tmp_path, focal, found):
+    ball = (85.0, 40.0, 30.0)
+    write(tmp_path / "in", [paint(lamp, gain, focal, chrome=[ball]) for lamp, gain in zip(LIGHTS, GAINS, strict=True)])
+    camera = "orthographic" if focal == np.inf else f"{focal}px"
+    photos = load(tmp_path / "in", balls="auto" if found else flag(ball, focal), focal=camera)
+    assert [one.kind for one in photos.balls] == ["chrome"] and photos.balls[0].found == found
+    assert angles(photos.light_directions, LIGHTS).max() < 1.0
+    assert photos.intensities is None and photos.light_nearness is None
+    assert not photos.mask[30:70, 190:230].any() and photos.mask[90, 85]
+    sphere = Sphere.of(photos.balls[0].circle, photos.camera, photos.shape)
+    np.testing.assert_allclose([sphere.x, sphere.y, sphere.radius], ball, atol=0.5)
+
+
+@pytest.mark.parametrize("said", ["auto", "flag"])
+def test_a_white_ball_gives_directions_and_intensities(tmp_path, said):
+    ball = (85.0, 40.0, 30.0)
+    images = [paint(lamp, gain, white=[ball]) for lamp, gain in zip(LIGHTS, GAINS, strict=True)]
+    mask = hit(OBJECT, np.inf)[3]
+    photos = load(write(tmp_path / "in", images, mask), balls=flag(ball) if said == "flag" else said)
+    assert [one.kind for one in photos.balls] == ["white"]
+    assert angles(photos.light_directions, LIGHTS).max() < 1.0
+    np.testing.assert_allclose(photos.intensities / photos.intensities.mean(), GAINS / GAINS.mean(), rtol=0.01)
+
+
+@pytest.mark.parametrize("focal", [np.inf, FOCAL])
+def test_two_balls_give_positions(tmp_path, focal):
+    balls = [(85.0, 45.0, 28.0), (85.0, -45.0, 30.0)]
+    lamps = 300.0 * LIGHTS + [OBJECT[0], 0.0, 0.0]
+    images = [paint(lamp, 1.0, focal, chrome=balls) for lamp in lamps]
+    camera = "orthographic" if focal == np.inf else f"{focal}px"
+    photos = load(write(tmp_path / "in", images), balls=[flag(ball, focal) for ball in balls], focal=camera)
+    capture = Capture.of(photos.mask, photos.camera)
+    off = lamps - capture.centre
+    assert angles(photos.light_directions, off).max() < 1.0
+    np.testing.assert_allclose(capture.radius / photos.light_nearness, np.linalg.norm(off, axis=1), rtol=0.05)
+    near = load(tmp_path / "in", balls=flag(balls[0], focal), focal=camera, light_distance=f"{300.0}px")
+    assert angles(near.light_directions, off).max() < 1.5  # one ball, and how far the lamps are
+
+
+def test_pictures_without_a_good_highlight_are_left_out(tmp_path):
+    ball = (85.0, 0.0, 30.0)
+    images = [paint(lamp, 1.0, chrome=[ball]) for lamp in LIGHTS]
+    images[2] = paint(LIGHTS[2], 0.8)  # no ball at all: nothing shines
+    images[4] = np.maximum(images[4], paint(LIGHTS[9], 1.0, chrome=[ball]))
+    images[6] = paint(np.array([0.98, 0.0, -0.199]), 1.0, chrome=[ball])
+    photos = load(write(tmp_path / "in", images), balls=f"chrome:{flag(ball)}")
+    left = next(note for note in photos.notes if note.startswith("left out"))
+    assert photos.files == tuple(f"p{number:02d}.png" for number in (0, 1, 3, 5, 7, 8, 9))
+    assert "p02.png (no highlight" in left and "p04.png (several" in left and "p06.png (the highlight lies at" in left
+    assert angles(photos.light_directions, LIGHTS[[0, 1, 3, 5, 7, 8, 9]]).max() < 1.0
+
+
+def test_a_ball_in_a_folder_of_its_own(tmp_path):
+    ball, alone = (10.0, 5.0, 40.0), []
+    for lamp in LIGHTS:
+        image = np.full(SHAPE, 0.004)
+        shown = hit(ball, np.inf)[3]
+        image[shown] = paint(lamp, 1.0, chrome=[ball])[shown]
+        alone.append(image)
+    write(tmp_path / "ball", alone)
+    write(tmp_path / "object", [paint(lamp, 1.0) for lamp in LIGHTS])
+    for said in (f"{tmp_path / 'ball'}:{flag(ball)}", tmp_path / "ball"):
+        photos = load(tmp_path / "object", balls=said, names=["p0[1-9].png"])  # matched by their numbers
+        assert angles(photos.light_directions, LIGHTS[1:]).max() < 1.0 and photos.balls[0].folder == tmp_path / "ball"
+    (tmp_path / "ball" / "p03.png").unlink()
+    with pytest.raises(InputError, match="9 pictures of the ball for 10"):
+        load(tmp_path / "object", balls=said)
+
+
+@pytest.mark.parametrize(
+    ("said", "means"),
+    [
+        ("atuo", "did you mean .auto"), ("1,2", "did you mean|write x,y"), ("./none", "no such folder"),
+        ("1,2,1", "at least 3"), ("none:1,2,9", "no such folder: none"), ("250,20,30", "leaves the picture"),
+        ("auto", "nothing but the ball"), ("90,90,20", "shows no light in|chrome"), ((1.0, 2.0), "write x,y,radius"),
+    ],
+)  # fmt: skip
+def test_what_is_no_ball_is_refused(tmp_path, said, means):
+    write(tmp_path / "in", [0.5 * paint(lamp, 1.0) for lamp in LIGHTS[:6]])
+    with pytest.raises(InputError, match=means):
+        load(tmp_path / "in", balls=said)
+
+
+def test_balls_and_lights_are_not_both_taken(tmp_path):
+    write(tmp_path / "in", [paint(lamp, 1.0) for lamp in LIGHTS[:4]])
+    with pytest.raises(InputError, match="keep one of the two"):
+        load(tmp_path / "in", balls="auto", lights="folder")
+    assert read_balls(None) == () == read_balls([])
+
+
+def test_a_circle_and_its_ball_in_perspective():
+    ball = Sphere(Camera(FOCAL), SHAPE, 85.0, 40.0, 30.0)
+    rows, columns = ball.outline()
+    np.testing.assert_allclose(ball.offsets(rows, columns), 1.0, atol=1e-9)
+    again = Sphere.of(ball.circle, ball.camera, SHAPE)
+    np.testing.assert_allclose([again.x, again.y, again.radius], [85.0, 40.0, 30.0], atol=0.1)
+    assert abs(ball.covers().sum() - hit((85.0, 40.0, 30.0), FOCAL)[3].sum()) <= 2
+    flat = Sphere.of(Circle(100.0, 60.0, 20.0), Camera(), SHAPE)
+    np.testing.assert_allclose(flat.circle, (100.0, 60.0, 20.0), atol=1e-9)
+
+
+@pytest.mark.skipif(not REAL.is_file(), reason="the photographs of the University of Washington are not there")
+@pytest.mark.parametrize("said", ["chrome:253.5,148,119", "auto", "mask"])
+def test_the_real_sphere(tmp_path, said):
+    with zipfile.ZipFile(REAL) as opened:
+        opened.extractall(tmp_path)
+    true = np.loadtxt(tmp_path / "lights.txt", skiprows=1)
+    folder = tmp_path / "chrome"
+    if said != "mask":
+        (folder / "chrome.mask.tga").unlink()
+    said = f"{folder}:253.5,148,119" if said.startswith("chrome") else folder
+    photos = load(tmp_path / "buddha", balls=said, gamma="linear")
+    off = angles(photos.light_directions, true)
+    assert off.mean() < 3.2 and np.median(off) < 2.4  # the file's own lights miss highlights by up to 8 pixels
+    ball = photos.balls[0]
+    np.testing.assert_allclose(ball.circle, (253.5, 148.0, 119.0), atol=2.0)
+    for place, number in zip(ball.highlights, range(12), strict=True):
+        rows, columns = np.nonzero(decode(folder / f"chrome.{number}.tga").pixels.min(-1) >= 250)
+        np.testing.assert_allclose(place, [columns.mean(), rows.mean()], atol=0.5)
