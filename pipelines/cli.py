@@ -23,6 +23,7 @@ class Command(NamedTuple):
         stores: Whether its folders may be addresses in object storage.
         hidden: Whether it is an earlier name, which works and is not listed.
         example: One line or two that end its help.
+        starts: What is said before the module is loaded, where that takes seconds.
     """
 
     module: str
@@ -32,6 +33,7 @@ class Command(NamedTuple):
     stores: bool = False
     hidden: bool = False
     example: str = ""
+    starts: str = ""
 
 
 class Group(NamedTuple):
@@ -102,7 +104,8 @@ EVALUATE = Group("score methods on rendered scenes and real photographs, and wri
 
 COMMANDS: dict[str, Command | Group] = {
     "infer": Command("pipelines.infer", "find normals, lights and a surface in a folder of photographs",
-                     example="sdps infer photos --out out/vase\nsdps infer photos --lights lights.lp --mask mask.png"),
+                     example="sdps infer photos --out out/vase\nsdps infer photos --lights lights.lp --mask mask.png",
+                     starts="looking at the photographs"),
     "app": Command("pipelines.app.app", "serve a local page for photographs, scenes and data", example="sdps app"),
     "doctor": Command("pipelines.doctor", "show what this machine has and what is missing",
                       example="sdps doctor --fix"),
@@ -236,6 +239,10 @@ def _add_commands(
         if isinstance(command, Group):
             _add_commands(child, command.commands, words[1:], f"{name} command")
         else:
+            if command.starts and len(words) > 1 and command.module not in sys.modules:
+                folder = f" in {words[1]}" if Path(words[1]).is_dir() else ""
+                sys.stdout.write(f"{command.starts}{folder}\n")
+                sys.stdout.flush()
             module = importlib.import_module(command.module)
             getattr(module, command.declare)(child)
             child.set_defaults(run=getattr(module, command.run), stores=command.stores)

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipelines.evaluate.report import page as report
 from pipelines.evaluate.report.sections import Section, SectionWriter, Table, Tile
-from pipelines.shared import network_flags, pictures
+from pipelines.shared import dry_run, network_flags, pictures
 from render.shared.errors import InputError
 from render.shared.progress import bars, stage
 from sdps.core.intensities import grey, scale_to_mean
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from sdps.photos import Finding, Photographs
     from sdps.refinement.trust import RefinedEstimate
 
+AUTO = "auto"
+"""A scale that keeps time and memory in bounds."""
 _MARKS = {"error": "!!", "warning": "! ", "note": "- "}
 _MOST_LISTED = 6
 _MOST_SIDE = 700  # of the object, in pixels: twice that and more is thinned for the page
@@ -55,8 +57,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         "with what the network says (default: where a network finds the normals)")  # fmt: skip
     parser.add_argument("--anyway", action="store_true",
                         help="go on where a check of the photographs stops (the report says which)")  # fmt: skip
-    parser.add_argument("--scale", type=float, default=1.0, metavar="F",
-                        help="reduce pictures and mask as they are read; 0.5 halves the sides")  # fmt: skip
+    parser.add_argument("--scale", type=_read_scale, default=1.0, metavar="F|auto",
+                        help="reduce pictures and mask as they are read; 0.5 halves the sides; auto: so that it takes "
+                        "under ten minutes and 4 GiB")  # fmt: skip
     parser.add_argument("--focal", default=None, metavar="28mm|3772px",
                         help="focal length: 35 mm equivalent, or pixels of the files; orthographic for none "
                         "(default: as the files' EXIF data say, else orthographic)")  # fmt: skip
@@ -65,6 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pixel-size", type=float, default=None, metavar="MM",
                         help="millimetres that a pixel of the files shows: the unit of depth and meshes")  # fmt: skip
     network_flags.add_arguments(parser)
+    parser.add_argument("--dry-run", action="store_true",
+                        help="say what was understood and what would be done, and write nothing")  # fmt: skip
     parser.add_argument("--self-test", action="store_true",
                         help="render a bunny, save it as photographs, and compare with the truth")  # fmt: skip
 
@@ -78,6 +83,8 @@ def main(args: argparse.Namespace) -> int:
     if args.folder is None:
         raise InputError("name a folder of photographs, or use --self-test")
     with bars(without=("reading", "checks", "refinement")):  # these have their own
+        if args.dry_run:
+            return rehearse(args)
         result, said = infer_folder(args)
         made = result.save(args.out)
         page = write_page(args.out / "report.html", result)
@@ -95,26 +102,70 @@ def main(args: argparse.Namespace) -> int:
 
 def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:
     """Read the photographs, say what was found about them, and run the method; also return how many were said."""
-    from sdps.api import check_out, infer, load, plan
-    from sdps.inference.inference_config import inference_config
-    from sdps.photos import check
+    from sdps.api import infer, plan
 
-    config = inference_config(args)
-    check_out(args.out, args.folder)
-    photos = load(
-        args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
-        gamma=args.gamma, names=args.images, anyway=args.anyway, scale=args.scale, focal=args.focal,
-        principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance,
-    )  # fmt: skip
-    findings = tuple(check(photos))
-    height, width = photos.shape
-    sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is {_name_camera(photos)}\n")
-    sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
-    options = {"models": args.models, "config": config, "refine": args.refine, "discontinuities": args.discontinuities}
+    photos, findings, options = look_through(args)
     if args.anyway or not any(finding.level == "error" for finding in findings):
         sys.stdout.write(f"{plan(photos, args.method, **options).describe()}\n")
         sys.stdout.flush()
     return infer(photos, args.method, findings=findings, anyway=args.anyway, **options), len(findings)
+
+
+def rehearse(args: argparse.Namespace) -> int:
+    """Say what was understood of the photographs and what `infer_folder` would do; write nothing.
+
+    Raises:
+        InputError: what would stop it.
+    """
+    from sdps.api import ask_about_lights, plan, stop
+
+    photos, findings, options = look_through(args)
+    sys.stdout.write(dry_run.describe_input(photos))
+    expected = plan(photos, args.method, **options)
+    sys.stdout.write(f"{expected.describe()}\n{dry_run.describe_work(expected, args.out)}")
+    sys.stdout.flush()
+    stop(photos, findings, args.anyway)
+    if not args.anyway:
+        expected.check()
+    if photos.light_directions is not None:
+        _, more = ask_about_lights(photos, args.models, options["config"])
+        sys.stdout.write(describe(more))
+        stop(photos, more, args.anyway)
+    sys.stdout.write("nothing was written (--dry-run)\n")
+    return 0
+
+
+def look_through(args: argparse.Namespace) -> tuple["Photographs", "tuple[Finding, ...]", dict[str, Any]]:
+    """Read the photographs and say what was found about them; also return findings, and options as of `sdps.infer`."""
+    from sdps.api import check_out, load, plan
+    from sdps.inference.inference_config import inference_config
+    from sdps.photos import check
+
+    options = {"models": args.models, "config": inference_config(args), "refine": args.refine,
+               "discontinuities": args.discontinuities}  # fmt: skip
+    check_out(args.out, args.folder)
+
+    def read(scale: float) -> "Photographs":
+        return load(
+            args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
+            gamma=args.gamma, names=args.images, anyway=args.anyway, scale=scale, focal=args.focal,
+            principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance,
+        )  # fmt: skip
+
+    photos = read(1.0 if args.scale == AUTO else args.scale)
+    if args.scale == AUTO and (quick := plan(photos, args.method, **options).quick) is not None:
+        sys.stdout.write(f"- reduced by --scale {quick[0]:g}, so that it takes less time and memory\n")
+        photos = read(quick[0])
+    findings = tuple(check(photos))
+    height, width = photos.shape
+    sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is {_name_camera(photos)}\n")
+    sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
+    return photos, findings, options
+
+
+def _read_scale(text: str) -> float | str:
+    """Return a scale, or `auto`; what is no number is refused as argparse does."""
+    return text if text == AUTO else float(text)
 
 
 def describe(findings: "Sequence[Finding]") -> str:

@@ -91,21 +91,21 @@ def infer(
         InputError: photographs that cannot be used, or a method that is not there or cannot use them, in one line.
     """
     findings = tuple(check(photos)) if findings is None else findings
-    _stop(photos, findings, anyway)
+    stop(photos, findings, anyway)
     known = photos.light_directions is not None, photos.intensities is not None
     runner = _runner(method, known, models, config, refine, len(photos))
-    if not anyway:
-        workload(photos, runner, discontinuities=discontinuities).check()
+    if (forecast := workload(photos, runner, discontinuities=discontinuities)) and not anyway:
+        forecast.check()
     began, intensities = time.perf_counter(), photos.intensities
     if photos.light_directions is not None:  # after what costs nothing: it reads every photograph twice
-        intensities, more = _question_lights(photos, models, config)
+        intensities, more = ask_about_lights(photos, models, config)
         findings = (*findings, *more)
-        _stop(photos, findings, anyway)
+        stop(photos, findings, anyway)
     rig = Rig(photos.camera, photos.light_nearness, photos.nearness_each)
     given = photos.light_directions, intensities
     found = runner.estimate(photos, photos.mask, *given, saturation=photos.saturation, rig=rig)
-    seconds = time.perf_counter() - began
-    return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
+    took = time.perf_counter() - began
+    return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, took, forecast)
 
 
 def plan(
@@ -247,15 +247,19 @@ def _finder(models: str | Path | None) -> Callable[[str], Path]:
     return partial(pretrained.require, out=None if models is None else Path(models))
 
 
-def _stop(photos: Photographs, findings: tuple[Finding, ...], anyway: bool) -> None:
-    """Stop at the first grave finding, unless asked to go on."""
+def stop(photos: Photographs, findings: tuple[Finding, ...], anyway: bool) -> None:
+    """Stop at the first grave finding, unless asked to go on.
+
+    Raises:
+        InputError: that finding.
+    """
     grave = next((finding for finding in findings if finding.level == "error"), None)
     if grave is not None and not anyway:
         raise InputError(f"{photos.folder}: {grave.text} ({ANYWAY})")
 
 
-def _question_lights(
-    photos: Photographs, models: str | Path | None, config: InferenceConfig | None
+def ask_about_lights(
+    photos: Photographs, models: str | Path | None = None, config: InferenceConfig | None = None
 ) -> tuple[np.ndarray, tuple[Finding, ...]]:
     """Ask a network about lights that are given: return intensities, found where none are given, and what it says."""
     assert photos.light_directions is not None
