@@ -148,7 +148,7 @@ GROUPS = {
     "lights": {"lights", "light-set", "intensities", "frame", "light-distance"},
     "the camera": {"focal", "principal", "pixel-size", "camera-distance"},
     "how it is solved": {"method", "methods", "refine", "discontinuities", "read-out", "light-views", "normal-views",
-                         "keep-stray-light", "lighting", "normals"},
+                         "keep-stray-light", "lighting", "normals", "flat", "flatten"},
     "which scenes": {"ids", "split", "limit", "count", "skip-missing", "shard", "retry-failed", "shapes", "materials",
                      "category", "role"},
     "what comes out": {"out", "json", "layout", "bits", "exposure", "mitsuba", "photographs", "tensorboard"},

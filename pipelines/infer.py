@@ -67,6 +67,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="principal point, in pixels of the files (default: their middle)")  # fmt: skip
     parser.add_argument("--pixel-size", type=float, default=None, metavar="MM",
                         help="millimetres that a pixel of the files shows: the unit of depth and meshes")  # fmt: skip
+    parser.add_argument("--flat", nargs="?", const="yes", default=AUTO, metavar="yes|no|turned",
+                        help="a coin, relief, textile or painting that faces the camera, the whole frame without a mask"
+                        "; turned: what stands out came out hollow (default: auto, by how it looks)")  # fmt: skip
+    parser.add_argument("--flatten", nargs="?", type=float, const=0.25, default=0.0, metavar="SHARE",
+                        help="of a flat thing, take off the mean slope of this share of the width around every pixel "
+                        "(0.25 without a number; default: none)")  # fmt: skip
     network_flags.add_arguments(parser)
     parser.add_argument("--dry-run", action="store_true",
                         help="say what was understood and what would be done, and write nothing")  # fmt: skip
@@ -108,7 +114,8 @@ def infer_folder(args: argparse.Namespace) -> tuple["Inference", int]:
     if args.anyway or not any(finding.level == "error" for finding in findings):
         sys.stdout.write(f"{plan(photos, args.method, **options).describe()}\n")
         sys.stdout.flush()
-    return infer(photos, args.method, findings=findings, anyway=args.anyway, **options), len(findings)
+    more = {"findings": findings, "anyway": args.anyway, "flat": args.flat, "flatten": args.flatten}
+    return infer(photos, args.method, **options, **more), len(findings)
 
 
 def rehearse(args: argparse.Namespace) -> int:
@@ -139,10 +146,12 @@ def look_through(args: argparse.Namespace) -> tuple["Photographs", "tuple[Findin
     """Read the photographs and say what was found about them; also return findings, and options as of `sdps.infer`."""
     from sdps.api import check_out, load, plan
     from sdps.inference.inference_config import inference_config
+    from sdps.methods.flat_things import Flatness
     from sdps.photos import check
 
     options = {"models": args.models, "config": inference_config(args), "refine": args.refine,
                "discontinuities": args.discontinuities}  # fmt: skip
+    flat = Flatness(args.flat, args.flatten)
     check_out(args.out, args.folder)
 
     def read(scale: float) -> "Photographs":
@@ -150,6 +159,7 @@ def look_through(args: argparse.Namespace) -> tuple["Photographs", "tuple[Findin
             args.folder, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
             gamma=args.gamma, names=args.images, anyway=args.anyway, scale=scale, focal=args.focal,
             principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance,
+            whole_frame=flat.asked,
         )  # fmt: skip
 
     photos = read(1.0 if args.scale == AUTO else args.scale)

@@ -37,7 +37,7 @@ class Photographs:
         bits: Per channel: 8 or 16, 32 of floating-point files (16 of half ones).
         gamma: The curve that was taken off: linear, srgb, or an exponent.
         mask: (H, W) bool, not empty; every pixel in it is finite in all pictures, but with `anyway`.
-        mask_origin: `file` or `automatic`.
+        mask_origin: `file`, `automatic`, or `whole frame` where that was asked for.
         light_directions: (L, 3) float32, unit, x right, y up, z to the camera, from the surface to the light; or None.
         intensities: (L,) or (L, 3) float32, relative; or None.
         notes: What was decided, in plain sentences.
@@ -140,10 +140,9 @@ def load(
     principal: str | Sequence[float] | None = None,
     pixel_size: float | None = None,
     light_distance: str | float | None = None,
+    whole_frame: bool = False,
 ) -> Photographs:
     """Look through a folder of photographs of a static object under one distant light each (docs/guides/capture.md).
-
-    Every file is decoded once, one at a time, so that a damaged one is found now.
 
     Args:
         folder: Pictures of one kind and size, and what may lie there with them.
@@ -163,6 +162,7 @@ def load(
         light_distance: How far all lamps stand from the object: a number of its sizes (the longer side of its outline's
             box), `400mm`, `40cm`, `0.4m` (with `pixel_size`), or `far`. None or `auto`: as the positions in the lights
             file say, else not known; `each`: not known, and not the same for all lamps.
+        whole_frame: Without a mask file, all pixels are the object's, as of flat things.
 
     Raises:
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
@@ -171,8 +171,17 @@ def load(
     wanted, folder, scale = read_wanted(focal, principal, pixel_size), Path(folder), check_scale(scale)
     listing, faults = list_pictures(folder, names), Faults(anyway)
     seen = survey(folder, listing, gamma, None if mask is None else Path(mask), faults, scale)
+    seen = _choose_mask(seen, whole_frame)
     known = _find_lights(listing, seen, lights, intensities, frame, faults)
     return _place_lamps(_assemble(folder, listing, seen, known, wanted, faults, scale), seen, known, distance)
+
+
+def _choose_mask(seen: Survey, whole_frame: bool) -> Survey:
+    """Return what was seen, with the whole frame for an automatic mask where that is asked for."""
+    if not whole_frame or seen.origin != "automatic":
+        return seen
+    notes = (*seen.notes[:-1], "the whole frame is the object")  # the last one is about the mask
+    return replace(seen, mask=np.ones_like(seen.mask), origin="whole frame", notes=notes)
 
 
 def _find_lights(

@@ -201,6 +201,7 @@ class Inference:
                       "residual_degrees": round(self.depth.residual, 3)},
             "mesh": {"every": step_of(photos.mask)} | ({"unit": _unit(photos)} if photos.pixel_size else {}),
             "seconds": round(self.seconds, 2),
+            **({} if self.estimate.tilt is None else {"flat": {"tilt_degrees": round(self.estimate.tilt, 2)}}),
             **({} if self.forecast is None else {"forecast": self.forecast.summary()}),
             "notes": list(photos.notes),
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
