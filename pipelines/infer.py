@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flat", nargs="?", const="yes", default=AUTO, metavar="yes|no|turned",
                         help="a coin, relief, textile or painting that faces the camera, the whole frame without a mask"
                         "; turned: what stands out came out hollow (default: auto, by how it looks)")  # fmt: skip
-    parser.add_argument("--flatten", nargs="?", type=float, const=0.25, default=0.0, metavar="SHARE",
+    parser.add_argument("--flatten", nargs="?", type=_read_share, const=0.25, default=0.0, metavar="SHARE",
                         help="of a flat thing, take off the mean slope of this share of the width around every pixel "
                         "(0.25 without a number; default: none)")  # fmt: skip
     network_flags.add_arguments(parser)
@@ -86,6 +86,8 @@ def main(args: argparse.Namespace) -> int:
         from pipelines.evaluate.self_test import photograph_bunny
 
         args.folder = photograph_bunny(args.out / "photographs")
+    if args.folder is None and Path(args.flat).is_dir():  # `--flat photographs`: a folder is no wish
+        args.folder, args.flat = Path(args.flat), "yes"
     if args.folder is None:
         raise InputError("name a folder of photographs, or use --self-test")
     with bars(without=("reading", "checks", "refinement")):  # these have their own
@@ -171,6 +173,18 @@ def look_through(args: argparse.Namespace) -> tuple["Photographs", "tuple[Findin
     sys.stdout.write(f"{len(photos)} photographs of {width}x{height}; the camera is {_name_camera(photos)}\n")
     sys.stdout.write("".join(f"- {note}\n" for note in photos.notes) + describe(findings))
     return photos, findings, options
+
+
+def _read_share(text: str) -> float:
+    """Return a share of the width.
+
+    Raises:
+        ArgumentTypeError: no number, such as the folder, which argparse gives to a flag before it.
+    """
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number; name the folder before --flatten") from None
 
 
 def _read_scale(text: str) -> float | str:

@@ -67,7 +67,7 @@ def infer(
     discontinuities: bool = False,
     findings: tuple[Finding, ...] | None = None,
     anyway: bool = False,
-    flat: Wish = AUTO,
+    flat: Wish = "auto",
     flatten: float = 0.0,
 ) -> Inference:
     """Estimate normals and lights of photographs.

@@ -1,11 +1,15 @@
 """What is found of flat things that fill the frame: reliefs with truth, nothing given and lights given.
 
-    python -m lab.studies.flat_study --side 160 --images 16        # minutes; the tables of docs/studies/refinement.md
+    python -m lab.studies.flat_study --side 128 --images 12        # minutes; the table of docs/guides/infer.md
+    python -m lab.studies.flat_study --depth 0.25                  # shallow ones
 
 A coin, a weave and brush strokes are made as heights, shaded with gloss and cast shadows, and lit from afar or by lamps
 two object sizes away, which bend what is found into a bowl.
 """
 
+import argparse
+import sys
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,13 +17,46 @@ from scipy import ndimage
 
 from render.shared.imaging.vectors import unit
 from render.shared.seeds import generator
-from sdps.core.geometry import Capture, reach
+from sdps.api import _runner
+from sdps.core.geometry import UNKNOWN, Capture, reach
 from sdps.core.integration import integrate
+from sdps.core.metrics import normal_mae
+from sdps.methods.flat_things import Flatness, Wish
+from sdps.refinement.trust import RefinedEstimate
 from sdps.surface.relight import trace_light
 
 _ROOM, _NOISE = 32, 0.003
 _PORTRAIT = ((0.05, 0.1, 0.35, 0.05), (0.12, 0.2, 0.12, 0.03), (-0.1, -0.35, 0.2, 0.03), (0.3, 0.05, 0.08, 0.03))
 KINDS = ("coin", "weave", "paint")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print how many degrees normals are off, as found and with the mean plane facing the camera."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--side", type=int, default=128)
+    parser.add_argument("--images", type=int, default=12)
+    parser.add_argument("--distance", type=float, default=np.inf, help="of the lamps, in object sizes")
+    parser.add_argument("--depth", type=float, default=1.0, help="what heights are multiplied with")
+    args = parser.parse_args(argv)
+    sys.stdout.write("kind   lights  --flat  network  refined  answer  turned  tilt\n")
+    for kind in KINDS:
+        scene = photograph(kind, args.side, args.images, distance=args.distance, depth=args.depth)
+        for lit, wish in ((False, "no"), (False, "auto"), (True, "no"), (True, "yes")):
+            sys.stdout.write(f"{kind:6s} {'given' if lit else 'none':7s} {wish:5s} {_judge(scene, lit, wish)}\n")
+            sys.stdout.flush()
+    return 0
+
+
+def _judge(scene: "Flat", lit: bool, wish: Wish) -> str:
+    """Return degrees of the network's, refined and joined normals, and of these turned inside out; and the tilt."""
+    mask, runner = np.ones(scene.heights.shape, bool), _runner("auto", (lit, lit), None, None, None, 12, Flatness(wish))
+    lights, gains = (scene.lights, scene.gains) if lit else (None, None)
+    found = runner.estimate(scene.images, mask, lights, gains, rig=UNKNOWN)
+    assert isinstance(found, RefinedEstimate)
+    turned = found.normals * np.array([-1, -1, 1], np.float32)
+    answers = found.start.normals, found.refined.normals, found.normals, turned
+    errors = "  ".join(f"{normal_mae(normals, scene.normals, mask):6.2f}" for normals in answers)
+    return f"{errors}  {'left' if found.tilt is None else f'{found.tilt:.1f}'}"
 
 
 class Flat(NamedTuple):
@@ -56,7 +93,7 @@ def photograph(
     rng, whole, inside = generator(seed, f"flat {kind}"), side + 2 * _ROOM, slice(_ROOM, _ROOM + side)
     heights, albedo, gloss, shine = _make(kind, whole, rng)
     heights = depth * heights
-    row, column = np.gradient(heights)
+    row, column = np.asarray(np.gradient(heights))
     column, row = column - column[inside, inside].mean(), row - row[inside, inside].mean()
     normals = unit(np.stack([-column, row, np.ones_like(row)], axis=-1))
     azimuth = 2 * np.pi * ((np.arange(count) * 0.618 + rng.random()) % 1.0)
@@ -129,3 +166,7 @@ def _make(kind: str, side: int, rng: np.random.Generator) -> tuple[np.ndarray, n
     colours = rng.uniform(0.08, 0.8, (4, 3))
     which = (blur(0.07 * side) > 0).astype(int) + 2 * patch
     return height, colours[which] * (1 + 0.08 * blur(2.0)[..., None]), 0.12, 40.0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

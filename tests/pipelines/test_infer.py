@@ -190,7 +190,7 @@ def test_a_method_means_the_same_to_photographs_as_to_benchmarks(
 ) -> None:
     asked = []
 
-    def runner(*given: object) -> None:
+    def runner(*given: object, **_: object) -> None:
         asked.append(given)
         raise InputError("enough")
 

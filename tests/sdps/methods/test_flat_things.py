@@ -9,6 +9,7 @@ import pytest
 
 import sdps
 from lab.studies.flat_study import KINDS, Flat, photograph
+from pipelines.cli import main
 from render.shared.errors import InputError
 from render.shared.imaging.vectors import unit
 from sdps.core.estimate import Estimate
@@ -124,3 +125,15 @@ def test_photographs_of_flat_things(tmp_path: Path) -> None:
     slopes = result.normals[..., :2] / result.normals[..., 2:]
     np.testing.assert_allclose(slopes.mean(axis=(0, 1)), 0.0, atol=1e-3)
     assert result.summary()["flat"] == {"tilt_degrees": round(tilts["auto"], 2)}
+
+
+def test_the_folder_may_follow_the_flag(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    images = 0.6 * photograph("coin", 64, 6).images
+    folder = str(folders.write_folder(tmp_path, images / images.max()))
+    assert main(["infer", "--method", "factorisation", "--dry-run", "--flat", folder]) == 0
+    said = capsys.readouterr().out
+    assert "the whole frame is the object" in said and "draw a mask.png" not in said
+    assert main(["infer", "--dry-run", "--flatten", folder]) == 2
+    assert "name the folder before --flatten" in capsys.readouterr().err
+    assert main(["infer", folder, "--dry-run", "--flat", "no", "--flatten", "0.3"]) == 2
+    assert "leave out --flat no" in capsys.readouterr().err
