@@ -3,7 +3,8 @@
 Photographs under unknown lights show a surface up to z' = lambda z + mu x + nu y, with lights to match (Belhumeur,
 Kriegman and Yuille, The Bas-Relief Ambiguity, IJCV 1999). An outline resolves it; flat things have none, but their mean
 plane is known to face the camera, which gives mu and nu: the slopes' mean is taken off, and the lights follow, so that
-every picture looks as before. It is no rotation: a turned surface under turned lights is seen from elsewhere.
+every picture looks as before. It is no rotation: a turned surface under turned lights is seen from elsewhere. Known
+intensities give lambda.
 
 What is left is whether the relief stands out or is hollow: turned inside out under lights from the opposite side it
 looks the same, but for cast shadows.
@@ -20,6 +21,7 @@ from render.shared.errors import InputError, unknown
 from render.shared.imaging.vectors import unit
 from sdps.core.estimate import Estimate
 from sdps.core.integration import integrate
+from sdps.core.intensities import grey
 
 Wish = Literal["auto", "yes", "no", "turned"]
 SHARE = 0.25
@@ -28,6 +30,8 @@ _COVERS = 0.97
 """Share of the frame from which on a mask covers it."""
 _THICKEST = 0.2
 """Height, over the longer side, above which what covers the frame is not flat."""
+_LIKE, _LIKELY = 0.03, 0.3
+"""How exactly intensities are known and found, and how far depth is expected to be off; natural logarithms."""
 _STEEPEST, _LEAST_Z = 0.1, 0.05
 _SMALL = 96  # pixels of the longer side where a few tell enough
 _PART = 2**20  # pixels worked on at once
@@ -84,9 +88,18 @@ class Flatness:
             raise InputError("--flat turned: lights that are given tell what stands out; leave it out, or use --frame")
         return turn_inside_out(face_camera(found, mask, lit=lit))
 
-    def finish(self, found: _Found, mask: np.ndarray, *, lit: bool) -> _Found:
-        """Let the mean plane of the answer face the camera, and flatten it where that is wished."""
+    def finish(self, found: _Found, mask: np.ndarray, known: np.ndarray | None, *, lit: bool) -> _Found:
+        """Let the mean plane of the answer face the camera, scale its depth, and flatten it where that is wished.
+
+        Args:
+            found: What was found, from `begin` on.
+            mask: (H, W) bool.
+            known: (L,) or (L, 3) intensities that were given, where those found moved freely; None where not.
+            lit: Light directions were given.
+        """
         level = replace(face_camera(found, mask, lit=lit), tilt=found.tilt)
+        if known is not None and not lit:
+            level = deepen(level, mask, find_depth(level, known))
         return replace(level, normals=flatten(level.normals, mask, self.share)) if self.share else level
 
 
@@ -127,12 +140,36 @@ def face_camera(found: _Found, mask: np.ndarray, *, lit: bool) -> _Found:
         return replace(found, normals=normals, tilt=degrees)
     lights = found.light_directions.astype(np.float64)
     lights[:, 2] = np.maximum(lights[:, 2] + lights[:, :2] @ mean, _LEAST_Z)
-    gains = found.intensities
-    if len(gains):
-        longer = np.linalg.norm(lights, axis=1)
-        gains = (gains * (longer[:, None] if gains.ndim > 1 else longer)).astype(np.float32)
-    directions = unit(lights).astype(np.float32)
-    return replace(found, normals=normals, light_directions=directions, intensities=gains, tilt=degrees)
+    return replace(found, normals=normals, tilt=degrees, **_split(lights, found.intensities))
+
+
+def find_depth(found: Estimate, known: np.ndarray) -> float:
+    """Return lambda: by how much deeper the surface is if the lights are as strong as is known.
+
+    Under it lights (l_x, l_y, l_z) are (l_x / lambda, l_y / lambda, l_z), whose lengths are their intensities. Lights
+    of one height tell nothing, and leave it at 1.
+
+    Args:
+        found: Lights whose intensities were free to explain the images.
+        known: (L,) or (L, 3) intensities, of any scale.
+    """
+    lights = found.light_directions.astype(np.float64) * grey(found.intensities.astype(np.float64))[:, None]
+    logs = np.linspace(-1.0, 1.0, 201)
+    across, along = np.hypot(lights[:, 0], lights[:, 1]), lights[:, 2]
+    lengths = np.hypot(across * np.exp(-logs)[:, None], along)  # (201, L)
+    off = np.log(lengths / grey(known.astype(np.float64)))
+    misfit = np.square((off - off.mean(axis=1, keepdims=True)) / _LIKE).sum(axis=1)
+    return float(np.exp(logs[np.argmin(misfit + np.square(logs / _LIKELY))]))
+
+
+def deepen(found: _Found, mask: np.ndarray, factor: float) -> _Found:
+    """Return the surface made deeper by a factor, under the lights that leave every picture as it was."""
+    normals = np.zeros_like(found.normals)
+    for rows in _bands(mask):
+        inside = mask[rows]
+        normals[rows][inside] = _to_normals(factor * _slopes(found.normals[rows][inside]))
+    lights = found.light_directions / np.array([factor, factor, 1.0])
+    return replace(found, normals=normals, **_split(lights, found.intensities))
 
 
 def turn_inside_out(found: _Found) -> _Found:
@@ -169,6 +206,14 @@ def flatten(normals: np.ndarray, mask: np.ndarray, share: float = SHARE) -> np.n
         some = mask[part]
         found[part][some] = _to_normals(_slopes(normals[part][some]) - slow[part][some])
     return found
+
+
+def _split(lights: np.ndarray, intensities: np.ndarray) -> dict[str, np.ndarray]:
+    """Return directions, and intensities times the lengths, of lights (L, 3) that bent; none where there are none."""
+    if len(intensities):
+        longer = np.linalg.norm(lights, axis=1)
+        intensities = (intensities * (longer[:, None] if intensities.ndim > 1 else longer)).astype(np.float32)
+    return {"light_directions": unit(lights).astype(np.float32), "intensities": intensities}
 
 
 def _slopes(normals: np.ndarray) -> np.ndarray:  # (..., 2)

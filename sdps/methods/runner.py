@@ -130,7 +130,11 @@ class Runner:
             estimate = self.flat.begin(estimate, mask, lit=lit)
         if method.refined:
             estimate = self._refine(images, mask, estimate, given, saturation, rig)
-        return estimate if estimate.tilt is None else self.flat.finish(estimate, mask, lit=lit)
+        if estimate.tilt is None:
+            return estimate
+        trust = getattr(estimate, "trust", None)  # of refined ones, whose intensities move
+        free = trust is not None and not trust.doubt and not are_near(estimate.nearness)
+        return self.flat.finish(estimate, mask, given.get("intensities") if free else None, lit=lit)
 
     def _estimate(
         self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None, rig: Rig

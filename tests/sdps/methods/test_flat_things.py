@@ -16,7 +16,15 @@ from sdps.core.estimate import Estimate
 from sdps.core.integration import integrate
 from sdps.core.metrics import direction_mae, normal_mae
 from sdps.inference.inference_config import InferenceConfig
-from sdps.methods.flat_things import Flatness, face_camera, flatten, is_flat, turn_inside_out
+from sdps.methods.flat_things import (
+    Flatness,
+    deepen,
+    face_camera,
+    find_depth,
+    flatten,
+    is_flat,
+    turn_inside_out,
+)
 from sdps.refinement.trust import _find_blindness
 
 SIDE = 96
@@ -80,6 +88,21 @@ def test_a_bowl_is_flattened_away(coin: Flat) -> None:
     hole = WHOLE.copy()
     hole[20:40, 20:40] = False
     assert not flatten(bowl * hole[..., None], hole)[~hole].any()
+
+
+def test_known_intensities_tell_the_depth(coin: Flat) -> None:
+    true = Estimate(coin.normals, coin.lights, coin.gains)
+    deep = deepen(true, WHOLE, 1.4)
+    assert normal_mae(deep.normals, coin.normals, WHOLE) > 2.0 and direction_mae(deep.light_directions, coin.lights) > 5
+    assert find_depth(deep, coin.gains) == pytest.approx(1 / 1.4, rel=0.02)
+    assert find_depth(true, coin.gains) == pytest.approx(1.0, rel=0.02)
+    tilted = replace(deep, normals=bend(deep.normals, np.array([0.02, 0.0])), tilt=1.0)
+    found = Flatness("yes").finish(tilted, WHOLE, np.repeat(coin.gains[:, None], 3, axis=1), lit=False)
+    assert normal_mae(found.normals, coin.normals, WHOLE) < 0.5 and found.tilt == 1.0
+    left = Flatness("yes").finish(tilted, WHOLE, coin.gains, lit=True)
+    assert normal_mae(left.normals, deep.normals, WHOLE) < 0.01
+    ring = unit(np.stack([np.cos(np.arange(8.0)), np.sin(np.arange(8.0)), np.ones(8)], axis=1)).astype(np.float32)
+    assert find_depth(deepen(replace(true, light_directions=ring), WHOLE, 1.4), coin.gains) == pytest.approx(1.0)
 
 
 def test_hollow_is_turned(coin: Flat) -> None:
