@@ -12,7 +12,7 @@ looks the same, but for cast shadows.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -208,7 +208,7 @@ def flatten(normals: np.ndarray, mask: np.ndarray, share: float = SHARE) -> np.n
     return found
 
 
-def _split(lights: np.ndarray, intensities: np.ndarray) -> dict[str, np.ndarray]:
+def _split(lights: np.ndarray, intensities: np.ndarray) -> dict[str, Any]:
     """Return directions, and intensities times the lengths, of lights (L, 3) that bent; none where there are none."""
     if len(intensities):
         longer = np.linalg.norm(lights, axis=1)
