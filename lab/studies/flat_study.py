@@ -8,6 +8,7 @@ two object sizes away, which bend what is found into a bowl.
 """
 
 import argparse
+import itertools
 import sys
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -38,19 +39,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--distance", type=float, default=np.inf, help="of the lamps, in object sizes")
     parser.add_argument("--depth", type=float, default=1.0, help="what heights are multiplied with")
     args = parser.parse_args(argv)
-    sys.stdout.write("kind   lights  --flat  network  refined  answer  turned  tilt\n")
+    sys.stdout.write("kind   given    --flat  network  refined  answer  turned  tilt\n")
     for kind in KINDS:
         scene = photograph(kind, args.side, args.images, distance=args.distance, depth=args.depth)
-        for lit, wish in ((False, "no"), (False, "auto"), (True, "no"), (True, "yes")):
-            sys.stdout.write(f"{kind:6s} {'given' if lit else 'none':7s} {wish:5s} {_judge(scene, lit, wish)}\n")
+        for given, wish in itertools.product(("none", "strength", "all"), ("no", "yes")):
+            sys.stdout.write(f"{kind:6s} {given:8s} {wish:5s} {_judge(scene, given, wish)}\n")
             sys.stdout.flush()
     return 0
 
 
-def _judge(scene: "Flat", lit: bool, wish: Wish) -> str:
+def _judge(scene: "Flat", given: str, wish: Wish) -> str:
     """Return degrees of the network's, refined and joined normals, and of these turned inside out; and the tilt."""
-    mask, runner = np.ones(scene.heights.shape, bool), _runner("auto", (lit, lit), None, None, None, 12, Flatness(wish))
-    lights, gains = (scene.lights, scene.gains) if lit else (None, None)
+    mask, known = np.ones(scene.heights.shape, bool), (given == "all", given != "none")
+    runner = _runner("auto", known, None, None, None, len(scene.images), Flatness(wish))
+    lights, gains = (value if there else None for value, there in zip((scene.lights, scene.gains), known, strict=True))
     found = runner.estimate(scene.images, mask, lights, gains, rig=UNKNOWN)
     assert isinstance(found, RefinedEstimate)
     turned = found.normals * np.array([-1, -1, 1], np.float32)

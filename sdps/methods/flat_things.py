@@ -30,7 +30,7 @@ _COVERS = 0.97
 """Share of the frame from which on a mask covers it."""
 _THICKEST = 0.2
 """Height, over the longer side, above which what covers the frame is not flat."""
-_LIKE, _LIKELY = 0.03, 0.3
+_LIKE, _LIKELY = 0.03, 0.4
 """How exactly intensities are known and found, and how far depth is expected to be off; natural logarithms."""
 _STEEPEST, _LEAST_Z = 0.1, 0.05
 _SMALL = 96  # pixels of the longer side where a few tell enough
@@ -154,9 +154,9 @@ def find_depth(found: Estimate, known: np.ndarray) -> float:
         known: (L,) or (L, 3) intensities, of any scale.
     """
     lights = found.light_directions.astype(np.float64) * grey(found.intensities.astype(np.float64))[:, None]
-    logs = np.linspace(-1.0, 1.0, 201)
+    logs = np.linspace(-1.5, 1.5, 301)
     across, along = np.hypot(lights[:, 0], lights[:, 1]), lights[:, 2]
-    lengths = np.hypot(across * np.exp(-logs)[:, None], along)  # (201, L)
+    lengths = np.hypot(across * np.exp(-logs)[:, None], along)  # (301, L)
     off = np.log(lengths / grey(known.astype(np.float64)))
     misfit = np.square((off - off.mean(axis=1, keepdims=True)) / _LIKE).sum(axis=1)
     return float(np.exp(logs[np.argmin(misfit + np.square(logs / _LIKELY))]))
