@@ -23,6 +23,7 @@ class Command(NamedTuple):
         stores: Whether its folders may be addresses in object storage.
         hidden: Whether it is an earlier name, which works and is not listed.
         example: One line or two that end its help.
+        starts: What is said before the module is loaded, where that takes seconds.
     """
 
     module: str
@@ -32,6 +33,7 @@ class Command(NamedTuple):
     stores: bool = False
     hidden: bool = False
     example: str = ""
+    starts: str = ""
 
 
 class Group(NamedTuple):
@@ -102,7 +104,8 @@ EVALUATE = Group("score methods on rendered scenes and real photographs, and wri
 
 COMMANDS: dict[str, Command | Group] = {
     "infer": Command("pipelines.infer", "find normals, lights and a surface in a folder of photographs",
-                     example="sdps infer photos --out out/vase\nsdps infer photos --lights lights.lp --mask mask.png"),
+                     example="sdps infer photos --out out/vase\nsdps infer photos --lights lights.lp --mask mask.png",
+                     starts="looking at the photographs"),
     "export": Command("pipelines.export_result", "write a result for other programs: normals, heights, lights",
                       example="sdps export out/vase --normals directx\nsdps export out/vase --as height,lp"),
     "app": Command("pipelines.app.app", "serve a local page for photographs, scenes and data", example="sdps app"),
@@ -147,7 +150,7 @@ GROUPS = {
     "lights": {"lights", "light-set", "intensities", "frame", "light-distance"},
     "the camera": {"focal", "principal", "pixel-size", "camera-distance"},
     "how it is solved": {"method", "methods", "refine", "discontinuities", "read-out", "light-views", "normal-views",
-                         "keep-stray-light", "lighting"},
+                         "keep-stray-light", "lighting", "flat", "flatten"},
     "which scenes": {"ids", "split", "limit", "count", "skip-missing", "shard", "retry-failed", "shapes", "materials",
                      "category", "role"},
     "what comes out": {"out", "json", "layout", "bits", "exposure", "mitsuba", "photographs", "tensorboard", "export",
@@ -239,6 +242,10 @@ def _add_commands(
         if isinstance(command, Group):
             _add_commands(child, command.commands, words[1:], f"{name} command")
         else:
+            if command.starts and len(words) > 1 and command.module not in sys.modules:
+                folder = f" in {words[1]}" if Path(words[1]).is_dir() else ""
+                sys.stdout.write(f"{command.starts}{folder}\n")
+                sys.stdout.flush()
             module = importlib.import_module(command.module)
             getattr(module, command.declare)(child)
             child.set_defaults(run=getattr(module, command.run), stores=command.stores)

@@ -14,7 +14,7 @@ result.save("out")  # the files of `sdps infer`, but for its report
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from sdps.inference.estimator import check_lights
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
+from sdps.methods.flat_things import NOT_FLAT, Flatness, Wish
 from sdps.methods.light_witness import question_lights, see_lights
 from sdps.methods.method import AFTER, FUSE, REFINE, Method
 from sdps.methods.parse import can_fuse, finish, parse, uses_networks
@@ -66,6 +67,8 @@ def infer(
     discontinuities: bool = False,
     findings: tuple[Finding, ...] | None = None,
     anyway: bool = False,
+    flat: Wish = "auto",
+    flatten: float = 0.0,
 ) -> Inference:
     """Estimate normals and lights of photographs.
 
@@ -82,6 +85,7 @@ def infer(
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
         anyway: Go on where the checks found an error. The method may still find that it cannot.
+        flat, flatten: What is done with flat things: wish and share of `sdps.methods.flat_things.Flatness`.
 
     Returns:
         Normals (H, W, 3), light directions (L, 3) and intensities (L,), and what follows from them: depth, albedo,
@@ -91,21 +95,18 @@ def infer(
         InputError: photographs that cannot be used, or a method that is not there or cannot use them, in one line.
     """
     findings = tuple(check(photos)) if findings is None else findings
-    _stop(photos, findings, anyway)
+    stop(photos, findings, anyway)
     known = photos.light_directions is not None, photos.intensities is not None
-    runner = _runner(method, known, models, config, refine, len(photos))
+    runner = _runner(method, known, models, config, refine, len(photos), Flatness(flat, flatten))
+    forecast = workload(photos, runner, discontinuities=discontinuities)
     if not anyway:
-        workload(photos, runner, discontinuities=discontinuities).check()
-    began, intensities = time.perf_counter(), photos.intensities
-    if photos.light_directions is not None:  # after what costs nothing: it reads every photograph twice
-        intensities, more = _question_lights(photos, models, config)
-        findings = (*findings, *more)
-        _stop(photos, findings, anyway)
-    rig = Rig(photos.camera, photos.light_nearness, photos.nearness_each)
-    given = photos.light_directions, intensities
-    found = runner.estimate(photos, photos.mask, *given, saturation=photos.saturation, rig=rig)
-    seconds = time.perf_counter() - began
-    return Inference(photos, runner.method.name, found, findings, runner.files, discontinuities, seconds)
+        forecast.check()
+    began = time.perf_counter()  # questioning comes after what costs nothing: it reads every photograph twice
+    intensities, more = (photos.intensities, ()) if not known[0] else ask_about_lights(photos, models, config)
+    stop(photos, findings := (*findings, *more), anyway)
+    found, name = _estimate(runner, photos, intensities), runner.method.name
+    took, findings = time.perf_counter() - began, (*findings, *_tell_flat(found, runner.flat))
+    return Inference(photos, name, found, findings, runner.files, discontinuities, took, forecast)
 
 
 def plan(
@@ -247,15 +248,19 @@ def _finder(models: str | Path | None) -> Callable[[str], Path]:
     return partial(pretrained.require, out=None if models is None else Path(models))
 
 
-def _stop(photos: Photographs, findings: tuple[Finding, ...], anyway: bool) -> None:
-    """Stop at the first grave finding, unless asked to go on."""
+def stop(photos: Photographs, findings: tuple[Finding, ...], anyway: bool) -> None:
+    """Stop at the first grave finding, unless asked to go on.
+
+    Raises:
+        InputError: that finding.
+    """
     grave = next((finding for finding in findings if finding.level == "error"), None)
     if grave is not None and not anyway:
         raise InputError(f"{photos.folder}: {grave.text} ({ANYWAY})")
 
 
-def _question_lights(
-    photos: Photographs, models: str | Path | None, config: InferenceConfig | None
+def ask_about_lights(
+    photos: Photographs, models: str | Path | None = None, config: InferenceConfig | None = None
 ) -> tuple[np.ndarray, tuple[Finding, ...]]:
     """Ask a network about lights that are given: return intensities, found where none are given, and what it says."""
     assert photos.light_directions is not None
@@ -270,9 +275,28 @@ def _question_lights(
     return intensities, (Finding(level, text),)
 
 
+def _estimate(runner: Runner, photos: Photographs, intensities: np.ndarray | None) -> Estimate:
+    """Run a method on photographs."""
+    rig = Rig(photos.camera, photos.light_nearness, photos.nearness_each)
+    given = photos.light_directions, intensities
+    return runner.estimate(photos, photos.mask, *given, saturation=photos.saturation, rig=rig)
+
+
+def _tell_flat(found: Estimate, flat: Flatness) -> Iterator[Finding]:
+    """Say what was done with a flat thing, where something was."""
+    if found.tilt is not None:
+        why = "Said to be flat" if flat.asked else "This looks like a flat thing"
+        slow = f" Slopes were flattened over {flat.share:.0%} of the width." if flat.share else ""
+        yield Finding(
+            "note",
+            f"{why}: its mean plane, {found.tilt:.0f} degrees off, was made to face the camera.{slow} If what stands "
+            "out is hollow, use --flat turned; if it is not flat, --flat no.",
+        )
+
+
 def _runner(
     method: str, known: tuple[bool, bool], models: str | Path | None, config: InferenceConfig | None,
-    refine: bool | None = False, images: int = 0,
+    refine: bool | None = False, images: int = 0, flat: Flatness = NOT_FLAT,
 ) -> Runner:  # fmt: skip
     """Return the method of an expression with its networks; `known`: light directions, intensities."""
     find = _finder(models)
@@ -280,11 +304,12 @@ def _runner(
     plain = plain if after in AFTER else method
     chosen = _adapt(_automatic(known[0], find) if plain == AUTO else plain, known, find)
     if plain != method:
-        return Runner(finish(chosen, after, find), find, config)
+        return Runner(finish(chosen, after, find), find, config, flat=flat)
     fuses = can_fuse(chosen, find)
     if refine is None:
         refine = uses_networks(chosen) and images >= (FEWEST if fuses else FEWEST_IMAGES)
-    return Runner(finish(chosen, FUSE if fuses else REFINE, find) if refine else chosen, find, config)
+    chosen = finish(chosen, FUSE if fuses else REFINE, find) if refine else chosen
+    return Runner(chosen, find, config, flat=flat)
 
 
 def _adapt(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> Method:

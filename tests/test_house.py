@@ -26,7 +26,7 @@ FOLDERS = [
     *(f"sdps.{name}" for name in (
         "core", "data", "data.resident", "models", "training", "publishing", "inference", "refinement",
         "classical.common", "classical", "methods.fusion", "methods", "photos.light_files", "photos.pictures",
-        "photos.pictures.sources", "photos.analysis.balls", "photos.analysis", "photos",
+        "photos.pictures.decoding", "photos.pictures.sources", "photos.analysis.balls", "photos.analysis", "photos",
         "surface", "surface.gloss", "surface.exports",
     )),
     "sdps",

@@ -1,6 +1,7 @@
 """Progress: bars with ETA, live on a terminal, a line now and then in a log; and shares of stages for who listens."""
 
 import itertools
+import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,12 +16,31 @@ _place = (0.0, 1.0)
 """Which part of its stage what runs now is: from where on, and how much of it."""
 _SHORT = 10.0
 """Seconds after which a stage has a bar."""
+_QUIET = 60.0
+"""Seconds between the lines of a bar in a log."""
+_MOVES = re.compile(r"\r|\x1b\[[0-9;]*[A-Za-z]")
+
+
+class _Lines:
+    """A stream for bars in a log: each state is a line of its own, without carriage returns and terminal codes."""
+
+    def write(self, text: str) -> int:
+        """Write what is left of a bar without the moves of the cursor."""
+        shown = _MOVES.sub("", text).strip()
+        if shown:
+            sys.stderr.write(f"{shown}\n")
+        return len(text)
+
+    def flush(self) -> None:
+        """Pass on what was written."""
+        sys.stderr.flush()
 
 
 def progress_bar(*args: Any, **options: Any) -> "tqdm[Any]":
-    """Return a tqdm bar; where standard error is not a terminal it prints a line every 20 seconds instead."""
+    """Return a tqdm bar; where standard error is not a terminal it prints a line a minute, and one when it is done."""
     if not sys.stderr.isatty():
-        options = {"mininterval": 20.0, "maxinterval": 20.0, "ncols": 100, "ascii": True} | options
+        quiet = {"mininterval": _QUIET, "maxinterval": _QUIET, "ncols": 100, "ascii": True, "delay": _SHORT}
+        options = quiet | options | {"file": _Lines()}
     return tqdm(*args, **options)
 
 

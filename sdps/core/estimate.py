@@ -67,6 +67,8 @@ class Estimate:
         stray_light: (L, 3) float32, taken off the images before networks saw them; None where there were none.
         exposure: Factor applied to the images for each network, `lighting` and `normals`.
         notes: What a classical method notes.
+        tilt: Degrees by which the mean plane of a flat thing was tilted before it was made to face the camera; None
+            where it was left as it was found.
     """
 
     normals: np.ndarray
@@ -81,6 +83,7 @@ class Estimate:
     stray_light: np.ndarray | None = field(default=None, kw_only=True)
     exposure: dict[str, float] = field(default_factory=dict, kw_only=True)
     notes: Notes = field(default=NO_NOTES, kw_only=True)
+    tilt: float | None = field(default=None, kw_only=True)
 
 
 def constant_estimate(count: int, mask: np.ndarray) -> Estimate:

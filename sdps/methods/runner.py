@@ -22,6 +22,7 @@ from sdps.core.metrics import score
 from sdps.inference.estimator import Estimator, default_device, load_model
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
+from sdps.methods.flat_things import NOT_FLAT, Flatness
 from sdps.methods.method import CONSTANT, NONE, VIEWS, Method
 from sdps.methods.on_box import Box
 from sdps.models.registry import TRUE_LIGHTS
@@ -53,6 +54,7 @@ class Runner:
         find: Gives the weights file of a name, or raises InputError.
         config: How networks are used; what the method itself says of its read-out and views is filled in.
         refining: How it is refined, if it is.
+        flat: What is done with flat things.
 
     Raises:
         InputError: weights that are missing, damaged, or of another role.
@@ -60,10 +62,10 @@ class Runner:
 
     def __init__(
         self, method: Method, find: Callable[[str], Path], config: InferenceConfig | None = None,
-        refining: "RefineConfig | None" = None,
+        refining: "RefineConfig | None" = None, flat: Flatness = NOT_FLAT,
     ) -> None:  # fmt: skip
         self.method, self.config = method, _fill_config(config or InferenceConfig(), method)
-        self.refining = refining
+        self.refining, self.flat = refining, flat
         self.files = {name: find(name) for name in sorted(method.models())}
 
         def model(name: str) -> "TrainedModel | None":
@@ -123,8 +125,16 @@ class Runner:
             given["lights"] = lights
         if TRUE_LIGHTS in (method.lighting, method.intensities) and intensities is not None:
             given["intensities"] = intensities
-        estimate = self._estimate(images, mask, given, found, rig)
-        return self._refine(images, mask, estimate, given, saturation, rig) if method.refined else estimate
+        estimate, lit = self._estimate(images, mask, given, found, rig), given.get("lights") is not None
+        if self.flat.applies(mask, estimate.normals, lit=lit):
+            estimate = self.flat.begin(estimate, mask, lit=lit)
+        if method.refined:
+            estimate = self._refine(images, mask, estimate, given, saturation, rig)
+        if estimate.tilt is None:
+            return estimate
+        trust = getattr(estimate, "trust", None)  # of refined ones, whose intensities move
+        free = trust is not None and not trust.doubt and not are_near(estimate.nearness)
+        return self.flat.finish(estimate, mask, given.get("intensities") if free else None, lit=lit)
 
     def _estimate(
         self, images: ImageSource, mask: np.ndarray, given: dict[str, Any], found: Found | None, rig: Rig
@@ -200,7 +210,7 @@ class Runner:
             directions_given=lit, config=self.refining, stray=self.config.stray_light, saturation=saturation,
             rig=rig, nearness=estimate.nearness,
         )  # fmt: skip
-        expected = trust(refined, mask, estimate, given=lit)
+        expected = trust(refined, mask, estimate, given=lit, level=estimate.tilt is not None)
         if not self.method.fused or expected.blind:
             return choose(estimate, refined, expected)
         # What is doubted of the normals, joining weighs pixel by pixel; refined lights are better even then.

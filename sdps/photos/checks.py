@@ -280,7 +280,9 @@ def _gamma(photos: Photographs, _: Measures) -> Iterator[Finding]:
 
 def _mask(photos: Photographs, measures: Measures) -> Iterator[Finding]:
     size = int(photos.mask.sum())
-    if photos.mask.all():
+    if photos.mask_origin == "whole frame":
+        pass  # as asked
+    elif photos.mask.all():
         yield Finding(
             "warning" if photos.mask_origin == "automatic" else "note",
             "The whole frame is taken for the object. If there is a background, draw a mask.png, white on black.",

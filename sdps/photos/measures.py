@@ -17,7 +17,7 @@ from sdps.core.intensities import colour_balance
 from sdps.photos.analysis.colours import colour_casts
 from sdps.photos.analysis.fall_off import FallOff, block_means, fall_off
 from sdps.photos.analysis.motion import Shift, Tracker, second_look
-from sdps.photos.pictures.camera_files import read_exif
+from sdps.photos.pictures.decoding.camera_files import read_exif
 from sdps.photos.reading import Photographs
 from sdps.photos.response import brightness
 

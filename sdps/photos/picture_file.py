@@ -12,7 +12,7 @@ import numpy as np
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
-from sdps.photos.pictures.decoders import DECODERS
+from sdps.photos.pictures.decoding.decoders import DECODERS
 from sdps.photos.pictures.lens import NO_LENS, Lens
 from sdps.photos.pictures.picture_kinds import NAMED, SUFFIXES, Coding, foreign_kind, name_kind, picture_kind
 from sdps.photos.pictures.profiles import read_profile

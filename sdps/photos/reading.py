@@ -44,7 +44,7 @@ class Photographs:
         bits: Per channel: 8 or 16, 32 of floating-point files (16 of half ones).
         gamma: The curve that was taken off: linear, srgb, or an exponent.
         mask: (H, W) bool, not empty; every pixel in it is finite in all pictures, but with `anyway`.
-        mask_origin: `file` or `automatic`.
+        mask_origin: `file`, `automatic`, or `whole frame` where that was asked for.
         light_directions: (L, 3) float32, unit, x right, y up, z to the camera, from the surface to the light; or None.
         intensities: (L,) or (L, 3) float32, relative; or None.
         notes: What was decided, in plain sentences.
@@ -149,12 +149,10 @@ def load(
     intensities: str | Path | None = None, frame: str = "y-up", gamma: str | float = "auto",
     names: Sequence[str] | None = None, anyway: bool = False, scale: float = 1.0, focal: str | float | None = None,
     principal: str | Sequence[float] | None = None, pixel_size: float | None = None,
-    light_distance: str | float | None = None, balls: Said | Iterable[Said] | None = None,
-    ambient: str | Path | None = None, dark: str | Path | None = None, every: int | None = None,
+    light_distance: str | float | None = None, balls: Said | Iterable[Said] | None = None, every: int | None = None,
+    ambient: str | Path | None = None, dark: str | Path | None = None, whole_frame: bool = False,
 ) -> Photographs:  # fmt: skip
     """Look through a folder of photographs of a static object under one distant light each (docs/guides/capture.md).
-
-    Every file is decoded once, one at a time, so that a damaged one is found now.
 
     Args:
         folder: Pictures of one kind and size, and what may lie with them; a ZIP of it, a film, a pose of `find_poses`.
@@ -177,18 +175,17 @@ def load(
         ambient: A picture without the lamp, subtracted at the photographs' exposure; None: those named so; `none`.
         dark: A picture with the lens covered, subtracted as well; None and `none` as for `ambient`.
         every: Of a film, take every n-th frame; None: so that about 60 are taken.
+        whole_frame: Without a mask file, all pixels are the object's, as of flat things.
 
     Raises:
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
     """
-    wanted, distance, shown_by = (
-        read_wanted(focal, principal, pixel_size),
-        read_distance(light_distance),
-        read_balls(balls, lights),
-    )
-    pose, scale, faults = only_pose(folder, every), check_scale(scale), Faults(anyway)
+    wanted, distance = read_wanted(focal, principal, pixel_size), read_distance(light_distance)
+    pose, scale, shown_by = only_pose(folder, every), check_scale(scale), read_balls(balls, lights)
     with pose.naming():
+        faults = Faults(anyway)
         listing, seen = _look(pose, names, mask, gamma, faults, scale, (ambient, dark))
+        seen = _choose_mask(seen, whole_frame)
         known = _find_lights(pose, listing, seen, lights, intensities, frame, faults)
         photos = _assemble(pose, listing, seen, known, wanted, faults, scale)
         again = partial(load, gamma=gamma, anyway=True, scale=scale, focal=focal, principal=principal)
@@ -204,6 +201,14 @@ def _look(
     listing = list_pictures(pose.folder, pose.names if names is None else names)
     mask_file = pose.mask if mask is None else Path(mask)
     return listing, survey(pose.folder, listing, gamma, mask_file, faults, scale, without_lamp)
+
+
+def _choose_mask(seen: Survey, whole_frame: bool) -> Survey:
+    """Return what was seen, with the whole frame for an automatic mask where that is asked for."""
+    if not whole_frame or seen.origin != "automatic":
+        return seen
+    notes = (*seen.notes[:-1], "the whole frame is the object")  # the last one is about the mask
+    return replace(seen, mask=np.ones_like(seen.mask), origin="whole frame", notes=notes, variation=None)
 
 
 def _find_lights(

@@ -87,7 +87,7 @@ def choose(start: Estimate, refined: Refined, expected: Trust) -> RefinedEstimat
     return RefinedEstimate(**values)
 
 
-def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = False) -> Trust:
+def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = False, level: bool = False) -> Trust:
     """Return the errors to expect of what refinement found.
 
     Args:
@@ -96,6 +96,7 @@ def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = Fa
         start: Its start; where a network predicts them, with its expected errors.
         given: The light directions were given: less is expected to be off, of lights nothing is said, and the start is
             kept for no error that is expected.
+        level: The object's mean plane faces the camera.
     """
     of_lights, moved, parts = _features(found, mask, start)
     told, plainly, values = start.expected_error is not None, [], []
@@ -105,7 +106,7 @@ def trust(found: Refined, mask: np.ndarray, start: Estimate, *, given: bool = Fa
     expected, plain = np.zeros((2, *mask.shape), np.float32)
     expected[mask], plain[mask] = np.concatenate(values), np.concatenate(plainly)
     of_start, mean = float(np.exp(moved @ START)), float(plain[mask].mean())
-    blind = _find_blindness(mask, start.normals, start.light_directions)
+    blind = _find_blindness(mask, start.normals, start.light_directions, tilted=not (given or level))
     doubt = blind or _count_images(len(found.light_directions))
     # What a network tells raises both sides, so it is left out here.
     if not doubt and not given and mean > of_start:
@@ -168,10 +169,10 @@ def _count_images(images: int) -> str:
     return f"{images} images are too few to refine with; {FEWEST_IMAGES} are needed"
 
 
-def _find_blindness(mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> str:
-    """Return why photographs such as these cannot show the shape, or nothing."""
+def _find_blindness(mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, *, tilted: bool = True) -> str:
+    """Return why photographs such as these cannot show the shape, or nothing; `tilted`: its tilt is not known."""
     if np.linalg.svd(lights, compute_uv=False)[-1] / np.sqrt(len(lights)) < _PLANE:
         return "the lights lie in one plane with the object, so photographs cannot show its shape"
-    if np.sqrt(np.square(normals[mask] - normals[mask].mean(axis=0)).sum(axis=1).mean()) < _FLAT:
+    if tilted and np.sqrt(np.square(normals[mask] - normals[mask].mean(axis=0)).sum(axis=1).mean()) < _FLAT:
         return "the object is flat, so photographs cannot show its tilt apart from the lights' directions"
     return ""

@@ -30,6 +30,7 @@ from sdps.surface.lamp_distance import Origin, describe_lamps, measure_distances
 from sdps.surface.meshing import mesh, step_of, write_mesh
 from sdps.surface.relight import Lamps, Residuals, fit_albedo, relit, residuals, trace_light
 from sdps.surface.verdict import give_verdict
+from sdps.surface.workload import Workload
 
 RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
          "grazing": (-0.85, 0.45, 0.25)}  # fmt: skip
@@ -49,6 +50,7 @@ class Inference:
         files: The weights used, by name.
         discontinuities: Depth may jump (`sdps.core.integration.integrate`).
         seconds: Time the method took.
+        forecast: What it was said to take beforehand, in seconds and memory.
     """
 
     photos: Photographs
@@ -58,6 +60,7 @@ class Inference:
     files: dict[str, Path]
     discontinuities: bool
     seconds: float
+    forecast: Workload | None = None
 
     @property
     def normals(self) -> np.ndarray:
@@ -200,6 +203,8 @@ class Inference:
                       "residual_degrees": round(self.depth.residual, 3)},
             "mesh": {"every": step_of(photos.mask)} | ({"unit": _unit(photos)} if photos.pixel_size else {}),
             "seconds": round(self.seconds, 2),
+            **({} if self.estimate.tilt is None else {"flat": {"tilt_degrees": round(self.estimate.tilt, 2)}}),
+            **({} if self.forecast is None else {"forecast": self.forecast.summary()}),
             "notes": list(photos.notes),
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
             "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},

@@ -5,6 +5,7 @@ what else runs on the machine may double them.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import ceil
@@ -21,7 +22,7 @@ from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES
 from sdps.methods.fusion.fuse import TILE_PIXELS
 from sdps.methods.on_box import estimate_bytes
 from sdps.methods.runner import Runner
-from sdps.models.base import NormalNetwork
+from sdps.models.base import FusionNetwork, NormalNetwork
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.photos import Photographs
 from sdps.refinement import refine
@@ -31,6 +32,7 @@ LIMIT = 4.0
 """GiB that an inference may take."""
 LONG = 600.0
 """Seconds from which on a smaller scale is proposed."""
+_LEAST = 0.25
 _SCALES = (0.5, 0.4, 0.3, 0.25, 0.2, 0.15, 0.1, 0.05)
 _GIB = 2.0**30
 _BASE = 0.45  # GiB: python, torch, weights, kernels
@@ -38,6 +40,8 @@ _CONVOLUTION = 0.0103
 """Seconds of the convolution where the networks' `inference_seconds` were measured."""
 _NEAR_LAMPS = 1.3
 """How many times as long refinement takes where it looks for near lamps: half of the first steps do."""
+_FILES = ("depth.npy", "mask.png", "mesh.glb", "mesh.obj", "mesh.ply", "normal.exr", "normal.npy", "normal.png",
+          "relit", "result.json")  # fmt: skip
 _DECODED = {"JPEG": 12e-9}
 _DECODED_ELSE = 45e-9  # PNG, TIFF, EXR
 
@@ -77,6 +81,9 @@ class Workload:
         seconds: By stage, about.
         gib: Most memory at once, about.
         smaller: The largest scale proposed where this takes long or much, and what that takes; else None.
+        quick: The largest scale, at least a quarter, that takes under ten minutes and fits, likewise.
+        method: Name of the method.
+        files: What `Inference.save` will write.
     """
 
     size: Size
@@ -85,6 +92,9 @@ class Workload:
     seconds: dict[str, float]
     gib: float
     smaller: "tuple[float, float, float] | None" = None
+    quick: "tuple[float, float, float] | None" = None
+    method: str = ""
+    files: tuple[str, ...] = ()
 
     @property
     def total(self) -> float:
@@ -101,6 +111,17 @@ class Workload:
             return text
         scale, seconds, gib = self.smaller
         return f"{text}; --scale {scale:g} would take about {_duration(seconds)} and {gib:.1f} GiB"
+
+    def summary(self) -> dict[str, float]:
+        """Return seconds and GiB in all, JSON ready."""
+        return {"seconds": round(self.total), "gib": round(self.gib, 2)}
+
+    def describe_stages(self) -> str:
+        """Return one line: every stage that takes five seconds or more, and how long."""
+        long = {name: seconds for name, seconds in self.seconds.items() if seconds >= 5.0}
+        rest = self.total - sum(long.values())
+        parts = [f"{name} {_duration(seconds)}" for name, seconds in long.items()]
+        return ", ".join([*parts, f"the rest {_duration(rest)}"] if rest else parts)
 
     def check(self) -> None:
         """Refuse what does not fit in memory.
@@ -132,15 +153,34 @@ def workload(photos: Photographs, runner: Runner, *, discontinuities: bool = Fal
     size = Size(float(mask.sum()), box, frame, frame / photos.scale**2, len(photos))
     kind = photos.coding.kind
     seconds, gib = _seconds(size, runner, kind, photos.scale < 1, discontinuities), _memory(size, runner)
-    smaller = None
+    smaller = quick = None
     if sum(seconds.values()) > LONG or gib > LIMIT:
-        for scale in _SCALES:
-            less = size.reduced(scale)
-            took = sum(_seconds(less, runner, kind, True, discontinuities).values())
-            smaller = (round(scale * photos.scale, 3), took, _memory(less, runner))
-            if smaller[2] <= LIMIT:
-                break
-    return Workload(size, photos.shape, photos.scale, seconds, gib, smaller)
+        less = [
+            (round(scale * photos.scale, 3), sum(_seconds(part, runner, kind, True, discontinuities).values()),
+             _memory(part, runner))
+            for scale, part in ((scale, size.reduced(scale)) for scale in _SCALES)
+        ]  # fmt: skip
+        smaller, quick = next((each for each in less if each[2] <= LIMIT), less[-1]), _choose(less)
+    files = list_files(runner)
+    return Workload(size, photos.shape, photos.scale, seconds, gib, smaller, quick, runner.method.name, files)
+
+
+def list_files(runner: Runner) -> tuple[str, ...]:
+    """Return the names of the files that `Inference.save` writes of a method, sorted."""
+    method, estimator, names = runner.method, runner.estimator, [*_FILES]
+    lit = method.normals in classical.METHODS or method.lighting or (estimator and estimator.lighting)
+    network = None if estimator is None or estimator.normals is None else estimator.normals.network
+    names += ["lights.json"] if lit else []
+    names += ["albedo.npy", "highlights.npy", "residual.npy"] if method.refined else []
+    names += ["expected-error.npy"] if method.refined or isinstance(network, FusionNetwork) else []
+    return tuple(sorted(names))
+
+
+def _choose(smaller: Sequence[tuple[float, float, float]]) -> tuple[float, float, float]:
+    """Return the largest of the scales that fit which is not long, none under a quarter for the time's sake."""
+    fit = [each for each in smaller if each[2] <= LIMIT] or [smaller[-1]]
+    gentle = [each for each in fit if each[0] >= _LEAST * smaller[0][0] / _SCALES[0]] or fit[:1]
+    return next((each for each in gentle if each[1] <= LONG), gentle[-1])
 
 
 def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuities: bool) -> dict[str, float]:

@@ -21,7 +21,7 @@ from lab.bench import bench_infer
 from lab.commands import main as lab_main
 from lab.shared.machines import HERE, kinds
 from pipelines.cli import build_parser, main
-from pipelines.infer import write_page
+from pipelines.evaluate.report.photographs_page import write_page
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.progress import report_to
@@ -192,7 +192,7 @@ def test_a_method_means_the_same_to_photographs_as_to_benchmarks(
 ) -> None:
     asked = []
 
-    def runner(*given: object) -> None:
+    def runner(*given: object, **_: object) -> None:
         asked.append(given)
         raise InputError("enough")
 

@@ -121,7 +121,7 @@ def _read_size(path: Path) -> tuple[int, int]:
         data = path.read_bytes()
         kind = picture_kind(data, path.name)
         if kind in ("RAW", "HEIC"):
-            from sdps.photos.pictures.camera_files import read_size
+            from sdps.photos.pictures.decoding.camera_files import read_size
 
             return read_size(path, data, kind)
         if head.startswith(_TIFF):

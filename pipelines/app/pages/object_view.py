@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from pipelines.app.pages.reflectance_tables import build_tables
-from pipelines.infer import depth_picture
+from pipelines.evaluate.report.photographs_page import depth_picture
 from pipelines.shared import pictures
 from render.shared.progress import stage
 from sdps.core.geometry import Capture

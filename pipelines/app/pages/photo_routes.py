@@ -28,7 +28,8 @@ from render.shared.files import atomic_path
 
 PHOTOS, PAINTED = "photos", "painted.png"
 _GAMMAS = ("auto", "linear", "srgb", "2.2")
-_SCALES = ("1", "0.5", "0.25")
+_SCALES = ("1", "0.5", "0.25", "auto")
+_FLAT = ("auto", "yes", "turned", "no")
 _TASKS = ("example", "check", "infer")
 _MOST_MASK = 32 * 2**20
 _MOST_RUNS = 20
@@ -128,7 +129,9 @@ async def start_task(request: Request) -> Response:
         run.mkdir(parents=True)
         arguments |= {"number": latest, "method": str(asked.get("method", "auto"))[:80]}
         arguments |= {key: asked.get(key) is True for key in ("refine", "anyway", "discontinuities")}
-        arguments["scale"] = float(_read_choice(asked, "scale", _SCALES))
+        scale = _read_choice(asked, "scale", _SCALES)
+        arguments["scale"] = scale if scale == "auto" else float(scale)
+        arguments["flat"] = _read_choice(asked, "flat", _FLAT)
         arguments["focal"] = str(asked.get("focal") or "")[:40]
         arguments["light_distance"] = str(asked.get("light_distance") or "auto")[:40]
     try:

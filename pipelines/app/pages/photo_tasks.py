@@ -116,15 +116,16 @@ def list_methods(lit: bool) -> list[dict[str, str]]:
 
 
 def infer(place: str, number: int, method: str, refine: bool, anyway: bool, discontinuities: bool,
-          **options: Any) -> dict[str, Any]:  # fmt: skip
+          flat: Any = "auto", scale: float | str = 1.0, **options: Any) -> dict[str, Any]:  # fmt: skip
     """Run a method, write all files of `sdps infer` and what the page shows.
 
     Args:
         place: The set's folder.
         number: Of the run.
         refine: Refine where `sdps.infer` does by default.
-        method, anyway, discontinuities: As of `sdps.infer`.
-        options: As of `check`, `scale` of `sdps.load`, `light_distance`, and `focal`: 35 mm equivalent in millimetres.
+        method, anyway, discontinuities, flat: As of `sdps.infer`.
+        scale: As of `sdps.load`, or `auto`: what takes under ten minutes.
+        options: As of `check`, `light_distance`, and `focal`: 35 mm equivalent in millimetres.
 
     Returns:
         What the page shows of the run.
@@ -133,7 +134,7 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
         InputError: as `sdps.infer`.
     """
     import sdps
-    from pipelines.infer import write_page
+    from pipelines.evaluate.report.photographs_page import write_page
 
     folder = Path(place)
     run = folder / "runs" / str(number)
@@ -141,10 +142,12 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
     shares = _INFERRING | (_REFINING if refine or method.endswith(("+refine", "+fuse")) else {})
     with share_out(shares), _shorten_paths(folder):
         stage("reading")
-        photos = _load(folder, anyway=anyway, **options)
-        result = sdps.infer(
-            photos, method, refine=None if refine else False, anyway=anyway, discontinuities=discontinuities
-        )
+        options |= {"anyway": anyway, "whole_frame": flat in ("yes", "turned")}
+        how: dict[str, Any] = {"refine": None if refine else False, "discontinuities": discontinuities}
+        photos = _load(folder, scale=1.0 if scale == "auto" else float(scale), **options)
+        if scale == "auto" and (quick := sdps.plan(photos, method, **how).quick) is not None:
+            photos = _load(folder, scale=quick[0], **options)
+        result = sdps.infer(photos, method, anyway=anyway, flat=flat, **how)
         (run / "view").mkdir(parents=True, exist_ok=True)
         shown = object_view.write(result, run / "view")
         result.save(run / "files")
@@ -175,7 +178,7 @@ def _measure_error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float
 
 def _load(
     folder: Path, *, anyway: bool, gamma: str = "auto", frame: str = "y-up", lights: bool = False, scale: float = 1.0,
-    focal: str = "", light_distance: str = "auto", balls: Sequence[str] = (),
+    focal: str = "", light_distance: str = "auto", balls: Sequence[str] = (), whole_frame: bool = False,
 ) -> Any:  # fmt: skip
     from sdps import photos
 
@@ -183,7 +186,7 @@ def _load(
     (pose,) = photos.find_poses(folder / PHOTOS, inside=folder)  # it has no folders, so there is one
     return photos.load(
         pose, mask=painted if painted.is_file() else None, lights="folder" if lights else None,
-        frame=frame, gamma=gamma, anyway=anyway, scale=scale, balls=balls,
+        frame=frame, gamma=gamma, anyway=anyway, scale=scale, balls=balls, whole_frame=whole_frame,
         light_distance=light_distance, focal=f"{focal}mm" if focal[-1:].isdigit() else focal,  # as the page asks for it
     )  # fmt: skip
 

@@ -123,6 +123,7 @@ async function infer(event) {
   const asked = { ...options(), method: $("method").value };
   for (const name of ["refine", "discontinuities", "anyway"]) asked[name] = $(name).checked;
   asked.scale = $("scale").value;
+  asked.flat = $("flat").value;
   asked.focal = $("focal").value;
   asked.light_distance = $("light-distance").value;
   try {

@@ -52,7 +52,7 @@ def test_a_stage_that_comes_again_has_a_name_of_its_own() -> None:
 
 def test_long_stages_have_a_bar_with_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setattr(progress, "_SHORT", 0.0)
-    monkeypatch.setattr(progress.sys.stderr, "isatty", lambda: True, raising=False)  # or lines come every 20 seconds
+    monkeypatch.setattr(progress.sys.stderr, "isatty", lambda: True, raising=False)  # or lines come every minute
     with bars(without=("reading",)):
         stage("reading", 1, 2)
         for number in range(3):
@@ -67,3 +67,18 @@ def test_short_stages_have_none(capsys) -> None:
         stage("normals", 1, 2)
         stage("normals", 2, 2)
     assert capsys.readouterr().err == ""
+
+
+def test_a_log_has_whole_lines_and_few_of_them(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setattr(progress, "_SHORT", 0.0)
+    monkeypatch.setattr(progress.sys.stderr, "isatty", lambda: False, raising=False)
+    with bars():
+        for number in range(200):
+            stage("normals", number + 1, 200)
+        stage("depth", 1, 1)
+    for _ in progress.progress_bar(range(50), desc="photographs"):
+        pass
+    shown = capsys.readouterr().err
+    assert "\r" not in shown and "\x1b" not in shown and "" not in shown.splitlines()
+    lines = [line for name in ("normals", "depth", "photographs") for line in shown.splitlines() if name in line]
+    assert len(lines) == len(shown.splitlines()) <= 6 and "normals: 100%" in shown

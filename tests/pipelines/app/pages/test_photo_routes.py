@@ -162,6 +162,18 @@ def test_balls_are_found_and_used(address: str, tmp_path: Path) -> None:
         )
 
 
+def test_a_flat_thing_at_a_size_that_fits(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+    asked = {"method": "factorisation", "flat": "turned", "scale": "auto"}
+    assert client.wait(client.post(f"{path}/start/infer", asked))["state"] == "done"
+    with zipfile.ZipFile(io.BytesIO(client.get(f"{path}/runs/1/download"))) as opened:
+        facts = json.loads(opened.read("result.json"))
+    assert facts["flat"]["tilt_degrees"] > 0.0 and facts["scale"] == 1.0
+    status, said = client.send("POST", f"{path}/start/infer", json.dumps({"flat": "round"}).encode())
+    assert status == 400 and "flat: must be one of auto, yes" in json.loads(said)["message"]
+
+
 def test_a_painted_mask_is_used(address: str, hills: Path) -> None:
     client = Client(address)
     path = client.new_set(hills)

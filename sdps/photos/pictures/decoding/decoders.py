@@ -19,10 +19,10 @@ from PIL import Image
 from render.shared.decoding import check_picture, check_unpacked, silence
 from render.shared.errors import InputError
 from render.shared.imaging.exr_colours import read_exr_colours
-from sdps.photos.pictures.camera_files import read_avif, read_heif, read_raw
-from sdps.photos.pictures.decoded import Decoded, read_exposure, read_orientation, repeat_grey
+from sdps.photos.pictures.decoding.camera_files import read_avif, read_heif, read_raw
+from sdps.photos.pictures.decoding.decoded import Decoded, read_exposure, read_orientation, repeat_grey
+from sdps.photos.pictures.decoding.netpbm import read_netpbm
 from sdps.photos.pictures.lens import EXIF, Lens, read_lens
-from sdps.photos.pictures.netpbm import read_netpbm
 
 _ORIENTATION = 274
 _PROFILE = 34675

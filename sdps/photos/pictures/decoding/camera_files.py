@@ -14,7 +14,7 @@ from PIL import Image, features
 
 from render.shared.decoding import check_picture, check_unpacked, silence
 from render.shared.errors import InputError
-from sdps.photos.pictures.decoded import Decoded, join_exposure, read_exposure, read_orientation, repeat_grey
+from sdps.photos.pictures.decoding.decoded import Decoded, join_exposure, read_exposure, read_orientation, repeat_grey
 from sdps.photos.pictures.lens import EXIF, read_lens
 
 _ORIENTATION = 274
