@@ -250,8 +250,10 @@ class _Look:
             touched = reduce_image((~np.isfinite(pixels).all(-1)).astype(np.float32), self.shape) > 0
             self.broken[(self.broken < 0) & touched] = len(self.kept) - 1
         if not self.masked:
-            cut = None if picture.alpha is None else replace(picture, pixels=picture.alpha)
-            self.cut.add(cut and turn_pixels(cut, self.first.orientation, self.full))
+            alpha = picture.alpha
+            if alpha is not None:
+                alpha = turn_pixels(replace(picture, pixels=alpha), self.first.orientation, self.full)
+            self.cut.add(alpha)
             self.variation.add(reduce_grey(pixels, self.gamma, self.shape))
 
     def _begin(self, name: str, picture: Picture) -> None:

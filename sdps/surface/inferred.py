@@ -180,14 +180,12 @@ class Inference:
         """Return what a reader needs to judge the result, JSON ready."""
         photos = self.photos
         facts: dict[str, Any] = {
-            "verdict": self.verdict,
-            "method": self.method,
+            "verdict": self.verdict, "method": self.method,
             "weights": {name: str(path) for name, path in self.files.items()},
             "terms": pretrained.terms(self.files.values()),
             "images": len(photos),
             "size": list(photos.shape),
-            "scale": photos.scale,
-            "bits": photos.bits,
+            "scale": photos.scale, "bits": photos.bits,
             "gamma": photos.gamma,
             "mask": photos.mask_origin,
             "mask_pixels": int(photos.mask.sum()),

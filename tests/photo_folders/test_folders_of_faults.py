@@ -92,7 +92,7 @@ ROWS = [
     Row("nothing but a mask and normals", (single("mask.png", SHADE), single("normal.png", SHOTS[0])),
         error="no pictures in it"),
     Row("a film and nothing else", (raw("MVI_0001.MP4", b"\0\0\0\x18ftypmp42" + bytes(99)),),
-        error="1 .mp4, which are not"),
+        error="MVI_0001.MP4"),
     Row("GIF files", (shots("{}.gif"),), error="6 .gif, which are not read"),
     Row("text files", (text("notes.txt", "a"), text("more.txt", "b")), error="2 .txt, which are not read"),
     Row("empty sub-folders", (lambda f: (f / "photos").mkdir(),), error="no pictures in it"),

@@ -11,7 +11,7 @@ from raw_files import dng, mosaic
 
 from sdps.photos.picture_file import orient_pixels
 
-PHONE = Path(__file__).parent.parent / "sdps/photos/pictures"
+PHONE = Path(__file__).parent.parent / "sdps/photos/pictures/decoding"
 TURNED = (SIZE[1], SIZE[0])
 LINEAR = {"gamma": "linear"}
 

@@ -115,7 +115,7 @@ ROWS = [
         error="mask.png: the mask is 40x29 pixels, the pictures are 40x32"),
     Row("an empty mask", (shots(), single("mask.png", 0 * SHADE, mode="L")), error="mask.png: the mask is empty"),
     Row("a mask in the transparency", (shots(), lambda f: cut_out_one(f / "mask.png")), **FILE),
-    Row("cut-out photographs", (cut_out,)),
+    Row("cut-out photographs", (cut_out,), **FILE),
     Row("a mask elsewhere", (shots(), single("../outline.png", SHADE, mode="L")),
         options={"mask": "{}/../outline.png"}, **FILE),
     Row("a mask that is not there", (shots(),), options={"mask": "{}/outline.png"},
