@@ -122,7 +122,7 @@ def _camera_files(folder: Path) -> None:
 
     (folder / "a.dng").write_bytes(dng((np.resize(_IMAGE, (24, 32)) * 65535).astype(np.uint16), seconds=0.1))
     for name in ("upright", "turned"):
-        heic = Path(__file__).parent.parent / f"sdps/photos/pictures/{name}.heic"
+        heic = Path(__file__).parent.parent / f"sdps/photos/pictures/decoding/{name}.heic"
         (folder / heic.name).write_bytes(heic.read_bytes())
 
 

@@ -15,8 +15,8 @@ from sdps.models.registry import MODELS, create
 from sdps.training.muon import _Muon, is_matrix, orthogonalise
 
 META = torch.device("meta")
-NORMALS = [name for name, item in MODELS.items() if item.role == "normals" and name != "frames"]
-"""`frames` works on the object's pixels alone: how many there are is a value, which this device has not."""
+NORMALS = [name for name, item in MODELS.items() if item.role == "normals" and name not in ("frames", "anylight")]
+"""`frames` and `anylight` work on the object's pixels alone: how many there are is a value, which this device has not."""
 LIGHTING = [name for name, item in MODELS.items() if item.role == "lighting"]
 
 
