@@ -16,7 +16,7 @@ from sdps.training.muon import _Muon, is_matrix, orthogonalise
 
 META = torch.device("meta")
 NORMALS = [name for name, item in MODELS.items() if item.role == "normals" and name not in ("frames", "anylight")]
-"""`frames` and `anylight` work on the object's pixels alone: how many there are is a value, which this device has not."""
+"""`frames` and `anylight` work on the pixels of the object: how many is a value, which this device has not."""
 LIGHTING = [name for name, item in MODELS.items() if item.role == "lighting"]
 
 
