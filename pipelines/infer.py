@@ -27,7 +27,7 @@ def main(args: argparse.Namespace) -> int:
         from pipelines.evaluate.self_test import photograph_bunny
 
         args.folder = photograph_bunny(args.out / "photographs")
-    if args.folder is None and Path(args.flat).is_dir():  # `--flat photographs`: a folder is no wish
+    if args.folder is None and Path(args.flat).is_dir():  # `--flat photographs`: a folder, not a choice
         args.folder, args.flat = Path(args.flat), "yes"
     if args.folder is None:
         raise InputError("name a folder of photographs, or use --self-test")

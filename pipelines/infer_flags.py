@@ -90,14 +90,14 @@ def _read_share(text: str) -> float:
     """Return a share of the width.
 
     Raises:
-        ArgumentTypeError: no number, such as the folder, which argparse gives to a flag before it.
+        ArgumentTypeError: not a number, such as the folder, which argparse gives to a flag that stands before it.
     """
     try:
         return float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number; name the folder before --flatten") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number; name the folder before --flatten") from None
 
 
 def _read_scale(text: str) -> float | str:
-    """Return a scale, or `auto`; what is no number is refused as argparse does."""
+    """Return a scale, or `auto`; anything else is refused by argparse."""
     return text if text == AUTO else float(text)

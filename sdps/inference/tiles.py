@@ -17,6 +17,7 @@ TILE_BYTES = 7 * 2**28
 PIXEL_BYTES = 2700
 """Memory a network takes per pixel, for any number of images: feature maps at full size, measured."""
 _LEAST_SIDE = 64
+_BAND_PIXELS = 2**20
 
 
 class Tile(NamedTuple):
@@ -81,3 +82,13 @@ def _cut(length: int, most: int, multiple: int) -> Iterator[slice]:
 
 def _widen(part: slice, halo: int, length: int) -> slice:
     return slice(max(part.start - halo, 0), min(part.stop + halo, length))
+
+
+def split(count: int, most: int) -> list[slice]:
+    """Return slices of `count` things, of `most` and a rest, to work on one after another."""
+    return [slice(start, min(start + most, count)) for start in range(0, count, most)]
+
+
+def split_rows(shape: tuple[int, ...]) -> list[slice]:
+    """Return the rows of a picture (H, W, ...) that are worked on at once: those with about a million pixels."""
+    return split(shape[0], max(1, _BAND_PIXELS // shape[1]))

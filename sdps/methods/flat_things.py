@@ -3,14 +3,13 @@
 Photographs under unknown lights show a surface up to z' = lambda z + mu x + nu y, with lights to match (Belhumeur,
 Kriegman and Yuille, The Bas-Relief Ambiguity, IJCV 1999). An outline resolves it; flat things have none, but their mean
 plane is known to face the camera, which gives mu and nu: the slopes' mean is taken off, and the lights follow, so that
-every picture looks as before. It is no rotation: a turned surface under turned lights is seen from elsewhere. Known
-intensities give lambda.
+every picture looks as before. This is not a rotation: a turned surface under turned lights is seen from elsewhere.
+Known intensities give lambda.
 
 What is left is whether the relief stands out or is hollow: turned inside out under lights from the opposite side it
 looks the same, but for cast shadows.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar, get_args
 
@@ -22,6 +21,7 @@ from render.shared.imaging.vectors import unit
 from sdps.core.estimate import Estimate
 from sdps.core.integration import integrate
 from sdps.core.intensities import grey
+from sdps.inference.tiles import split_rows
 
 Wish = Literal["auto", "yes", "no", "turned"]
 SHARE = 0.25
@@ -34,7 +34,6 @@ _LIKE, _LIKELY = 0.03, 0.4
 """How exactly intensities are known and found, and how far depth is expected to be off; natural logarithms."""
 _STEEPEST, _LEAST_Z = 0.1, 0.05
 _SMALL = 96  # pixels of the longer side where a few tell enough
-_PART = 2**20  # pixels worked on at once
 _Found = TypeVar("_Found", bound=Estimate)
 
 
@@ -128,11 +127,11 @@ def face_camera(found: _Found, mask: np.ndarray, *, lit: bool) -> _Found:
         The same with other normals and lights, and the tilt that was taken off.
     """
     total, count = np.zeros(2), int(mask.sum())
-    for rows in _bands(mask):
+    for rows in split_rows(mask.shape):
         total += _slopes(found.normals[rows][mask[rows]]).sum(axis=0)
     mean = total / count
     normals = np.zeros_like(found.normals)
-    for rows in _bands(mask):
+    for rows in split_rows(mask.shape):
         inside = mask[rows]
         normals[rows][inside] = _to_normals(_slopes(found.normals[rows][inside]) - mean)
     degrees = float(np.degrees(np.arctan(np.hypot(*mean))))
@@ -165,7 +164,7 @@ def find_depth(found: Estimate, known: np.ndarray) -> float:
 def deepen(found: _Found, mask: np.ndarray, factor: float) -> _Found:
     """Return the surface made deeper by a factor, under the lights that leave every picture as it was."""
     normals = np.zeros_like(found.normals)
-    for rows in _bands(mask):
+    for rows in split_rows(mask.shape):
         inside = mask[rows]
         normals[rows][inside] = _to_normals(factor * _slopes(found.normals[rows][inside]))
     lights = found.light_directions / np.array([factor, factor, 1.0])
@@ -202,7 +201,7 @@ def flatten(normals: np.ndarray, mask: np.ndarray, share: float = SHARE) -> np.n
     slow = (plane + blurred / np.maximum(weight, 1e-6)[..., None]).astype(np.float32)
     slow = cv2.resize(slow, mask.shape[::-1], interpolation=cv2.INTER_CUBIC)
     found = np.zeros((*mask.shape, 3), np.float32)
-    for part in _bands(mask):
+    for part in split_rows(mask.shape):
         some = mask[part]
         found[part][some] = _to_normals(_slopes(normals[part][some]) - slow[part][some])
     return found
@@ -230,14 +229,8 @@ def _reduce(normals: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarr
     longest = max(mask.shape)
     size = tuple(max(1, round(side * min(1.0, _SMALL / longest))) for side in mask.shape[::-1])
     slopes = np.concatenate(
-        [_slopes(normals[rows] * mask[rows][..., None]).astype(np.float32) for rows in _bands(mask)]
+        [_slopes(normals[rows] * mask[rows][..., None]).astype(np.float32) for rows in split_rows(mask.shape)]
     )
     small = cv2.resize(slopes, size, interpolation=cv2.INTER_AREA).astype(np.float64)
     share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return small / np.maximum(share, 1e-6)[..., None], share > 0.0
-
-
-def _bands(mask: np.ndarray) -> Iterator[slice]:
-    """Yield the rows of a picture (H, W) that are worked on at once."""
-    step = max(1, _PART // mask.shape[1])
-    return (slice(start, start + step) for start in range(0, len(mask), step))

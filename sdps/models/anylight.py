@@ -159,7 +159,7 @@ class AnyLightNet(CorrectedNetwork):
         return loss + criterion.shading_weight * terms["shading_loss"], terms
 
     def inference_seconds(self, images: int, pixels: float, box: float, views: int) -> float:
-        """Return about how long inference takes: every view is seen anew."""
+        """Return about how long inference takes: every view is read again from the start."""
         return views * (3.0e-6 * images * pixels + 2.0e-6 * box)
 
     def directness(self, seen: Observations) -> Tensor:

@@ -74,9 +74,12 @@ def measure(photos: Photographs) -> Measures:
     levels, peaks, saturated, tops, topped, outside = np.zeros((6, count))
     digests, settings, shifts, blocks = [], [], [], []
     tracker = Tracker(photos.mask)
-    stored = None if photos.background is None else replace(photos, background=None)
+    stored = replace(photos, background=None)
     for number in progress_bar(range(count), desc="checking", unit="picture", delay=5):
-        image = photos[number : number + 1][0]
+        image = stored[number : number + 1][0]
+        highest = image[photos.mask].max(-1)  # (Q,), clipped or not: before anything is subtracted
+        if photos.background is not None:
+            photos.background.subtract(image, photos.files[number], (slice(None), slice(None)), photos.saturation)
         stage("checks", number, count)
         grey = brightness(image)
         digests.append(hashlib.blake2b(grey.tobytes(), digest_size=16).digest())
@@ -84,8 +87,7 @@ def measure(photos: Photographs) -> Measures:
         shifts.append(tracker.add(grey))
         blocks.append(block_means(grey))
         observations[number] = image.reshape(-1, 3)[sample]
-        inside, bright = image[photos.mask], grey[photos.mask]  # (Q, 3), (Q,)
-        highest = inside.max(-1) if stored is None else stored[number : number + 1][0][photos.mask].max(-1)
+        bright = grey[photos.mask]  # (Q,)
         levels[number], peaks[number], tops[number] = np.percentile(bright, 95), bright.max(), highest.max()
         saturated[number], topped[number] = (highest >= photos.saturation).mean(), (highest >= tops[number]).mean()
         if len(pixels) < grey.size:

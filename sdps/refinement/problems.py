@@ -8,6 +8,7 @@ from torch import Tensor
 
 from render.shared.errors import InputError
 from sdps.inference.image_source import ObjectImages
+from sdps.inference.tiles import split
 from sdps.refinement.descent import Problem
 from sdps.refinement.image_model import State, build_model, find_shadows
 from sdps.refinement.sites import select_grid
@@ -70,7 +71,7 @@ def allocate(shape: tuple[int, ...]) -> np.ndarray:
 
 def split_pixels(count: int) -> list[slice]:
     """Return the slices of `count` pixels that are worked on at once."""
-    return [slice(start, min(start + _PART, count)) for start in range(0, count, _PART)]
+    return split(count, _PART)
 
 
 def estimate_log_albedo(problem: Problem, state: State) -> Tensor:  # (P, 3)

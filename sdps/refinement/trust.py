@@ -14,6 +14,7 @@ from scipy import ndimage
 from sdps.core.estimate import Estimate
 from sdps.core.geometry import are_near
 from sdps.core.metrics import angle_degrees
+from sdps.inference.tiles import split
 from sdps.refinement.image_model import Refined
 
 FEWEST_IMAGES = 8
@@ -157,7 +158,7 @@ def _features(found: Refined, mask: np.ndarray, start: Estimate) -> tuple[np.nda
         np.ones(images), np.full(images, misfit), np.full(images, count), np.full(images, spread),
         np.log(found.image_residual / residual), np.log(shifted + _STILL),
     ], axis=1)  # fmt: skip
-    parts = (slice(begin, begin + _PART) for begin in range(0, len(turned), _PART))
+    parts = split(len(turned), _PART)
     moved = np.array([1.0, misfit, np.log(turned.mean() + _STILL)])
     return of_lights, moved, (of_normals(part) for part in parts)
 

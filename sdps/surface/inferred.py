@@ -20,7 +20,7 @@ from sdps.core.estimate import Estimate
 from sdps.core.geometry import Capture, are_near
 from sdps.core.integration import Depth, integrate
 from sdps.core.metrics import angle_degrees
-from sdps.inference.tiles import release_memory
+from sdps.inference.tiles import release_memory, split_rows
 from sdps.methods import pretrained
 from sdps.methods.fusion.fuse import FusedEstimate
 from sdps.photos import Finding, Photographs, write_lights
@@ -35,7 +35,6 @@ from sdps.surface.workload import Workload
 RELIT = {"from-left": (-0.7, 0.2, 0.7), "from-right": (0.7, 0.2, 0.7), "from-above": (0.0, 0.8, 0.6),
          "grazing": (-0.85, 0.45, 0.25)}  # fmt: skip
 _RESULT = "result.json"
-_PART = 2**20  # pixels worked on at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +271,7 @@ class Inference:
         _save_array(folder / "depth.npy", self.depth.z * np.float32(size) if size else self.depth.z)
         colour = None
         if self.albedo is not None:  # for a screen, the brightest percent at white
-            colour = np.concatenate([display(self.albedo[rows] / self._brightest) for rows in _bands(mask)])
+            colour = np.concatenate([display(self.albedo[rows] / self._brightest) for rows in split_rows(mask.shape)])
         stage("meshes")
         release_memory()
         surface = mesh(self.depth, millimetres=size, colour=colour, normals=normals, every=every)
@@ -283,7 +282,7 @@ class Inference:
         release_memory()
         (folder / "relit").mkdir()
         for name in RELIT:
-            shown = [display(self.relit_view(name, (rows,))) for rows in _bands(mask)]
+            shown = [display(self.relit_view(name, (rows,))) for rows in split_rows(mask.shape)]
             write_png(folder / "relit" / f"{name}.png", np.concatenate(shown))
             stage("relit pictures", 1, 1)
         write_json(folder / _RESULT, self.summary())
@@ -351,19 +350,13 @@ def _about_refined(found: RefinedEstimate, photos: Photographs) -> dict[str, Any
 
 def _encode_normals(normals: np.ndarray) -> np.ndarray:  # (H, W, 3) uint16
     """Return normals as colours, (n + 1) / 2, a few rows at a time."""
-    parts = (normals[rows].astype(np.float64) for rows in _bands(normals[..., 0]))
+    parts = (normals[rows].astype(np.float64) for rows in split_rows(normals.shape))
     return np.concatenate([quantise((some + 1.0) / 2.0, 16) for some in parts])
-
-
-def _bands(picture: np.ndarray) -> list[slice]:
-    """Return the rows of a picture (H, W) that are worked on at once."""
-    step = max(1, _PART // picture.shape[1])
-    return [slice(start, start + step) for start in range(0, len(picture), step)]
 
 
 def _mean_angle(first: np.ndarray, second: np.ndarray, mask: np.ndarray) -> float:
     """Return the mean angle in degrees between vectors (H, W, 3) inside the mask."""
-    parts = [angle_degrees(first[rows][mask[rows]], second[rows][mask[rows]]) for rows in _bands(mask)]
+    parts = [angle_degrees(first[rows][mask[rows]], second[rows][mask[rows]]) for rows in split_rows(mask.shape)]
     return float(np.concatenate(parts).mean())
 
 

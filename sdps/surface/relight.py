@@ -19,6 +19,7 @@ from render.shared.progress import repeat, stage
 from sdps.core.geometry import Capture, reach
 from sdps.core.integration import Depth, check_normals
 from sdps.core.intensities import per_channel
+from sdps.inference.tiles import split
 
 if TYPE_CHECKING:
     from sdps.inference.image_source import ImageSource
@@ -132,7 +133,7 @@ def _fit(images: "ImageSource", mask: np.ndarray, scene: _Scene, passes: int) ->
         above, below = np.zeros((2, count, 3), np.float32)
         for part, observed in _read(images, mask):
             for light, values in zip(range(part.start, part.stop), observed, strict=True):
-                for some in _parts(count):
+                for some in split(count, _PART):
                     model = scene.shade(light, some)
                     weighted = model
                     if albedo is not None and smallest is not None:
@@ -250,7 +251,7 @@ def _sums(images: "ImageSource", mask: np.ndarray, scene: _Scene, albedo: np.nda
     wrong, power = np.zeros((2, len(images))), np.zeros((2, count))
     for part, observed in _read(images, mask):
         for number, values in zip(range(part.start, part.stop), observed, strict=True):
-            for some in _parts(count):
+            for some in split(count, _PART):
                 model = scene.shade(number, some) * inside[some]
                 off, squared = ((values[some] - model) ** 2).sum(axis=1), (values[some] ** 2).sum(axis=1)  # (p,)
                 wrong[:, number] += off.sum(dtype=np.float64), squared.sum(dtype=np.float64)
@@ -333,10 +334,6 @@ def _unit(normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return check_normals(normals, mask).astype(np.float32)
     found = [check_normals(normals[rows], mask[rows]).astype(np.float32) for rows in bands if mask[rows].any()]
     return np.concatenate(found) if found else check_normals(normals, mask).astype(np.float32)
-
-
-def _parts(count: int) -> list[slice]:
-    return [slice(start, start + _PART) for start in range(0, count, _PART)]
 
 
 def _read(images: "ImageSource", mask: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:

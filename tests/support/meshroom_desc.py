@@ -63,15 +63,12 @@ class StaticNodeSize:
 
 
 class Node:
-    """A node that runs Python; Meshroom calls `processChunk`."""
+    """A node that runs Python; Meshroom calls its `processChunk(chunk)`."""
 
     cpu, gpu, ram = Level.NORMAL, Level.NONE, Level.NORMAL
     inputs: list[Any] = []  # noqa: RUF012
     outputs: list[Any] = []  # noqa: RUF012
     size, parallelization, documentation, category = StaticNodeSize(1), None, "", "Other"
-
-    def processChunk(self, chunk):
-        raise NotImplementedError
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:

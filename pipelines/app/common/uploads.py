@@ -118,12 +118,12 @@ def _read_size(path: Path) -> tuple[int, int]:
             head = opened.read(_EXR_HEADER)
         if head.startswith(_EXR):
             return _read_exr_size(head)
-        data = path.read_bytes()
-        kind = picture_kind(data, path.name)
+        # What makes a TIFF a RAW file may stand anywhere in it; all other kinds are told by their first bytes.
+        kind = picture_kind(path.read_bytes() if head.startswith(_TIFF) else head, path.name)
         if kind in ("RAW", "HEIC"):
             from sdps.photos.pictures.decoding.camera_files import read_size
 
-            return read_size(path, data, kind)
+            return read_size(path, path.read_bytes(), kind)
         if head.startswith(_TIFF):
             import tifffile
 

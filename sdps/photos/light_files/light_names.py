@@ -144,7 +144,7 @@ def in_order(path: Path, table: Table, files: Sequence[str]) -> tuple[np.ndarray
 
 
 def _nearest(file: str, names: Sequence[str], places: Sequence[int | None]) -> str:
-    """Say which row that is no other picture's is named most like a picture."""
+    """Say which unused row has the name most like a picture's."""
     spare = {_plain(stem(name)): name for place, name in enumerate(names) if place not in places}
     found = get_close_matches(_plain(stem(file)), spare, n=1, cutoff=0.5)
     return f", and the nearest to {file} is {spare[found[0]]}" if found else ""

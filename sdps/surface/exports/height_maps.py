@@ -17,11 +17,11 @@ import numpy as np
 
 from render.shared.files import write_json
 from sdps.core.integration import STEEPEST
+from sdps.inference.tiles import split_rows
 from sdps.surface.exports.map_files import write_tiff
 from sdps.surface.exports.saved_result import SavedResult
 
 _LEVELS = 65534  # of heights in 16 bits; 0 is the background
-_ROWS = 512  # of a picture worked on at once
 
 
 def write_heights(result: SavedResult, folder: Path) -> list[Path]:
@@ -73,12 +73,11 @@ def measure_curvatures(result: SavedResult) -> tuple[np.ndarray, np.ndarray]:
     0 outside the mask, and at pixels without a neighbour in their row or column.
     """
     mean, gauss = (np.zeros(result.shape, np.float32) for _ in range(2))
-    for start in range(0, len(mean), _ROWS):
-        kept = slice(start, start + _ROWS)
-        seen = slice(max(start - 1, 0), start + _ROWS + 1)  # with the rows beside it
+    for kept in split_rows(mean.shape):
+        seen = slice(max(kept.start - 1, 0), kept.stop + 1)  # with the rows beside it
         found = _measure(result, seen)
         for whole, part in zip((mean, gauss), found, strict=True):
-            whole[kept] = part[start - seen.start :][: len(whole[kept])]
+            whole[kept] = part[kept.start - seen.start :][: len(whole[kept])]
     return mean, gauss
 
 

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from render.shared.files import write_json
 from render.shared.images import quantise
 from sdps.core.metrics import angle_degrees
+from sdps.inference.tiles import split_rows
 from sdps.surface.exports.map_files import write_picture, write_vectors
 from sdps.surface.exports.saved_result import SavedResult
 
-_ROWS = 512  # of a picture worked on at once
 _FLAT, _NOTHING = (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
 
 
@@ -79,8 +79,7 @@ def write_normals(convention: str, result: SavedResult, folder: Path) -> list[Pa
 def code_normals(normals: np.ndarray, mask: np.ndarray, convention: Convention) -> np.ndarray:  # (H, W, 3) uint16
     """Return normals (H, W, 3) as colours of 16 bits, round((n + 1) / 2 x 65535)."""
     coded = np.empty(normals.shape, np.uint16)
-    for start in range(0, len(coded), _ROWS):
-        rows = slice(start, start + _ROWS)
+    for rows in split_rows(coded.shape):
         shown = normals[rows] * np.array(convention.picture, np.float64)
         shown = np.where(mask[rows][..., None], shown, np.array(convention.background))
         coded[rows] = quantise((shown + 1.0) / 2.0, 16)

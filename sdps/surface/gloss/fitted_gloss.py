@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.shared.errors import InputError
+from sdps.inference.tiles import split
 from sdps.refinement.reflectance import evaluate_body, evaluate_factor, evaluate_lobes, measure_angles, shade
 from sdps.surface.gloss.metallic_roughness import (
     DIELECTRIC,
@@ -109,7 +110,7 @@ def fit_materials(surface: Surface) -> Materials:
     if better and np.median(plain.mean(axis=1)) < BLACKEST:
         return _all_metal(shapes, surface)
     scale *= max(1.0, float(np.percentile(plain.max(axis=1), 99)) / BRIGHTEST)
-    found = [_fit_part(shapes, apart, surface, some, scale) for some in _split(len(surface.albedo))]
+    found = [_fit_part(shapes, apart, surface, some, scale) for some in split(len(surface.albedo), _PART)]
     base, metallic, roughness = (np.concatenate(values) for values in zip(*found, strict=True))
     return Materials(base, metallic, roughness, scale)
 
@@ -129,7 +130,7 @@ def _fit_part(shapes: _Shapes, apart: _Shapes, surface: Surface, some: slice, sc
 
 def _all_metal(shapes: _Shapes, surface: Surface) -> Materials:
     """Return the materials of an object of metal, whose brightest percent is set to `BRIGHTEST`."""
-    found = [_as_metal(shapes, *_read_part(surface, some))[1:] for some in _split(len(surface.albedo))]
+    found = [_as_metal(shapes, *_read_part(surface, some))[1:] for some in split(len(surface.albedo), _PART)]
     roughness, reflected = (np.concatenate(values).astype(np.float32) for values in zip(*found, strict=True))
     scale = max(float(np.percentile(reflected, 99)), 1e-9) / BRIGHTEST
     colour = (surface.gains / surface.gains.max() / scale).astype(np.float32)
@@ -139,10 +140,6 @@ def _all_metal(shapes: _Shapes, surface: Surface) -> Materials:
 def _read_part(surface: Surface, some: slice) -> tuple[np.ndarray, np.ndarray]:
     """Return the grey albedo and the strength of some pixels, float64."""
     return surface.albedo[some].mean(axis=1, dtype=np.float64), surface.strength[some].astype(np.float64)
-
-
-def _split(count: int) -> list[slice]:
-    return [slice(start, start + _PART) for start in range(0, count, _PART)]
 
 
 def _sample(surface: Surface) -> _Shapes:
@@ -209,7 +206,7 @@ def match_photographs(found: Materials, surface: Surface, normals: np.ndarray, l
         lights: (L, 3) unit, from the surface to the light.
     """
     lights = lights[:: -(-len(lights) // _MOST_LIGHTS)]
-    parts = [_match_part(found, surface, normals, lights, some) for some in _split(len(normals))]
+    parts = [_match_part(found, surface, normals, lights, some) for some in split(len(normals), _PART)]
     base, scale = np.concatenate(parts), found.scale
     if found.metallic.all():
         share = max(float(np.percentile(base.max(axis=1), 99)), 1e-9) / BRIGHTEST

@@ -18,6 +18,7 @@ import numpy as np
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
 from render.shared.imaging.srgb import to_srgb
+from sdps.inference.tiles import split
 
 POLYNOMIAL = 6
 """Numbers of a pixel in a `.ptm`; as many lights are needed."""
@@ -72,7 +73,7 @@ def fit_pictures(pictures: Iterable[np.ndarray], basis: np.ndarray) -> np.ndarra
     found = None
     for number, picture in enumerate(pictures):
         found = np.zeros((terms, *picture.shape), np.float32) if found is None else found
-        for some in _split(len(picture)):
+        for some in split(len(picture), _PART):
             shown = to_srgb(picture[some].astype(np.float32, copy=False))
             for term in range(terms):
                 found[term, some] += solution[term, number] * shown
@@ -110,7 +111,7 @@ def write_ptm(path: str | Path, numbers: np.ndarray, mask: np.ndarray) -> None:
         mask: (H, W) bool.
     """
     colour, grey = np.empty_like(numbers[0]), np.empty(numbers.shape[:2], np.float32)  # (n, 3), (6, n)
-    for some in _split(len(colour)):
+    for some in split(len(colour), _PART):
         mean = np.maximum(_mean_shown(numbers[:, some]), 1e-6)
         colour[some] = mean / mean.max(axis=1, keepdims=True)
         grey[:, some] = _FULL * (numbers[:, some] * colour[some]).sum(axis=2) / (colour[some] ** 2).sum(axis=1)
@@ -123,7 +124,7 @@ def write_ptm(path: str | Path, numbers: np.ndarray, mask: np.ndarray) -> None:
     whole = np.zeros((*mask.shape, 9), np.uint8)
     whole[..., :6] = bias.astype(np.uint8)
     places, flat = np.flatnonzero(mask), whole.reshape(-1, 9)
-    for some in _split(len(places)):
+    for some in split(len(places), _PART):
         flat[places[some], :POLYNOMIAL] = _to_bytes(grey[:, some].T / scale + bias)
         flat[places[some], POLYNOMIAL:] = _to_bytes(_FULL * colour[some])
     _write(path, head.encode(), whole[::-1, :, :POLYNOMIAL], whole[::-1, :, POLYNOMIAL:])
@@ -144,7 +145,7 @@ def write_rti(path: str | Path, numbers: np.ndarray, mask: np.ndarray) -> None:
     zero = _to_bytes(-_FULL * bias / scale)
     whole = np.broadcast_to(zero, (*mask.shape, 3, terms)).copy()
     places, flat = np.flatnonzero(mask), whole.reshape(-1, 3, terms)
-    for some in _split(len(places)):
+    for some in split(len(places), _PART):
         flat[places[some]] = _to_bytes(_FULL * (np.moveaxis(numbers[:, some], 0, -1) - bias) / scale)
     _write(path, head, scale, bias, whole)
 
@@ -173,7 +174,3 @@ def _write(path: str | Path, head: bytes, *parts: np.ndarray) -> None:
 
 def _to_bytes(values: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
-
-
-def _split(count: int) -> list[slice]:
-    return [slice(start, start + _PART) for start in range(0, count, _PART)]

@@ -122,7 +122,7 @@ def _overlap(one: Sphere, other: Sphere) -> bool:
 
 
 def _verify(view: BallView, kind: str) -> BallRays | None:
-    """Return what a ball says of the lights; None of what is no ball."""
+    """Return what a ball says of the lights; None if it is not a ball."""
     if kind != CHROME and np.mean(view.shaded[1] >= _MATT) >= _SHOWN:
         rays = trace_rays(view, WHITE)
         return rays if rays.share >= _SHOWN else None

@@ -19,7 +19,7 @@ _SMALL, _SLOPE = 40, 0.1  # pixels of a highlight whose slopes count, and the pa
 _NOISE = 8.0  # standard deviations
 _SECOND = 0.5  # light of a second highlight over that of the first, from which on neither can be believed
 _APART = 0.05  # radii between highlights that are not one
-_LARGE = 0.15  # share of the ball above which it is no highlight of a lamp
+_LARGE = 0.15  # share of the ball above which it is not the highlight of a lamp
 _RIM = 0.97  # radii
 
 MISSING = "no highlight of a lamp on the ball"

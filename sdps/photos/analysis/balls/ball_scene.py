@@ -118,7 +118,7 @@ def see_balls(scene: Scene, wanted: Sequence[WantedBall], alone: bool = False) -
         alone: Nothing but balls is in the pictures, and a mask is of one.
 
     Raises:
-        InputError: a circle outside the pictures, or one that is no ball; no ball where one was to be found.
+        InputError: a circle outside the pictures, or one that is not a ball; no ball where one was to be found.
     """
     named, found = [ball for ball in wanted if ball.circle is not None], []
     given = [(_place(scene, ball), ball) for ball in named]

@@ -1,6 +1,6 @@
-"""What cameras and phones write: RAW by LibRaw (rawpy), HEIC by libheif (pi-heif), AVIF by Pillow.
+"""What cameras and phones write: RAW by LibRaw (rawpy), HEIC by libheif (pi-heif).
 
-The first two are optional packages. pillow-heif, the better known wrapper of libheif, is not used: its wheels hold
+Both are optional packages. pillow-heif, the better known wrapper of libheif, is not used: its wheels hold
 x265, which is under the GPL.
 """
 
@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, features
+from PIL import Image
 
-from render.shared.decoding import check_picture, check_unpacked, silence
+from render.shared.decoding import check_unpacked, silence
 from render.shared.errors import InputError
-from sdps.photos.pictures.decoding.decoded import Decoded, join_exposure, read_exposure, read_orientation, repeat_grey
+from sdps.photos.pictures.decoding.decoded import Decoded, join_exposure, read_taken, repeat_grey
 from sdps.photos.pictures.lens import EXIF, read_lens
 
-_ORIENTATION = 274
 _TURNS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
 """EXIF orientation by LibRaw's flip (1: left-right, 2: top-bottom, 4: transposed)."""
 _ANGLES = {0: 1, 1: 8, 2: 3, 3: 6}
@@ -88,7 +87,7 @@ def read_heif(path: Path, data: bytes) -> Decoded:
         pixels, alpha = _turn_back(pixels, turned), None if alpha is None else _turn_back(alpha, turned)
     exif = Image.Exif()
     exif.load(picture.info.get("exif") or b"")
-    lens, exposure = read_lens(lambda: exif.get_ifd(EXIF)), read_exposure(lambda: exif.get_ifd(EXIF))
+    lens, exposure = read_taken(lambda: exif.get_ifd(EXIF))
     return Decoded(repeat_grey(pixels), alpha, 16 if wide else 8, profile or None, turned, "", lens, exposure)
 
 
@@ -159,24 +158,6 @@ def _find_turn(data: bytes) -> int:
 def _turn_back(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Undo a rotation by 90, 180 or 270 degrees."""
     return np.ascontiguousarray(np.rot90(pixels, {6: 1, 3: 2, 8: 3}[orientation]))
-
-
-def read_avif(path: Path, data: bytes) -> Decoded:
-    """Decode an AVIF picture to 8 bits.
-
-    Raises:
-        InputError: Pillow has no decoder for it. Pillow's errors pass.
-    """
-    if not features.check("avif"):
-        raise InputError(f"{path}: is an AVIF picture, which this Pillow cannot read: pip install 'pillow>=11.3'")
-    with Image.open(io.BytesIO(data), formats=["AVIF"]) as picture:
-        check_picture(path, picture, data)
-        exif = picture.getexif()
-        tag, profile = exif.get(_ORIENTATION, 1), picture.info.get("icc_profile")
-        lens, exposure = read_lens(lambda: exif.get_ifd(EXIF)), read_exposure(lambda: exif.get_ifd(EXIF))
-        alpha = np.asarray(picture.getchannel("A")) if "A" in picture.getbands() else None
-        pixels = np.asarray(picture.convert("RGB"))
-    return Decoded(pixels, alpha, 8, profile, read_orientation(tag), "", lens, exposure)
 
 
 def read_size(path: Path, data: bytes, kind: str) -> tuple[int, int]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sdps.photos.pictures.lens import NO_LENS, Lens
+from sdps.photos.pictures.lens import NO_LENS, Lens, read_lens
 
 _TIME, _APERTURE, _ISO = (33434, "ExposureTime"), (33437, "FNumber"), (34855, "ISOSpeedRatings")
 
@@ -44,6 +44,11 @@ def read_exposure(tags: Callable[[], Mapping[Any, Any]]) -> float:
         return join_exposure(time, aperture, iso)
     except Exception:  # damaged in one of many ways
         return 0.0
+
+
+def read_taken(tags: Callable[[], Mapping[Any, Any]]) -> tuple[Lens, float]:
+    """Return what the EXIF directory which `tags` reads says of the lens, and the exposure."""
+    return read_lens(tags), read_exposure(tags)
 
 
 def join_exposure(time: float, aperture: float, iso: float) -> float:

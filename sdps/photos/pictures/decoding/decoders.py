@@ -1,8 +1,8 @@
 """Decoders of every kind of picture file, each at the file's own depth.
 
 OpenCV reads PNG and TIFF, since Pillow reduces 16-bit RGB to 8 bits; Pillow reads JPEG, since OpenCV fills what a
-truncated file lacks with grey and says nothing, and BMP, TGA and WebP; OpenEXR reads EXR. `camera_files.py` reads RAW,
-HEIC and AVIF.
+truncated file lacks with grey and says nothing, and BMP, TGA, WebP and AVIF; OpenEXR reads EXR. `camera_files.py` reads
+RAW and HEIC.
 """
 
 import io
@@ -14,15 +14,15 @@ from typing import Any
 import cv2
 import numpy as np
 import tifffile
-from PIL import Image
+from PIL import Image, features
 
 from render.shared.decoding import check_picture, check_unpacked, silence
 from render.shared.errors import InputError
 from render.shared.imaging.exr_colours import read_exr_colours
-from sdps.photos.pictures.decoding.camera_files import read_avif, read_heif, read_raw
-from sdps.photos.pictures.decoding.decoded import Decoded, read_exposure, read_orientation, repeat_grey
+from sdps.photos.pictures.decoding.camera_files import read_heif, read_raw
+from sdps.photos.pictures.decoding.decoded import Decoded, read_orientation, read_taken, repeat_grey
 from sdps.photos.pictures.decoding.netpbm import read_netpbm
-from sdps.photos.pictures.lens import EXIF, Lens, read_lens
+from sdps.photos.pictures.lens import EXIF, Lens
 
 _ORIENTATION = 274
 _PROFILE = 34675
@@ -39,7 +39,7 @@ def _png(path: Path, data: bytes) -> Decoded:
         profile, exif = picture.info.get("icc_profile"), Image.Exif()
         exif.load(picture.info.get("exif", b""))  # not getexif(), which decodes the pixels
         picture.verify()  # its checksums; libpng would print
-    said = read_lens(lambda: exif.get_ifd(EXIF)), read_exposure(lambda: exif.get_ifd(EXIF))
+    said = read_taken(lambda: exif.get_ifd(EXIF))
     return _by_opencv(path, _only_pixels(data), "PNG", profile, exif.get(_ORIENTATION, 1), *said)
 
 
@@ -64,7 +64,7 @@ def _tiff(path: Path, data: bytes | bytearray) -> Decoded:
         profile = bytes(tags[_PROFILE].value) if _PROFILE in tags else None
         orientation = int(tags[_ORIENTATION].value) if _ORIENTATION in tags else 1
         exif = tags[EXIF].value if EXIF in tags else {}
-        said = read_lens(lambda: exif), read_exposure(lambda: exif)
+        said = read_taken(lambda: exif)
         _refuse_colours(path, page)
         if page.dtype in _BY_TIFFFILE or (page.planarconfig == _PLANES and page.samplesperpixel > 1):
             pixels = _read_page(path, page)
@@ -78,7 +78,7 @@ def _tiff(path: Path, data: bytes | bytearray) -> Decoded:
 
 
 def _refuse_colours(path: Path, page: Any) -> None:
-    """Refuse a TIFF whose values are no amounts of red, green and blue, nor known to be turned into some."""
+    """Refuse a TIFF whose values are not red, green and blue and are not converted to them."""
     kind = int(page.photometric)
     converted = kind == _INKS and page.bitspersample == 8 and page.planarconfig != _PLANES
     what = "" if converted else _COLOURS.get(kind, "")
@@ -133,13 +133,19 @@ def _by_pillow(*formats: str) -> Callable[[Path, bytes], Decoded]:
             check_picture(path, picture, data)
             profile, orientation = picture.info.get("icc_profile"), picture.getexif().get(_ORIENTATION, 1)
             exif, alpha = picture.getexif(), None
-            lens, exposure = read_lens(lambda: exif.get_ifd(EXIF)), read_exposure(lambda: exif.get_ifd(EXIF))
+            lens, exposure = read_taken(lambda: exif.get_ifd(EXIF))
             if "A" in picture.getbands() or "transparency" in picture.info:
                 alpha = np.asarray(picture.convert("RGBA"))[..., 3]
             pixels = np.asarray(picture.convert("RGB"))
         return Decoded(pixels, alpha, 8, profile, read_orientation(orientation), "", lens, exposure)
 
     return decode
+
+
+def _avif(path: Path, data: bytes) -> Decoded:
+    if not features.check("avif"):
+        raise InputError(f"{path}: is an AVIF picture, which this Pillow cannot read: pip install 'pillow>=11.3'")
+    return _by_pillow("AVIF")(path, data)
 
 
 def _exr(path: Path, data: bytes) -> Decoded:
@@ -155,6 +161,6 @@ def _pnm(path: Path, data: bytes) -> Decoded:
 
 DECODERS: dict[str, Callable[[Path, bytes], Decoded]] = {
     "PNG": _png, "TIFF": _tiff, "EXR": _exr, "PNM": _pnm, "JPEG": _by_pillow("JPEG", "MPO"), "BMP": _by_pillow("BMP"),
-    "TGA": _by_pillow("TGA"), "WebP": _by_pillow("WEBP"), "RAW": read_raw, "HEIC": read_heif, "AVIF": read_avif,
+    "TGA": _by_pillow("TGA"), "WebP": _by_pillow("WEBP"), "RAW": read_raw, "HEIC": read_heif, "AVIF": _avif,
 }  # fmt: skip
 """By kind, from a path for messages and the whole file; all raise InputError or their library's own errors."""

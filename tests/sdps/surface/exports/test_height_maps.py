@@ -11,7 +11,7 @@ from saved_results import save_result, sphere
 
 from render.shared.files import read_json
 from sdps.core.geometry import ORTHOGRAPHIC, Camera
-from sdps.surface.exports import height_maps
+from sdps.inference import tiles
 from sdps.surface.exports.height_maps import measure_curvatures
 from sdps.surface.exports.registry import write_exports
 from sdps.surface.exports.saved_result import SavedResult
@@ -29,7 +29,7 @@ def middle_of(result: SavedResult) -> np.ndarray:
 def test_a_ball_has_the_curvature_of_its_radius(
     tmp_path: Path, camera: Camera, size: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(height_maps, "_ROWS", 10)  # several parts
+    monkeypatch.setattr(tiles, "_BAND_PIXELS", 10 * 61)  # several parts, of ten rows
     result = save_result(tmp_path, sphere(camera=camera), camera=camera, pixel_size=size)
     mean, gauss = measure_curvatures(result)
     inside, radius = middle_of(result), RADIUS * (size or 1.0)
