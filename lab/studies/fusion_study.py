@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--images", type=int, nargs="+", default=[0], help="of each scene (default: all)")
     parser.add_argument("--lights", action="store_true", help="lights are given")
     parser.add_argument("--every", type=int, default=1, help="take every so many scenes")
+    parser.add_argument("--part", default="0/1", metavar="K/N", help="of these every N-th, from the K-th on")
     parser.add_argument("--merltest", type=Path, help="folder with the scenes of `sdps evaluate merltest`")
     parser.add_argument("--method", default="", help="such as lightset+frames+refine")
     parser.add_argument("--models", type=Path, help="folder of runs")
@@ -42,10 +43,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     find = finder(args.models)
     method = args.method or ("true+frames+refine" if args.lights else "sdps-frames+refine")
     runner = Runner(parse(method, find), find, InferenceConfig(light_views=8, normal_views=8))
+    first, parts = (int(word) for word in args.part.split("/"))
     groups = {}
     for images in args.images:
         place = args.out / f"{method}-{images or 'all'}{'-merltest' if args.merltest else ''}"
-        for number, spec in tqdm(list(enumerate(read_manifest(folder)))[:: args.every], disable=None):
+        for number, spec in tqdm(list(enumerate(read_manifest(folder)))[:: args.every][first::parts], disable=None):
             file = place / f"{spec.id.replace('/', '_')}.npz"
             if file.exists():
                 continue

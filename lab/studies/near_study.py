@@ -1,11 +1,12 @@
 """How near lamps and perspective change the answers: rendered scenes at several distances and focal lengths.
 
-    python -m lab.studies.near_study out/near --quick
+    python -m lab.studies.near_study out/near --every 5
     python -m lab.studies.near_study out/near
 
-Every scene is answered by the network, by refinement that takes lamps for distant and cameras for orthographic, and by
-refinement that is given the focal length and finds how near the lamps stand. Scenes and answers are kept in the folder,
-so that a run that was stopped goes on. Light directions count from the mean of the pixels that are seen, as everywhere.
+Every scene is answered by the network, by refinement that takes lamps for distant and cameras for orthographic, by
+refinement that is given the focal length and finds how near the lamps stand, and by the joined answer of the last.
+Answers are kept in the folder, so that a run that was stopped goes on. Light directions count from the mean of the
+pixels that are seen, as everywhere.
 """
 
 import argparse
@@ -17,13 +18,19 @@ from pathlib import Path
 
 import numpy as np
 
+from lab.shared.answered_scenes import answer
 from pipelines.shared.text_tables import render_text
 from render.api import render_views
 from render.planning.light_sets import draw
-from sdps.api import estimate
 from sdps.core.geometry import Camera, Rig
 from sdps.core.metrics import angle_degrees
 from sdps.data.sample_geometry import lay_out, place
+from sdps.inference.inference_config import InferenceConfig
+from sdps.methods.fusion.evidence import find_place
+from sdps.methods.fusion.fuse import join, load_fusion
+from sdps.methods.parse import parse
+from sdps.methods.pretrained import finder
+from sdps.methods.runner import Runner
 from sdps.refinement.refine import RefineConfig, refine
 
 SHAPES = ("sphere", "bunny", "sculpture:990011", "sculpture:990012", "blobby:990013", "composition:990014")
@@ -38,7 +45,7 @@ _QUICK = RefineConfig(coarse_pixels=1400, iterations=500, iterations_before=300,
 
 @dataclass(frozen=True)
 class Row:
-    """Degrees of normals and of lights, by the network, with lamps taken for distant, and with lamps found."""
+    """Degrees of normals and of lights, by the network, with lamps taken for distant, with lamps found, and joined."""
 
     shape: str
     material: str
@@ -47,6 +54,7 @@ class Row:
     start: tuple[float, float]
     distant: tuple[float, float]
     near: tuple[float, float]
+    joined: tuple[float, float]
     nearness: float
     found: float
 
@@ -62,8 +70,8 @@ def settings(every: int) -> Iterator[tuple[str, str, float, float]]:
             yield shape, material, distance, focal
 
 
-def measure(shape: str, material: str, distance: float, focal: float) -> Row:
-    """Render a scene and answer it."""
+def measure(runner: Runner, shape: str, material: str, distance: float, focal: float) -> Row:
+    """Render a scene and answer it; the runner's method ends in `+refine`."""
     lens = None if np.isinf(focal) else focal / _HALF_FRAME
     lights = draw("hand-held", _LAMPS, np.random.default_rng(5))
     size = _SCALE if lens is None else min(_SCALE, lens / 2)  # a camera stands two radii away at least
@@ -75,22 +83,21 @@ def measure(shape: str, material: str, distance: float, focal: float) -> Row:
     images = np.asarray(view.images, np.float32)
     layout = lay_out(view.scene, np.asarray(view.depth), mask, np.arange(_LAMPS))
     placed = place(layout, mask, view.scene.light_directions())
-    begun = estimate(images, mask, "sdps-frames")
 
     def score(normals: np.ndarray, directions: np.ndarray) -> tuple[float, float]:
         off = angle_degrees(normals[mask], truth[mask]).mean(), angle_degrees(directions, placed.directions).mean()
         return round(float(off[0]), 3), round(float(off[1]), 3)
 
     camera = Camera() if lens is None else Camera(lens * _SIDE / 2)
-    answers = [
-        refine(images, mask, begun.normals, begun.light_directions, begun.intensities, config=_QUICK, rig=rig)
-        for rig in (Rig(nearness=np.zeros(_LAMPS)), Rig(camera))
-    ]
-    distant, near = (score(answer.normals, answer.light_directions) for answer in answers)
-    return Row(
-        shape, material, distance, focal, score(begun.normals, begun.light_directions), distant, near,
-        float(placed.nearness.mean()), float(answers[1].nearness.mean()),
-    )  # fmt: skip
+    answered, evidence = answer(runner, images, mask, None, None, rig=Rig(camera))
+    begun, near, joined = answered.start, answered.refined, answered.refined.normals.copy()
+    if evidence is not None:
+        joined[find_place(mask)] = join(evidence, load_fusion())[0]
+    start = begun.normals, begun.light_directions, begun.intensities
+    distant = refine(images, mask, *start, config=_QUICK, rig=Rig(nearness=np.zeros(_LAMPS)))
+    answers = [(each.normals, each.light_directions) for each in (begun, distant, near)]
+    scores = [score(*each) for each in (*answers, (joined, near.light_directions))]
+    return Row(shape, material, distance, focal, *scores, float(placed.nearness.mean()), float(near.nearness.mean()))
 
 
 def summarise(rows: Sequence[Row]) -> str:
@@ -99,13 +106,13 @@ def summarise(rows: Sequence[Row]) -> str:
     for key in sorted({(row.focal, row.distance) for row in rows}, reverse=True):
         some = [row for row in rows if (row.focal, row.distance) == key]
         cells = [" / ".join(f"{np.mean([getattr(row, name)[k] for row in some]):.2f}" for k in (0, 1))
-                 for name in ("start", "distant", "near")]  # fmt: skip
+                 for name in ("start", "distant", "near", "joined")]  # fmt: skip
         close = [abs(row.found / row.nearness - 1) <= 0.1 for row in some if row.nearness]
         found = f"{np.mean([row.found for row in some]):.3f}"
         told = f"{np.mean([row.nearness for row in some]):.3f}"
         share = f"{sum(close)} of {len(close)}" if close else "-"
         lines.append([f"{key[1]:g}", f"{key[0]:g}", str(len(some)), *cells, told, found, share])
-    head = ["distance", "focal mm", "scenes", "network", "distant", "near", "rho", "found", "within 10 %"]
+    head = ["distance", "focal mm", "scenes", "network", "distant", "near", "joined", "rho", "found", "within 10 %"]
     return render_text("Normals / lights, degrees", head, lines)
 
 
@@ -113,16 +120,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print a line for every scene, and the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--quick", action="store_true", help="every eighth pair of shape and material")
+    parser.add_argument("--every", type=int, default=1, help="take every so many pairs of shape and material")
+    parser.add_argument("--part", default="0/1", metavar="K/N", help="every N-th scene, from the K-th on")
     args = parser.parse_args(arguments)
     args.out.mkdir(parents=True, exist_ok=True)
     file = args.out / "rows.jsonl"
     lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
     kept = {tuple(row[:4]): Row(*row) for row in map(json.loads, lines)}
-    wanted = list(settings(8 if args.quick else 1))
+    first, parts = (int(word) for word in args.part.split("/"))
+    wanted, find = list(settings(args.every))[first::parts], finder(None)
+    views = InferenceConfig(light_views=8, normal_views=8)
+    runner = Runner(parse("sdps-frames+refine", find), find, views, _QUICK)
     for number, setting in enumerate(wanted, start=1):
         if setting not in kept:
-            kept[setting] = measure(*setting)
+            kept[setting] = measure(runner, *setting)
             with file.open("a", encoding="utf-8") as out:
                 out.write(json.dumps(list(asdict(kept[setting]).values())) + "\n")
         sys.stdout.write(f"{number} of {len(wanted)}: {kept[setting]}\n")
