@@ -20,6 +20,7 @@ from render.exchange.layouts.foreign_samples import Source
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.images import bit_depth, read_image, to_unit
+from render.shared.seeds import generator
 from sdps.core.geometry import Camera
 from sdps.inference.inference_config import inference_config
 from sdps.methods import select
@@ -49,12 +50,14 @@ class DiligentConfig:
         bits: 16 reads the PNGs exactly; 8 keeps the high byte, which is all that the published results of SDPS-Net saw.
         bear: Images of bear: 96, as in the paper, or 76 without the first 20.
         margin: Pixels kept around the mask's bounding box; sides are then rounded up to multiples of 4.
+        images: So many of each object, drawn by chance, the same in every run; 0: all.
         focal: Focal length in pixels, the benchmark's about 3772; 0: taken for orthographic. The principal point is the
             middle of the files' pictures.
     """
 
     bits: int = 8
     bear: int = 96
+    images: int = 0
     margin: int = MARGIN
     focal: float = 0.0
 
@@ -63,6 +66,8 @@ class DiligentConfig:
             raise InputError(f"bits must be 8 or 16, got {self.bits}")
         if self.bear not in (76, 96):
             raise InputError(f"bear must be 96 or 76, got {self.bear}")
+        if self.images < 0:
+            raise InputError(f"images must be a number of images, or 0 for all, got {self.images}")
         if self.focal < 0:
             raise InputError(f"focal must be a length in pixels, or 0 for an orthographic camera, got {self.focal:g}")
         if self.margin < 0:
@@ -71,12 +76,13 @@ class DiligentConfig:
     def describe(self) -> str:
         """Say in words how images are read."""
         depth = "16 bits" if self.bits == 16 else "8 bits (the high byte of 16-bit files)"
+        some = f"; {self.images} images of each object, drawn by chance" if self.images else ""
         lens = f"; focal length {self.focal:g} px" if self.focal else ""
         bear = "bear with all 96 images" if self.bear == 96 else "bear without its first 20 images (76)"
         return (
             f"{depth}; cropped to the mask's box with {self.margin} pixels of margin, sides multiples of 4; images "
             "divided by full scale, times the mask, not divided by the known intensities (methods that are given the "
-            f"lights get the file's directions and intensities); {bear}{lens}"
+            f"lights get the file's directions and intensities); {bear}{some}{lens}"
         )
 
 
@@ -87,6 +93,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="16: the PNGs exactly; 8: their high byte, as published (default: 8)")  # fmt: skip
     parser.add_argument("--bear", type=int, default=96, choices=(96, 76),
                         help="images of bear; 76 drops the corrupted first 20 (default: 96, as the paper)")  # fmt: skip
+    parser.add_argument("--images", type=int, default=0, metavar="N",
+                        help="N images of each object, drawn by chance, the same every time (default: all)")  # fmt: skip
     parser.add_argument("--focal", type=float, default=0.0, metavar="PX",
                         help="focal length in pixels, 3772 of its camera (default: orthographic)")  # fmt: skip
 
@@ -98,7 +106,8 @@ def main(args: argparse.Namespace) -> int:
     chosen = chosen or select.every_method(select.runs_folder(args.models), inference_config(args))
     return suite.evaluate(
         DILIGENT, args, items, chosen, text=describe(items, config), protocol=to_plain(config),
-        command=f"sdps evaluate diligent {args.data} --bits {args.bits} --bear {args.bear}",
+        command=f"sdps evaluate diligent {args.data} --bits {args.bits} --bear {args.bear}"
+        + (f" --images {args.images}" if args.images else "") + (f" --focal {args.focal:g}" if args.focal else ""),
     )  # fmt: skip
 
 
@@ -139,12 +148,18 @@ def _object(source: Source, config: DiligentConfig) -> TestObject:
     drop = _BEAR_CORRUPT if source.shape == "bear" and config.bear == 76 else 0
     if drop >= len(source.images):
         raise InputError(f"{source.folder}: {len(source.images)} images, --bear 76 drops the first {drop}")
-    files = [source.folder / name for name in source.images[drop:]]
+    taken = np.arange(drop, len(source.images))
+    if config.images > len(taken):
+        raise InputError(f"{source.folder}: {len(taken)} images, --images wants {config.images}")
+    if config.images:
+        taken = np.sort(generator(0, source.shape, "images").permutation(taken)[: config.images])
+    files = [source.folder / source.images[number] for number in taken]
+    extra = [value for value in (config.images, config.focal) if value]
     return build_object(
         source.shape, Images.of_files(files, lambda path: _read(path, config.bits)), truth.mask,
-        source.directions[drop:], source.intensities[drop:], normals=truth.normals, margin=config.margin,
+        source.directions[taken], source.intensities[taken], normals=truth.normals, margin=config.margin,
         files=[source.folder / "mask.png", truth.origin], camera=Camera(config.focal) if config.focal else None,
-        settings=(config.bits, config.focal) if config.focal else (config.bits,),
+        settings=(config.bits, *extra),
     )  # fmt: skip
 
 

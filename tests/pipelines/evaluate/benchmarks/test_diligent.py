@@ -135,6 +135,21 @@ def test_bear_may_lose_its_first_images(tree):
     assert fewer["bear"].digest != every["bear"].digest and fewer["ball"].digest == every["ball"].digest
 
 
+def test_a_few_images_of_each_object_are_drawn_the_same_every_time(tree):
+    every = next(item for item in diligent_objects(tree, DiligentConfig()) if item.name == "bear")
+    few, again = (next(item for item in diligent_objects(tree, DiligentConfig(images=5)) if item.name == "bear")
+                  for _ in range(2))  # fmt: skip
+    place = [every.true_directions.tolist().index(light) for light in few.true_directions.tolist()]
+    assert len(place) == 5 and place == sorted(place) and place != list(range(5))
+    assert np.array_equal(folders.whole(few.load()), folders.whole(every.load())[place])
+    assert few.digest == again.digest != every.digest
+
+
+def test_more_images_than_there_are_is_refused(tree):
+    with pytest.raises(InputError, match="--images wants 1000"):
+        diligent_objects(tree, DiligentConfig(images=1000))
+
+
 @pytest.mark.parametrize("where", ["pmsData", "pmsData/conePNG", "."])
 def test_any_of_the_folders_is_taken(tree, where):
     assert "cone" in {item.name for item in diligent_objects(tree / where, DiligentConfig())}
