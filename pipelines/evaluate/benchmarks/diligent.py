@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bear", type=int, default=96, choices=(96, 76),
                         help="images of bear; 76 drops the corrupted first 20 (default: 96, as the paper)")  # fmt: skip
     parser.add_argument("--images", type=int, default=0, metavar="N",
-                        help="N images of each object, drawn by chance, the same every time (default: all)")  # fmt: skip
+                        help="of each object, drawn by chance, the same every time (default: all)")  # fmt: skip
     parser.add_argument("--focal", type=float, default=0.0, metavar="PX",
                         help="focal length in pixels, 3772 of its camera (default: orthographic)")  # fmt: skip
 
