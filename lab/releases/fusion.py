@@ -46,7 +46,10 @@ def train(scenes: Sequence[Answered], epochs: int, width: int, seed: int) -> Fus
         for some in np.array_split(rng.permutation(len(given)), math.ceil(len(given) / _BATCH)):
             inputs, truth = _batch([given[number] for number in some], rng)
             adam.zero_grad(set_to_none=True)
-            _loss(network, inputs, truth).backward()
+            loss = _loss(network, inputs, truth)
+            if not torch.isfinite(loss):
+                raise ArithmeticError(f"the loss is {loss.item()} at step {bar.n}; an answer is not finite")
+            loss.backward()
             torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             adam.step()
             plan.step()

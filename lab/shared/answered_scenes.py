@@ -19,6 +19,7 @@ from sdps.methods.runner import Runner
 from sdps.refinement.trust import RefinedEstimate, choose
 
 _LOSS = 0.3  # degrees; what counts as losing
+_MOST_HALF = float(np.finfo(np.float16).max)  # the gloss of a black mirror is more
 _HEAD = ("scenes", "", "first", "second look", "refined", "mean", "fused", "expected", "refined loses", "fused loses",
          "lights first", "refined")  # fmt: skip
 
@@ -75,8 +76,8 @@ def keep(
         for name, lights in (("lights_start", found.start), ("lights_refined", found.refined)):
             kept[name] = np.asarray(angle_degrees(lights.light_directions, directions).mean())
     file.parent.mkdir(parents=True, exist_ok=True)
-    thin = {name: value.astype(np.float16) if value.ndim > 1 and value.dtype != bool else value
-            for name, value in kept.items()}  # fmt: skip
+    thin = {name: value.clip(-_MOST_HALF, _MOST_HALF).astype(np.float16)
+            if value.ndim > 1 and value.dtype != bool else value for name, value in kept.items()}  # fmt: skip
     with atomic_path(file) as temporary, temporary.open("wb") as handle:
         np.savez_compressed(handle, allow_pickle=False, **thin)
 

@@ -1,5 +1,6 @@
 """What fusion learns from is kept as it was, and the network learns whom to believe."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,24 @@ def test_an_answered_scene_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.truth, scene.truth[box], atol=1e-3)
     np.testing.assert_allclose(back.evidence.refined, scene.evidence.refined[box], atol=1e-3)
     assert back.evidence.numbers == scene.evidence.numbers
+
+
+def test_what_half_floats_do_not_hold_is_kept_as_their_largest(tmp_path: Path) -> None:
+    scene, lights = answered(3), np.tile(np.array([0.0, 0.0, 1.0], np.float32), (4, 1))
+    glossy = replace(scene.evidence, gloss=scene.evidence.gloss * np.float32(1e6))
+    start = Estimate(scene.truth, lights, np.ones(4, np.float32))
+    found = RefinedEstimate(scene.truth, lights, np.ones(4, np.float32), refined=start, start=start, trust=None)  # type: ignore[arg-type]
+    keep(tmp_path / "a.npz", (found, glossy.part(*find_place(glossy.mask))), scene.truth, lights, held_out=True)
+    (back,) = read_all(tmp_path)
+    assert np.isfinite(back.evidence.gloss).all() and back.evidence.gloss.max() == 65504.0
+
+
+def test_an_answer_that_is_not_finite_stops_the_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fusion, "_SIDE", 24)
+    scene = answered(1)
+    broken = replace(scene, evidence=replace(scene.evidence, gloss=scene.evidence.gloss * np.float32(np.inf)))
+    with pytest.raises(ArithmeticError, match="not finite"):
+        fusion.train([broken], 1, 16, 0)
 
 
 def test_photographs_are_those_of_cameras_that_expose_as_people_do(tmp_path: Path) -> None:
