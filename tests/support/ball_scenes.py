@@ -41,7 +41,10 @@ def paint(lamp, gain, focal=np.inf, chrome=(), white=()):
     image = np.full(SHAPE, 0.004)
     for ball in (OBJECT, *white):
         points, normals, _, shown = hit(ball, focal)
-        image[shown] = 0.7 * gain * np.maximum((normals * to_lamp(points, lamp)).sum(-1), 0.0)[shown]
+        lit = np.maximum((normals * to_lamp(points, lamp)).sum(-1), 0.0)
+        if np.linalg.norm(lamp) > 1.001:  # its light falls off with the square of the distance
+            lit *= ((np.array(lamp) - [OBJECT[0], OBJECT[1], 0.0]) ** 2).sum() / ((lamp - points) ** 2).sum(-1)
+        image[shown] = 0.7 * gain * lit[shown]
     for ball in chrome:
         points, normals, sight, shown = hit(ball, focal)
         mirrored = 2.0 * (normals * sight).sum(-1, keepdims=True) * normals - sight

@@ -12,9 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from sdps.core.geometry import Capture
+from sdps.photos.analysis.balls.ball_flags import WHITE
 from sdps.photos.analysis.balls.ball_lights import BallLights, BallRays, join_rays
+from sdps.photos.analysis.balls.ball_near import correct_near
 
 _UNLIKE = 1.03  # largest radius over smallest, from which on balls may stand at different depths
+_ROUNDS = 3
 _BETTER = 0.8  # of the degrees by which rays miss one another, if they are of one size
 
 
@@ -32,7 +35,7 @@ def join_balls(
     Returns:
         The lights, and the balls' distances from the camera over the object's, (B,); None: all at its depth.
     """
-    level = join_rays(rays, capture, distant, reach)
+    level = _join(rays, capture, distant, reach)
     sizes = np.array([ray.view.sphere.radius for ray in rays])
     if not capture.camera.is_perspective or sizes.max() < _UNLIKE * sizes.min() or level.distances is None:
         return level, None
@@ -41,7 +44,25 @@ def join_balls(
     moved = [
         replace(ray, points=pinhole + depth * (ray.points - pinhole)) for ray, depth in zip(rays, depths, strict=True)
     ]
-    alike = join_rays(moved, capture, distant, reach)
+    alike = _join(moved, capture, distant, reach, depths)
     if level.apart is None or alike.apart is None or not alike.apart < _BETTER * level.apart:
         return level, None
     return alike, depths
+
+
+def _join(
+    rays: Sequence[BallRays], capture: Capture, distant: bool, reach: float | None, depths: np.ndarray | None = None
+) -> BallLights:
+    """Join what balls say, white ones corrected for lamps that turn out to be near; depths (B,), None: all 1."""
+    found = join_rays(rays, capture, distant, reach)
+    every = np.ones(len(rays)) if depths is None else depths
+    for _ in range(_ROUNDS if any(ray.kind == WHITE for ray in rays) else 0):
+        away = found.distances if reach is None else np.full(len(found.directions), reach)
+        if away is None or distant:
+            break
+        with np.errstate(invalid="ignore"):
+            lengths = np.where(np.isfinite(away), 2.0 * capture.radius * away, np.nan)
+            lamps = capture.centre + lengths[:, None] * found.directions
+        own = [correct_near(ray, lamps, depth) for ray, depth in zip(rays, every, strict=True)]
+        found = join_rays(own, capture, distant, reach)
+    return found
