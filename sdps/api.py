@@ -105,7 +105,7 @@ def infer(
     intensities, more = (photos.intensities, ()) if not known[0] else ask_about_lights(photos, models, config)
     stop(photos, findings := (*findings, *more), anyway)
     found, name = _estimate(runner, photos, intensities), runner.method.name
-    took, findings = time.perf_counter() - began, (*findings, *_tell_flat(found, runner.flat))
+    took, findings = time.perf_counter() - began, (*findings, *_tell_flat(found, runner.flat, lit=known[0]))
     return Inference(photos, name, found, findings, runner.files, discontinuities, took, forecast)
 
 
@@ -282,16 +282,25 @@ def _estimate(runner: Runner, photos: Photographs, intensities: np.ndarray | Non
     return runner.estimate(photos, photos.mask, *given, saturation=photos.saturation, rig=rig)
 
 
-def _tell_flat(found: Estimate, flat: Flatness) -> Iterator[Finding]:
-    """Say what was done with a flat thing, where something was."""
-    if found.tilt is not None:
-        why = "Said to be flat" if flat.asked else "This looks like a flat thing"
-        slow = f" Slopes were flattened over {flat.share:.0%} of the width." if flat.share else ""
-        yield Finding(
-            "note",
-            f"{why}: its mean plane, {found.tilt:.0f} degrees off, was made to face the camera.{slow} If what stands "
-            "out is hollow, use --flat turned; if it is not flat, --flat no.",
+def _tell_flat(found: Estimate, flat: Flatness, *, lit: bool) -> Iterator[Finding]:
+    """Say what was done with a flat thing, where something was, and what tells its hollows; `lit`: by given lights."""
+    if found.tilt is None:
+        return
+    why = "Said to be flat" if flat.asked else "This looks like a flat thing"
+    slow = f" Slopes were flattened over {flat.share:.0%} of the width." if flat.share else ""
+    if lit:
+        side = ""
+    elif flat.wish == "turned":
+        side = " What stood out was turned to be hollow, as asked."
+    elif found.side_by:
+        side = f" Which parts stand out and which are hollow is told by {found.side_by}."
+    else:
+        side = (
+            " Nothing tells which parts stand out and which are hollow (cast shadows or near lamps would): look at "
+            "a place that you know, and use --flat turned if it is inside out."
         )
+    level = f"{why}: its mean plane, {found.tilt:.0f} degrees off, was made to face the camera."
+    yield Finding("note", f"{level}{slow}{side} If it is not flat, use --flat no.")
 
 
 def _runner(

@@ -2,6 +2,7 @@
 
     python -m lab.studies.flat_study --side 128 --images 12        # minutes; the table of docs/guides/infer.md
     python -m lab.studies.flat_study --depth 0.25                  # shallow ones
+    python -m lab.studies.flat_study --side 96 --images 10 --sides 2   # which side is up: how often it is told, by what
 
 A coin, a weave and brush strokes are made as heights, shaded with gloss and cast shadows, and lit from afar or by lamps
 two object sizes away, which bend what is found into a bowl.
@@ -29,6 +30,13 @@ from sdps.surface.relight import trace_light
 _ROOM, _NOISE = 32, 0.003
 _PORTRAIT = ((0.05, 0.1, 0.35, 0.05), (0.12, 0.2, 0.12, 0.03), (-0.1, -0.35, 0.2, 0.03), (0.3, 0.05, 0.08, 0.03))
 KINDS = ("coin", "weave", "paint")
+_LAMPS: dict[str, dict[str, float]] = {
+    "far": {"depth": 1.0},
+    "far, raking": {"depth": 1.0, "slant": 78.0},
+    "far, deep": {"depth": 2.0, "slant": 78.0},
+    "at 3 sizes": {"depth": 1.0, "distance": 3.0},
+    "at 1.5 sizes": {"depth": 1.0, "distance": 1.5},
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,7 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--images", type=int, default=12)
     parser.add_argument("--distance", type=float, default=np.inf, help="of the lamps, in object sizes")
     parser.add_argument("--depth", type=float, default=1.0, help="what heights are multiplied with")
+    parser.add_argument("--sides", type=int, default=0, help="things of each kind whose side is told, unrefined")
     args = parser.parse_args(argv)
+    if args.sides:
+        _count_sides(args.side, args.images, args.sides)
+        return 0
     sys.stdout.write("kind   given    --flat  network  refined  answer  turned  tilt\n")
     for kind in KINDS:
         scene = photograph(kind, args.side, args.images, distance=args.distance, depth=args.depth)
@@ -46,6 +58,27 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.write(f"{kind:6s} {given:8s} {wish:5s} {_judge(scene, given, wish)}\n")
             sys.stdout.flush()
     return 0
+
+
+def _count_sides(side: int, images: int, each: int) -> None:
+    """Print how often the network has the right side, and how often evidence tells it, for raised and hollow things."""
+    mask, turn = np.ones((side, side), bool), np.array([-1, -1, 1], np.float32)
+    runner = _runner("auto", (False, False), None, None, False, images, Flatness("yes"))
+    sys.stdout.write("lamps          kind   network  told right  wrong  not told\n")
+    for name, settings in _LAMPS.items():
+        for kind in KINDS:
+            counts = dict.fromkeys(("network", "right", "wrong", "not"), 0)
+            for seed, depth in itertools.product(range(each), (1.0, -1.0)):
+                scene = photograph(kind, side, images, seed=seed + (100 if depth < 0 else 0),
+                                   **(settings | {"depth": depth * settings["depth"]}))  # fmt: skip
+                found = runner.estimate(scene.images, mask, None, None, rig=UNKNOWN)
+                off = [normal_mae(normals, scene.normals, mask) for normals in (found.normals, found.normals * turn)]
+                told = "not" if not found.side_by else "right" if off[0] < off[1] else "wrong"
+                counts[told] += 1
+                counts["network"] += (off[0] < off[1]) != found.turned
+            row = "  ".join(f"{counts[key]:8d}" for key in counts)
+            sys.stdout.write(f"{name:14s} {kind:6s} {row}\n")
+            sys.stdout.flush()
 
 
 def _judge(scene: "Flat", given: str, wish: Wish) -> str:
@@ -80,8 +113,9 @@ class Flat(NamedTuple):
 
 
 def photograph(
-    kind: str, side: int = 160, count: int = 16, *, distance: float = np.inf, depth: float = 1.0, seed: int = 0
-) -> Flat:
+    kind: str, side: int = 160, count: int = 16, *, distance: float = np.inf, depth: float = 1.0, seed: int = 0,
+    slant: float = 60.0,
+) -> Flat:  # fmt: skip
     """Return a flat thing with its pictures.
 
     Args:
@@ -89,8 +123,9 @@ def photograph(
         side: S, pixels.
         count: L.
         distance: Of the lamps, in object sizes.
-        depth: What heights are multiplied with.
+        depth: What heights are multiplied with; below 0 they are hollow.
         seed: Of the thing, the lights and the noise.
+        slant: Largest angle between a light and the line of sight, in degrees; raking ones cast shadows.
     """
     rng, whole, inside = generator(seed, f"flat {kind}"), side + 2 * _ROOM, slice(_ROOM, _ROOM + side)
     heights, albedo, gloss, shine = _make(kind, whole, rng)
@@ -99,7 +134,7 @@ def photograph(
     column, row = column - column[inside, inside].mean(), row - row[inside, inside].mean()
     normals = unit(np.stack([-column, row, np.ones_like(row)], axis=-1))
     azimuth = 2 * np.pi * ((np.arange(count) * 0.618 + rng.random()) % 1.0)
-    across = np.sin(np.radians(rng.uniform(20.0, 60.0, count)))
+    across = np.sin(np.radians(rng.uniform(20.0, slant, count)))
     lights = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), np.sqrt(1.0 - across**2)], axis=1)
     gains = rng.uniform(0.7, 1.3, count)
     mask = np.ones((whole, whole), bool)

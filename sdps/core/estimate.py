@@ -69,6 +69,8 @@ class Estimate:
         notes: What a classical method notes.
         tilt: Degrees by which the mean plane of a flat thing was tilted before it was made to face the camera; None
             where it was left as it was found.
+        side_by: What told whether a flat thing's relief stands out or is hollow; empty where nothing did.
+        turned: Whether it was turned inside out on that ground.
     """
 
     normals: np.ndarray
@@ -84,6 +86,8 @@ class Estimate:
     exposure: dict[str, float] = field(default_factory=dict, kw_only=True)
     notes: Notes = field(default=NO_NOTES, kw_only=True)
     tilt: float | None = field(default=None, kw_only=True)
+    side_by: str = field(default="", kw_only=True)
+    turned: bool = field(default=False, kw_only=True)
 
 
 def constant_estimate(count: int, mask: np.ndarray) -> Estimate:

@@ -7,7 +7,7 @@ every picture looks as before. This is not a rotation: a turned surface under tu
 Known intensities give lambda.
 
 What is left is whether the relief stands out or is hollow: turned inside out under lights from the opposite side it
-looks the same, but for cast shadows.
+looks the same, but for cast shadows and near lamps (`relief_sides`), which decide where they can.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,9 @@ from render.shared.imaging.vectors import unit
 from sdps.core.estimate import Estimate
 from sdps.core.integration import integrate
 from sdps.core.intensities import grey
+from sdps.inference.image_source import ImageSource
 from sdps.inference.tiles import split_rows
+from sdps.methods.relief_sides import TURN, tell_side
 
 Wish = Literal["auto", "yes", "no", "turned"]
 SHARE = 0.25
@@ -75,17 +77,26 @@ class Flatness:
         """
         return self.asked or (self.wish == "auto" and not lit and is_flat(mask, normals))
 
-    def begin(self, found: _Found, mask: np.ndarray, *, lit: bool) -> _Found:
-        """Let the mean plane of what was first found face the camera, the right side out.
+    def begin(self, found: _Found, mask: np.ndarray, *, lit: bool, images: ImageSource | None = None) -> _Found:
+        """Let the mean plane of what was first found face the camera, the right side out where pictures tell it.
+
+        Args:
+            found: What was found.
+            mask: (H, W) bool.
+            lit: Light directions were given.
+            images: (L, H, W, 3); None: they are not asked for the side.
 
         Raises:
             InputError: it shall be turned inside out although lights were given.
         """
-        if self.wish != "turned":
-            return face_camera(found, mask, lit=lit)
-        if lit:
+        if lit and self.wish == "turned":
             raise InputError("--flat turned: lights that are given tell what stands out; leave it out, or use --frame")
-        return turn_inside_out(face_camera(found, mask, lit=lit))
+        level = face_camera(found, mask, lit=lit)
+        if images is not None and not lit and len(level.light_directions):
+            told = tell_side(images, mask, level)
+            turned, by = told.side < 0, told.by if told.side else ""
+            level = replace(turn_inside_out(level) if turned else level, side_by=by, turned=turned)
+        return turn_inside_out(level) if self.wish == "turned" else level
 
     def finish(self, found: _Found, mask: np.ndarray, known: np.ndarray | None, *, lit: bool) -> _Found:
         """Let the mean plane of the answer face the camera, scale its depth, and flatten it where that is wished.
@@ -173,7 +184,7 @@ def deepen(found: _Found, mask: np.ndarray, factor: float) -> _Found:
 
 def turn_inside_out(found: _Found) -> _Found:
     """Return what stood out as hollow, under lights from the opposite side."""
-    turn = np.array([-1.0, -1.0, 1.0], np.float32)
+    turn = TURN.astype(np.float32)
     return replace(found, normals=found.normals * turn, light_directions=found.light_directions * turn)
 
 

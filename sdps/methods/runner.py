@@ -127,7 +127,7 @@ class Runner:
             given["intensities"] = intensities
         estimate, lit = self._estimate(images, mask, given, found, rig), given.get("lights") is not None
         if self.flat.applies(mask, estimate.normals, lit=lit):
-            estimate = self.flat.begin(estimate, mask, lit=lit)
+            estimate = self.flat.begin(estimate, mask, lit=lit, images=images)
         if method.refined:
             estimate = self._refine(images, mask, estimate, given, saturation, rig)
         if estimate.tilt is None:

@@ -74,15 +74,8 @@ def trace(
         lights: (L, 3) unit directions from the surface to the light, or (P, L, 3), those of each pixel.
         camera: Of this picture.
     """
-    lights, unit = np.asarray(lights, np.float32), np.ascontiguousarray(normals, np.float32)
-    field = np.where(mask, heights, -np.inf).astype(np.float32)
-    rows, columns = (places.astype(np.float32) for places in np.nonzero(mask))
-    points = np.stack([columns, -rows, field[mask]], axis=1)
-    ways = np.broadcast_to(lights, (len(points), *lights.shape[-2:]))
-    above = points + np.float32(_OFFSET) * unit
-    if camera.is_perspective:
-        points = camera.positions(np.where(mask, heights, 0.0))[mask].astype(np.float32)
-        field, above, ways = _straighten(field, mask, points + np.float32(_OFFSET) * unit, ways, camera)
+    unit = np.ascontiguousarray(normals, np.float32)
+    field, points, above, ways = _lay(heights, mask, unit, lights, camera)
     lit = np.ones(ways.shape[:2], np.bool_)
     _shadows(field, above, np.ascontiguousarray(ways), lit)
     factors = np.zeros((len(points), len(points)), np.float32)
@@ -90,6 +83,30 @@ def trace(
     _form_factors(field, points, above, unit, area, factors)
     factors /= np.maximum(factors.sum(axis=1, keepdims=True), 1.0)
     return Transport(lit, factors)
+
+
+def trace_shadows(heights: np.ndarray, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:
+    """Return which pixels nothing blocks the light of, (P, L) bool, seen without perspective; arguments of `trace`."""
+    field, _, above, ways = _lay(heights, mask, np.ascontiguousarray(normals, np.float32), lights, ORTHOGRAPHIC)
+    lit = np.ones(ways.shape[:2], np.bool_)
+    _shadows(field, above, np.ascontiguousarray(ways), lit)
+    return lit
+
+
+def _lay(
+    heights: np.ndarray, mask: np.ndarray, unit: np.ndarray, lights: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a height field (H, W), its points (P, 3), where rays begin (P, 3) and their ways (P, L, 3)."""
+    field = np.where(mask, heights, -np.inf).astype(np.float32)
+    rows, columns = (places.astype(np.float32) for places in np.nonzero(mask))
+    points = np.stack([columns, -rows, field[mask]], axis=1)
+    lights = np.asarray(lights, np.float32)
+    ways = np.broadcast_to(lights, (len(points), *lights.shape[-2:]))
+    above = points + np.float32(_OFFSET) * unit
+    if camera.is_perspective:
+        points = camera.positions(np.where(mask, heights, 0.0))[mask].astype(np.float32)
+        field, above, ways = _straighten(field, mask, points + np.float32(_OFFSET) * unit, ways, camera)
+    return field, points, above, ways
 
 
 def _straighten(

@@ -200,7 +200,7 @@ class Inference:
                       "residual_degrees": round(self.depth.residual, 3)},
             "mesh": {"every": step_of(photos.mask)} | ({"unit": _unit(photos)} if photos.pixel_size else {}),
             "seconds": round(self.seconds, 2),
-            **({} if self.estimate.tilt is None else {"flat": {"tilt_degrees": round(self.estimate.tilt, 2)}}),
+            **_tell_flat(self.estimate),
             **({} if self.forecast is None else {"forecast": self.forecast.summary()}),
             "notes": list(photos.notes),
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
@@ -363,3 +363,10 @@ def _mean_angle(first: np.ndarray, second: np.ndarray, mask: np.ndarray) -> floa
 def _save_array(path: Path, array: np.ndarray) -> None:
     with atomic_path(path) as temporary, temporary.open("wb") as handle:
         np.save(handle, np.ascontiguousarray(array, np.float32))
+
+
+def _tell_flat(found: Estimate) -> dict[str, Any]:
+    """Return what is to be said of a flat thing, by its key; nothing of other things."""
+    if found.tilt is None:
+        return {}
+    return {"flat": {"tilt_degrees": round(found.tilt, 2)} | ({"side_by": found.side_by} if found.side_by else {})}

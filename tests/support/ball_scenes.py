@@ -14,17 +14,20 @@ GAINS = 0.6 + 0.04 * np.arange(10)
 
 
 def hit(ball: Sequence[float], focal: float = np.inf):
-    """Return points, normals and sights of every pixel that shows a ball (x, y, radius at z = 0), and which do."""
+    """Return points, normals and sights of every pixel that shows a ball (x, y, radius), and which do; z is 0, or a
+    fourth number.
+    """
+    middle = np.array([ball[0], ball[1], *(ball[3:] or (0.0,))])
     rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
     at = np.stack([columns - (SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2 - rows, np.zeros(SHAPE)], -1)
     eye = np.array([0.0, 0.0, focal])
     sight = (eye - at) if np.isfinite(focal) else np.broadcast_to([0.0, 0.0, 1.0], at.shape)
     sight = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
-    off = at - np.array([ball[0], ball[1], 0.0])
+    off = at - middle
     along = -(off * sight).sum(-1)
     inside = ball[2] ** 2 - (off**2).sum(-1) + along**2
     points = at + (along + np.sqrt(np.maximum(inside, 0.0)))[..., None] * sight
-    return points, (points - [ball[0], ball[1], 0.0]) / ball[2], sight, inside > 0
+    return points, (points - middle) / ball[2], sight, inside > 0
 
 
 def to_lamp(points, lamp):
@@ -38,7 +41,10 @@ def paint(lamp, gain, focal=np.inf, chrome=(), white=()):
     image = np.full(SHAPE, 0.004)
     for ball in (OBJECT, *white):
         points, normals, _, shown = hit(ball, focal)
-        image[shown] = 0.7 * gain * np.maximum((normals * to_lamp(points, lamp)).sum(-1), 0.0)[shown]
+        lit = np.maximum((normals * to_lamp(points, lamp)).sum(-1), 0.0)
+        if np.linalg.norm(lamp) > 1.001:  # its light falls off with the square of the distance
+            lit *= ((np.array(lamp) - [OBJECT[0], OBJECT[1], 0.0]) ** 2).sum() / ((lamp - points) ** 2).sum(-1)
+        image[shown] = 0.7 * gain * lit[shown]
     for ball in chrome:
         points, normals, sight, shown = hit(ball, focal)
         mirrored = 2.0 * (normals * sight).sum(-1, keepdims=True) * normals - sight

@@ -1,23 +1,30 @@
 """What a saved result says of how it shines: glTF's maps and mesh, and relightable pictures."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from render.shared.errors import InputError
 from render.shared.files import write_json
 from render.shared.images import quantise
+from sdps.core.geometry import Capture
 from sdps.photos.response import display
 from sdps.refinement.reflectance import MODES, SHAPES, shade
 from sdps.surface.exports.map_files import write_picture
 from sdps.surface.exports.saved_result import SavedResult
 from sdps.surface.gloss.fitted_gloss import BRIGHTEST, Materials, Surface, fit_materials, match_photographs
+from sdps.surface.gloss.pixel_lights import PixelLights
 from sdps.surface.gloss.relightable import (
     HARMONICS,
+    Expand,
+    Pictures,
     expand_harmonics,
     expand_polynomial,
+    fit_near_pictures,
     fit_pictures,
     measure_error,
     spread_lights,
@@ -31,12 +38,13 @@ MOST_PIXELS = 2**23
 _LIGHTS = 64  # of pictures relit from the refined reflectance
 _WHITE = 99.5  # percentile of the pictures' values that is shown as white
 _LOOKED_AT, _FEW = 8, 4000  # pictures and their pixels that this is measured on
-Pictures = Callable[[], Iterator[np.ndarray]]
+_FITTED: WeakKeyDictionary[SavedResult, Materials] = WeakKeyDictionary()
 
 
 def write_materials(result: SavedResult, folder: Path) -> list[Path]:
     """Write baseColor.png (sRGB), roughness.png, metallic.png, and material.json, which tells how sure they are."""
-    maps, found = _make_maps(result)
+    found = _find_materials(result)
+    maps = _make_maps(result, found)
     about = folder / "material.json"
     made = [
         write_picture(folder / "baseColor.png", display(maps.base)),
@@ -50,7 +58,7 @@ def write_materials(result: SavedResult, folder: Path) -> list[Path]:
 def write_gltf(result: SavedResult, folder: Path) -> list[Path]:
     """Write object.glb, the mesh with base colour, metallic, roughness and normals as pictures."""
     path = folder / "object.glb"
-    maps, _ = _make_maps(result)
+    maps = _make_maps(result, _find_materials(result))
     write_textured_glb(path, maps, result.depth, result.mask, camera=result.camera, millimetres=result.pixel_size)
     return [path]
 
@@ -70,13 +78,19 @@ def write_relightable(kind: str, result: SavedResult, folder: Path) -> list[Path
     chosen = np.zeros_like(result.mask)
     chosen[::every, ::every] = result.mask[::every, ::every]
     origin, lights, pictures = (_relit if result.pictures is None else _photographed)(result, chosen)
-    terms = max((some for some in HARMONICS if 4 * some <= 3 * len(lights)), default=HARMONICS[0])
-    basis = expand_polynomial(lights) if kind == "ptm" else expand_harmonics(lights, terms)
-    numbers = fit_pictures(pictures(), basis)
+    count = len(lights.directions)
+    terms = max((some for some in HARMONICS if 4 * some <= 3 * count), default=HARMONICS[0])
+    expand: Expand = expand_polynomial if kind == "ptm" else partial(expand_harmonics, terms=terms)
+    basis = expand(lights.directions)
+    if lights.nearness is None:
+        numbers = fit_pictures(pictures(), basis)
+        error = measure_error(pictures(), basis, numbers)
+    else:
+        numbers = fit_near_pictures(pictures, expand, lights)
+        error = measure_error(pictures(), basis, numbers, expand, lights)
     path, about = folder / f"object.{kind}", folder / f"{kind}.json"
     (write_ptm if kind == "ptm" else write_rti)(path, numbers, chosen[::every, ::every])
-    error = measure_error(pictures(), basis, numbers)
-    facts = {"of": origin, "lights": len(lights), "numbers": basis.shape[1], "rms_error": round(error, 4)}
+    facts = {"of": origin, "lights": count, "numbers": basis.shape[1], "rms_error": round(error, 4)}
     write_json(about, facts | {"every": every})
     return [path, about]
 
@@ -117,17 +131,33 @@ def read_surface(result: SavedResult) -> Surface:
     return found
 
 
-def _make_maps(result: SavedResult) -> tuple[Maps, Materials]:
-    """Return the pictures of a result, and the materials of its pixels."""
-    surface = read_surface(result)
-    found = fit_materials(surface)
-    if result.lights is not None:
-        found = match_photographs(found, surface, result.normals[result.mask], result.lights.directions)
+def _find_materials(result: SavedResult) -> Materials:
+    """Return the materials of a result's pixels; fitted one time, for all exports that want them."""
+    found = _FITTED.get(result)
+    if found is None:
+        surface = read_surface(result)
+        found = fit_materials(surface)
+        if result.lights is not None:
+            lights = _see_lights(result, result.mask)
+            found = match_photographs(found, surface, result.normals[result.mask], lights)
+        _FITTED[result] = found
+    return found
+
+
+def _make_maps(result: SavedResult, found: Materials) -> Maps:
+    """Return the materials as pictures."""
     pictures = [np.zeros((*result.shape, *part.shape[1:]), np.float32) for part in found[:3]]
     for picture, part in zip(pictures, found[:3], strict=True):
         picture[result.mask] = part
     base, metallic, roughness = pictures
-    return Maps(base, metallic, roughness, result.normals), found
+    return Maps(base, metallic, roughness, result.normals)
+
+
+def _see_lights(result: SavedResult, chosen: np.ndarray) -> PixelLights:
+    """Return the lights of a result, which has some, as chosen pixels see them."""
+    known, capture = result.lights, Capture.of(result.mask, result.camera)
+    assert known is not None
+    return PixelLights.of(capture, chosen, result.depth, known.directions, known.nearness)
 
 
 def _describe(result: SavedResult, found: Materials) -> dict[str, Any]:
@@ -144,33 +174,36 @@ def _describe(result: SavedResult, found: Materials) -> dict[str, Any]:
     }
 
 
-def _photographed(result: SavedResult, chosen: np.ndarray) -> tuple[str, np.ndarray, Pictures]:
-    """Return what is fitted, lights (L, 3), and what yields chosen pixels (n, 3) under equal lights."""
+def _photographed(result: SavedResult, chosen: np.ndarray) -> tuple[str, PixelLights, Pictures]:
+    """Return what is fitted, the lights, and what yields chosen pixels (n, 3) as if each lamp shone on them alike."""
     if result.lights is None or not len(result.lights.directions):
         raise InputError(f"{result.folder}: no lights were found; use a method that finds them")
-    known, source = result.lights, result.pictures
+    known, source, lights = result.lights, result.pictures, _see_lights(result, chosen)
     assert source is not None
     gains = known.intensities.reshape(len(known.directions), -1).mean(axis=1)
 
     def read(number: int) -> np.ndarray:
-        return np.asarray(source[number : number + 1])[0][chosen] / max(float(gains[number]), 1e-6)
+        values = np.asarray(source[number : number + 1])[0][chosen] / max(float(gains[number]), 1e-6)
+        return lights.even_out(values, number)
 
     looked_at = range(0, len(gains), max(1, len(gains) // _LOOKED_AT))
     white = _find_white(read(number) for number in looked_at)
-    return "photographs", known.directions, lambda: (read(number) / white for number in range(len(gains)))
+    return "photographs", lights, lambda: (read(number) / white for number in range(len(gains)))
 
 
-def _relit(result: SavedResult, chosen: np.ndarray) -> tuple[str, np.ndarray, Pictures]:
+def _relit(result: SavedResult, chosen: np.ndarray) -> tuple[str, PixelLights, Pictures]:
     """Return the same of pictures relit from the refined reflectance, without cast shadows."""
-    surface, lights, normals = read_surface(result), spread_lights(_LIGHTS), result.normals[chosen]
-    kept = chosen[result.mask]
+    surface, directions, normals = read_surface(result), spread_lights(_LIGHTS), result.normals[chosen]
+    kept, capture = chosen[result.mask], Capture.of(result.mask, result.camera)
     surface = surface._replace(albedo=surface.albedo[kept], strength=surface.strength[kept])
+    lights = PixelLights.of(capture, chosen, result.depth, directions)
 
     def relight(light: np.ndarray) -> np.ndarray:
-        return shade(normals, light[None].astype(np.float32), surface)[..., 0] * surface.gains
+        seen, towards, _ = lights._replace(directions=light[None]).see(normals, slice(None))
+        return shade(seen, towards.astype(np.float32), surface)[..., 0] * surface.gains
 
-    white = _find_white(relight(light) for light in lights[:: _LIGHTS // _LOOKED_AT])
-    return "refined reflectance, without cast shadows", lights, lambda: (relight(light) / white for light in lights)
+    white = _find_white(relight(light) for light in directions[:: _LIGHTS // _LOOKED_AT])
+    return "refined reflectance, without cast shadows", lights, lambda: (relight(light) / white for light in directions)
 
 
 def _find_white(pictures: Iterator[np.ndarray]) -> float:

@@ -29,6 +29,7 @@ from sdps.surface.gloss.metallic_roughness import (
     evaluate_highlight,
     measure_cosines,
 )
+from sdps.surface.gloss.pixel_lights import PixelLights
 
 ROUGHNESS = np.linspace(0.05, 1.0, 58)
 """Tried one by one, with a parabola between them."""
@@ -194,7 +195,7 @@ def _as_dielectric(
     return off.min(axis=1) + _multiply(grey, strength, apart.body, apart.lobes), _at_least(off)
 
 
-def match_photographs(found: Materials, surface: Surface, normals: np.ndarray, lights: np.ndarray) -> Materials:
+def match_photographs(found: Materials, surface: Surface, normals: np.ndarray, lights: PixelLights) -> Materials:
     """Return materials whose base colour makes them, under the photographs' lights, most like the refined surface.
 
     Elsewhere a highlight that no photograph saw would count as much as what all of them saw.
@@ -203,9 +204,9 @@ def match_photographs(found: Materials, surface: Surface, normals: np.ndarray, l
         found: Of `fit_materials`.
         surface: What it was fitted to.
         normals: (n, 3) unit, in the camera's frame.
-        lights: (L, 3) unit, from the surface to the light.
+        lights: Of the n pixels.
     """
-    lights = lights[:: -(-len(lights) // _MOST_LIGHTS)]
+    lights = lights.thin(-(-len(lights.directions) // _MOST_LIGHTS))
     parts = [_match_part(found, surface, normals, lights, some) for some in split(len(normals), _PART)]
     base, scale = np.concatenate(parts), found.scale
     if found.metallic.all():
@@ -215,21 +216,24 @@ def match_photographs(found: Materials, surface: Surface, normals: np.ndarray, l
 
 
 def _match_part(
-    found: Materials, surface: Surface, normals: np.ndarray, lights: np.ndarray, some: slice
+    found: Materials, surface: Surface, normals: np.ndarray, lights: PixelLights, some: slice
 ) -> np.ndarray:  # (n, 3)
     """Return the base colour of some pixels by least squares; radiance is linear in it."""
+    turned, directions, falloff = lights.see(normals[some], some)
     metallic, roughness = found.metallic[some, None], found.roughness[some, None].astype(np.float64)
     own = surface._replace(albedo=surface.albedo[some], strength=surface.strength[some])
-    wanted = shade(normals[some], lights.astype(np.float32), own) / found.scale  # (n, 3, L)
+    wanted = shade(turned, directions.astype(np.float32), own) / found.scale  # (n, 3, L)
     wanted *= np.where(metallic > 0, surface.gains / surface.gains.max(), 1.0)[..., None]
-    cosines = measure_cosines(normals[some, None], lights)
-    lit = np.clip(normals[some] @ lights.T, 0.0, None)
+    cosines = measure_cosines(turned[:, None], directions)
+    lit = turned @ directions.T if falloff is None else (turned[:, None] * directions).sum(axis=-1)
+    lit = np.clip(lit, 0.0, None)
     fresnel, mirror = evaluate_fresnel(cosines), evaluate_highlight(cosines, roughness) * lit
     f0 = np.where(metallic > 0, 0.0, DIELECTRIC)
     fixed = (f0 + (1.0 - f0) * fresnel) * mirror
     moves = np.where(metallic > 0, (1.0 - fresnel) * mirror, (1.0 - f0) * (1.0 - fresnel) * lit)  # times base
-    left = ((wanted - fixed[:, None]) * moves[:, None]).sum(axis=-1)
-    return np.maximum(left / np.maximum((moves**2).sum(axis=1), 1e-9)[:, None], 0.0)
+    weighted = moves if falloff is None else moves * falloff**2  # as bright as the photographs show them
+    left = ((wanted - fixed[:, None]) * weighted[:, None]).sum(axis=-1)
+    return np.maximum(left / np.maximum((moves * weighted).sum(axis=1), 1e-9)[:, None], 0.0)
 
 
 def _as_metal(shapes: _Shapes, grey: np.ndarray, strength: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ References: Malzbender, Gelb and Wolters, Polynomial Texture Maps, SIGGRAPH 2001
 1.2; Gautron et al., A Novel Hemispherical Basis, EGSR 2004, equations 7 and 11.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from render.shared.errors import InputError
 from render.shared.files import atomic_path
 from render.shared.imaging.srgb import to_srgb
 from sdps.inference.tiles import split
+from sdps.surface.gloss.pixel_lights import PixelLights
 
 POLYNOMIAL = 6
 """Numbers of a pixel in a `.ptm`; as many lights are needed."""
@@ -28,6 +29,11 @@ _STEADY = 1e-3
 """Ridge, as a share of the lights: what lights do not determine stays small."""
 _OUTLIERS = 0.02  # percent of the numbers at either end that may be clipped to a byte's range
 _FULL, _FEW, _PART = 255.0, 2**20, 2**18
+_BLOCK = 2**22  # pixels whose equations, of 180 bytes at most, are held at once where each sees lamps of its own
+Expand = Callable[[np.ndarray], np.ndarray]
+"""`expand_polynomial` or `expand_harmonics`: directions (n, 3) to (n, K)."""
+Pictures = Callable[[], Iterable[np.ndarray]]
+"""Starts reading pictures (n, 3), as often as it is called."""
 
 
 def expand_polynomial(directions: np.ndarray) -> np.ndarray:
@@ -66,8 +72,7 @@ def fit_pictures(pictures: Iterable[np.ndarray], basis: np.ndarray) -> np.ndarra
         InputError: fewer lights than numbers.
     """
     count, terms = basis.shape
-    if count < terms:
-        raise InputError(f"a relightable picture of {terms} numbers a pixel needs {terms} lights or more, got {count}")
+    _check(count, terms)
     ridge = _STEADY * count * np.eye(terms)
     solution = np.linalg.solve(basis.T @ basis + ridge, basis.T).astype(np.float32)  # (K, L)
     found = None
@@ -82,16 +87,67 @@ def fit_pictures(pictures: Iterable[np.ndarray], basis: np.ndarray) -> np.ndarra
     return found
 
 
-def measure_error(pictures: Iterable[np.ndarray], basis: np.ndarray, numbers: np.ndarray) -> float:
+def fit_near_pictures(pictures: Pictures, expand: Expand, lights: PixelLights) -> np.ndarray:
+    """Return the same where each of n pixels sees the lamps from directions of its own.
+
+    Args:
+        pictures: L arrays (n, 3), read a time for every four million pixels, their falloff taken off.
+        expand: Gives what the numbers are multiplied with.
+        lights: Of the n pixels.
+    """
+    count, terms = expand(lights.directions).shape
+    _check(count, terms)
+    found = np.empty((terms, len(lights.rows), 3), np.float32)
+    for block in split(len(lights.rows), _BLOCK):
+        _solve(found[:, block], pictures(), expand, lights.select(block), block)
+    return found
+
+
+def _solve(
+    found: np.ndarray, pictures: Iterable[np.ndarray], expand: Expand, lights: PixelLights, block: slice
+) -> None:  # fmt: skip
+    """Write the numbers (K, m, 3) of a block of pixels, by least squares for each of them."""
+    terms, pixels, _ = found.shape
+    first, second = np.triu_indices(terms)
+    products, found[:] = np.zeros((len(first), pixels), np.float32), 0.0
+    for number, picture in enumerate(pictures):
+        own = picture[block]
+        for some in split(pixels, _PART):
+            basis = expand(lights.reach(some, number)[0]).T.astype(np.float32)  # (K, p)
+            shown = to_srgb(own[some].astype(np.float32, copy=False))
+            for term in range(terms):
+                found[term, some] += basis[term, :, None] * shown
+            for row, (one, other) in enumerate(zip(first, second, strict=True)):
+                products[row, some] += basis[one] * basis[other]
+    for some in split(pixels, _PART):
+        system = np.empty((products[:, some].shape[1], terms, terms))
+        system[:, first, second] = system[:, second, first] = products[:, some].T
+        system += _STEADY * len(lights.directions) * np.eye(terms)
+        found[:, some] = np.linalg.solve(system, found[:, some].swapaxes(0, 1)).swapaxes(0, 1)
+
+
+def _check(count: int, terms: int) -> None:
+    """Refuse fewer lights than numbers."""
+    if count < terms:
+        raise InputError(f"a relightable picture of {terms} numbers a pixel needs {terms} lights or more, got {count}")
+
+
+def measure_error(
+    pictures: Iterable[np.ndarray], basis: np.ndarray, numbers: np.ndarray, expand: Expand | None = None,
+    lights: PixelLights | None = None,
+) -> float:  # fmt: skip
     """Return how far the fit is from what it was fitted to, root mean square of values for a screen, 0 to 1.
 
-    Arguments as of `fit_pictures`, and what it returned.
+    Arguments as of `fit_pictures`, and what it returned; `expand` and `lights` as of `fit_near_pictures`.
     """
     few = slice(None, None, max(1, numbers.shape[1] // _PART))
-    squares = [
-        float(((np.tensordot(row, numbers[:, few], 1).clip(0.0, 1.0) - to_srgb(picture[few])) ** 2).mean())
-        for row, picture in zip(basis.astype(np.float32), pictures, strict=True)
-    ]
+    squares = []
+    for number, picture in enumerate(pictures):
+        if expand is None or lights is None:
+            shown = np.tensordot(basis[number].astype(np.float32), numbers[:, few], 1)
+        else:
+            shown = np.einsum("pk,kpc->pc", expand(lights.reach(few, number)[0]), numbers[:, few])
+        squares.append(float(((shown.clip(0.0, 1.0) - to_srgb(picture[few])) ** 2).mean()))
     return float(np.sqrt(np.mean(squares)))
 
 

@@ -7,8 +7,9 @@ import numpy as np
 
 from render.shared.errors import InputError, list_names
 from sdps.core.geometry import Capture
+from sdps.photos.analysis.balls.ball_depths import join_balls
 from sdps.photos.analysis.balls.ball_flags import FLAG
-from sdps.photos.analysis.balls.ball_lights import OUTLINED, BallLights, BallRays, join_rays
+from sdps.photos.analysis.balls.ball_lights import OUTLINED, BallLights, BallRays
 from sdps.photos.light_files.light_choice import EQUAL, KnownLights
 from sdps.photos.light_files.light_distance import FLAG as DISTANCE
 from sdps.photos.light_files.light_distance import LightDistance, Yardstick
@@ -54,7 +55,7 @@ def know_lights(
     distant, reach = distance.distance == np.inf, None
     if distance.distance is not None and not distant:
         reach = float(by.radii(np.array([distance.distance]), distance.unit, DISTANCE)[0]) / 2.0
-    found = join_rays(rays, capture, distant, reach)
+    found, depths = join_balls(rays, capture, distant, reach)
     kept = found.kept
     if kept.mean() < _ENOUGH:
         bad = [name for name, good in zip(files, kept.tolist(), strict=True) if not good]
@@ -67,12 +68,14 @@ def know_lights(
         known, directions=found.directions[kept].astype(np.float32), intensities=strengths, name=names,
         distances=None if found.distances is None else found.distances[kept],
         unit="" if found.distances is None else "objects",
-        notes=(*_describe(found, names, known, strengths), *_doubt_circles(rays)),
+        notes=(*_describe(found, names, known, strengths, depths), *_doubt_circles(rays)),
     )  # fmt: skip
     return LightsOfBalls(lights, kept, _name_left(files, found))
 
 
-def _describe(found: BallLights, names: str, known: KnownLights, strengths: np.ndarray | None) -> tuple[str, ...]:
+def _describe(
+    found: BallLights, names: str, known: KnownLights, strengths: np.ndarray | None, depths: np.ndarray | None
+) -> tuple[str, ...]:
     """Say where the lights are from."""
     notes = [f"lights are those that {names} shows" if " and " not in names else f"lights are those that {names} show"]
     if found.apart is not None:
@@ -80,9 +83,13 @@ def _describe(found: BallLights, names: str, known: KnownLights, strengths: np.n
         notes.append(f"the balls' rays agree to {found.apart:.1f} degrees{doubt if found.apart > _APART else ''}")
     if found.distances is not None and np.isfinite(found.distances).any():
         near = found.distances[np.isfinite(found.distances)]
+        where = "the balls' middles are taken to stand as far from the camera as the object's"
+        if depths is not None:
+            parts = " and ".join(f"{depth:.3g}" for depth in depths)
+            where = f"the balls are taken for ones of one size, {parts} times as far from the camera as the object"
         notes.append(
             f"the lamps stand {near.min():.3g} to {near.max():.3g} object sizes from its middle, where the balls' rays "
-            "meet (the balls' middles are taken to stand as far from the camera as the object's)"
+            f"meet ({where})"
         )
     if strengths is None:
         notes.append(f"a chrome ball gives no intensities; a network finds them (--intensities {EQUAL} if all are)")

@@ -46,8 +46,10 @@ class BallRays:
     def take(self, order: Sequence[int]) -> "BallRays":
         """Return it for some pictures, in another order."""
         chosen, strengths = list(order), self.intensities
+        view = replace(self.view, colours=self.view.colours[chosen], clipped=self.view.clipped[chosen])
         return replace(
-            self, points=self.points[chosen], directions=self.directions[chosen], highlights=self.highlights[chosen],
+            self, view=view, points=self.points[chosen], directions=self.directions[chosen],
+            highlights=self.highlights[chosen],
             faults=tuple(self.faults[number] for number in chosen),
             intensities=None if strengths is None else strengths[chosen],
         )  # fmt: skip

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +13,15 @@ from saved_results import save_result, sphere
 
 from render.shared.errors import InputError
 from render.shared.imaging.srgb import from_srgb
-from sdps.core.geometry import ORTHOGRAPHIC, Camera
+from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture, reach
 from sdps.refinement.reflectance import SHAPES, shade
 from sdps.surface.exports import gloss_exports
 from sdps.surface.exports.gloss_exports import read_surface
 from sdps.surface.exports.registry import write_exports
 from sdps.surface.exports.saved_result import SavedLights, SavedResult, read_result
+from sdps.surface.gloss.fitted_gloss import fit_materials
 from sdps.surface.gloss.metallic_roughness import shade_gltf
-from sdps.surface.gloss.relightable import spread_lights
+from sdps.surface.gloss.relightable import expand_harmonics, expand_polynomial, spread_lights
 
 LIGHTS = spread_lights(24).astype(np.float32)
 
@@ -111,6 +113,38 @@ def test_relightable_files_are_of_the_photographs_or_else_relit(tmp_path: Path, 
     assert relit["of"].startswith("refined reflectance")
     assert (seen["of"], seen["lights"]) == ("photographs", len(LIGHTS))
     assert max(relit["rms_error"], seen["rms_error"]) < 0.1
+
+
+@pytest.mark.parametrize(("kind", "writer"), [("ptm", "write_ptm"), ("rti", "write_rti")])
+def test_relightable_files_know_near_lamps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, writer: str
+) -> None:
+    """Photographs under near lamps, shown under distant ones, look like photographs under these."""
+    result, nearness = refined_result(tmp_path), np.full(len(LIGHTS), 0.3)
+    capture, normals, surface = Capture.of(result.mask), result.normals[result.mask], read_surface(result)
+    towards, falloff = reach(capture.places(result.depth)[result.mask], LIGHTS.astype(np.float64), nearness)
+    shown = shade(normals, towards.astype(np.float32), surface) * falloff[:, None]
+    pictures = np.zeros((len(LIGHTS), *result.shape, 3), np.float32)
+    pictures[:, result.mask] = shown.transpose(2, 0, 1)
+    wanted = shade(normals, LIGHTS, surface).transpose(2, 0, 1)
+    expand = expand_polynomial if kind == "ptm" else partial(expand_harmonics, terms=9)
+    written: list[np.ndarray] = []
+    monkeypatch.setattr(gloss_exports, writer, lambda _, numbers, __: written.append(numbers))
+    errors = []
+    for known in (nearness, None):
+        lights = SavedLights(tuple(map(str, range(len(LIGHTS)))), LIGHTS, np.ones(len(LIGHTS), np.float32), known)
+        write_exports(replace(result, lights=lights, pictures=pictures), [kind], tmp_path / "out")
+        found = from_srgb(np.tensordot(expand(LIGHTS), written[-1], 1).clip(0.0, 1.0))
+        scale = (found * wanted).sum() / (wanted**2).sum()
+        errors.append(np.linalg.norm(found - scale * wanted) / np.linalg.norm(found))
+    assert errors[0] < 0.8 * errors[1]
+
+
+def test_materials_are_fitted_one_time_for_all_that_want_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted = []
+    monkeypatch.setattr(gloss_exports, "fit_materials", lambda part: fitted.append(1) or fit_materials(part))
+    write_exports(refined_result(tmp_path), ["materials", "gltf"], tmp_path / "out")
+    assert len(fitted) == 1
 
 
 @pytest.mark.parametrize("seen", [False, True])

@@ -1,5 +1,6 @@
 """Relightable files, read by a few lines written after the formats' descriptions."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,14 @@ import pytest
 
 from render.shared.errors import InputError
 from render.shared.imaging.srgb import to_srgb
+from sdps.core.geometry import Capture, reach
+from sdps.surface.gloss.pixel_lights import PixelLights
 from sdps.surface.gloss.relightable import (
     expand_harmonics,
     expand_polynomial,
+    fit_near_pictures,
     fit_pictures,
+    measure_error,
     write_ptm,
     write_rti,
 )
@@ -81,6 +86,42 @@ def test_an_rti_shows_the_photographs(ball: tuple, tmp_path: Path, terms: int, m
     mask, lights, pictures = ball
     write_rti(tmp_path / "a.rti", fit_pictures(pictures, expand_harmonics(lights, terms)), mask)
     assert worst(mask, lights, pictures, lambda light: read_rti(tmp_path / "a.rti", light)) < most
+
+
+@pytest.fixture
+def near(ball: tuple) -> tuple[list[np.ndarray], PixelLights]:
+    """The ball's pictures under lamps one and a half of its diameters away, and these lamps."""
+    mask, directions, pictures = ball
+    z = np.zeros(mask.shape)
+    rows, columns = np.nonzero(mask)
+    x, y = (columns - WIDE / 2 + 0.5) / (SIZE / 2), (SIZE / 2 - 0.5 - rows) / (SIZE / 2)
+    normals = np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1)
+    z[mask] = SIZE / 2 * (normals[:, 2] - normals[:, 2].mean())
+    nearness = np.full(COUNT, 1 / 3)
+    lights = PixelLights.of(Capture.of(mask), mask, z, directions, nearness)
+    towards, falloff = reach(lights.capture.places(z)[mask], directions, nearness)
+    albedo = pictures.max(axis=0)
+    lit = np.clip((normals[:, None] * towards).sum(-1), 0.0, None) * falloff
+    return list(lit.T[..., None] * albedo), lights
+
+
+@pytest.mark.parametrize("kind", ["ptm", "rti"])
+def test_pictures_under_near_lamps_are_relit_as_from_afar(ball: tuple, near: tuple, tmp_path: Path, kind: str) -> None:
+    mask, directions, pictures = ball
+    photographs, lights = near
+    expand = expand_polynomial if kind == "ptm" else partial(expand_harmonics, terms=9)
+    write, read = (write_ptm, read_ptm) if kind == "ptm" else (write_rti, read_rti)
+    evened = [lights.even_out(picture, number) for number, picture in enumerate(photographs)]
+    numbers = fit_near_pictures(lambda: evened, expand, lights)
+    write(tmp_path / "own", numbers, mask)
+    write(tmp_path / "alike", fit_pictures(photographs, expand(directions)), mask)
+    own, alike = (
+        worst(mask, directions, pictures, lambda light, name=name: read(tmp_path / name, light))
+        for name in ("own", "alike")
+    )
+    assert own < 0.075
+    assert alike > 1.8 * own
+    assert measure_error(evened, expand(directions), numbers, expand, lights) < 0.06
 
 
 def test_too_few_lights_are_refused() -> None:

@@ -64,6 +64,49 @@ def test_two_balls_give_positions(tmp_path, focal):
     assert angles(near.light_directions, off).max() < 1.5  # one ball, and how far the lamps are
 
 
+def test_balls_at_different_depths_give_positions(tmp_path):
+    """Two balls of one size, one in front of the object's middle and one behind it."""
+    balls = [(85.0, 45.0, 29.0, 60.0), (85.0, -45.0, 29.0, -60.0)]
+    lamps = 300.0 * LIGHTS + [OBJECT[0], 0.0, 0.0]
+    images = [paint(lamp, 1.0, FOCAL, chrome=balls) for lamp in lamps]
+    said = [flag(ball, FOCAL) for ball in balls]
+    photos = load(write(tmp_path / "in", images, hit(OBJECT, FOCAL)[3]), balls=said, focal=f"{FOCAL}px")
+    capture = Capture.of(photos.mask, photos.camera)
+    off = lamps - capture.centre
+    assert angles(photos.light_directions, off).max() < 1.0
+    np.testing.assert_allclose(capture.radius / photos.light_nearness, np.linalg.norm(off, axis=1), rtol=0.05)
+    assert any("of one size, 0.88" in note for note in photos.notes)
+
+
+@pytest.mark.parametrize("depth", [0.0, 60.0])
+def test_white_balls_are_corrected_for_near_lamps(tmp_path, depth):
+    """Lambert's law for distant lamps turns directions by 4 degrees here."""
+    balls = [(85.0, 45.0, 29.0, depth), (85.0, -45.0, 29.0, -depth)]
+    lamps = 300.0 * LIGHTS + [OBJECT[0], 0.0, 0.0]
+    images = [paint(lamp, 0.8 * gain, FOCAL, white=balls) for lamp, gain in zip(lamps, GAINS, strict=True)]
+    folder = write(tmp_path / "in", images, hit(OBJECT, FOCAL)[3])
+    photos = load(folder, balls=[f"white:{flag(ball, FOCAL)}" for ball in balls], focal=f"{FOCAL}px")
+    off = lamps - Capture.of(photos.mask, photos.camera).centre
+    assert angles(photos.light_directions, off).mean() < 0.6
+    np.testing.assert_allclose(photos.intensities / photos.intensities.mean(), GAINS / GAINS.mean(), rtol=0.04)
+    if not depth:
+        said = f"white:{flag(balls[0], FOCAL)}"
+        one = load(folder, balls=said, focal=f"{FOCAL}px", light_distance="300px")
+        assert angles(one.light_directions, off).mean() < 1.0
+
+
+@pytest.mark.parametrize("size", [24.0, 36.0])
+def test_balls_of_different_sizes_at_one_depth_stay_there(tmp_path, size):
+    balls = [(85.0, 45.0, 29.0), (85.0, -45.0, size)]
+    lamps = 300.0 * LIGHTS + [OBJECT[0], 0.0, 0.0]
+    images = [paint(lamp, 1.0, FOCAL, chrome=balls) for lamp in lamps]
+    photos = load(write(tmp_path / "in", images), balls=[flag(ball, FOCAL) for ball in balls], focal=f"{FOCAL}px")
+    capture = Capture.of(photos.mask, photos.camera)
+    off = lamps - capture.centre
+    assert angles(photos.light_directions, off).mean() < 1.0
+    np.testing.assert_allclose(capture.radius / photos.light_nearness, np.linalg.norm(off, axis=1), rtol=0.08)
+
+
 def test_pictures_without_a_good_highlight_are_left_out(tmp_path):
     ball = (85.0, 0.0, 30.0)
     images = [paint(lamp, 1.0, chrome=[ball]) for lamp in LIGHTS]
