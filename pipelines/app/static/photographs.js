@@ -17,6 +17,8 @@ async function begin() {
   state.set = (await post("/photographs/sets")).set;
   state.runs = [];
   balls.balls = [];
+  for (const id of ["pose", "ambient", "dark"]) $(id).replaceChildren();
+  $("every").value = "";
   for (const id of ["review", "choose", "results"]) $(id).hidden = true;
 }
 
@@ -42,7 +44,7 @@ async function example() {
   $("example").disabled = true;
   try {
     await begin();
-    const found = await follow(await post(inSet("start/example")), box, "Example");
+    const found = await follow(await post(inSet("start/example"), options()), box, "Example");
     if (found) review(found);
   } catch (error) { showError(box, error); }
   $("example").disabled = false;
@@ -71,17 +73,43 @@ async function listDropped(transfer) {
 
 // ---- Checks and mask ----
 
-const options = () => ({ gamma: $("gamma").value, lights: $("lights").checked, frame: $("frame").value, balls: balls.values() });
+const TICKED = ["lights", "refine", "discontinuities", "anyway"];
+const ANSWERED = ["method", "gamma", "frame", "scale", "flat", "flatten", "ambient", "dark", "focal", "principal", "intensities", "every", "pose"];
 
-async function check(more = {}) {
-  const box = $("load-status");
+// Return the answers to all questions of the page, as the server reads them.
+const options = () => ({
+  ...Object.fromEntries([...TICKED.map((id) => [id, $(id).checked]), ...ANSWERED.map((id) => [id, $(id).value])]),
+  pixel_size: $("pixel-size").value, light_distance: $("light-distance").value || $("distance").value, balls: balls.values(),
+});
+
+async function check(more = {}, box = $("load-status")) {
   try {
     const found = await follow(await post(inSet("start/check"), { ...options(), ...more }), box, "Checks");
-    if (found) review(found);
+    if (found) review(found, box === $("load-status"));
   } catch (error) { showError(box, error); }
 }
 
-function review(found) {
+function fillSelect(id, rows) {
+  const chosen = $(id).value;
+  $(id).replaceChildren(...rows.map(([value, text]) => element("option", { value }, text)));
+  if (rows.some(([value]) => value === chosen)) $(id).value = chosen;
+}
+
+// Say what a run would do, or what would stop it.
+function foresee(found) {
+  $("trouble").hidden = !found.trouble;
+  $("trouble").textContent = found.trouble;
+  $("work").replaceChildren(...found.work.flatMap(([name, text]) => [element("dt", {}, name), element("dd", {}, text)]));
+  $("work").classList.remove("old");
+  $("foresee").disabled = true;
+}
+
+function doubt() {
+  $("foresee").disabled = false;
+  $("work").classList.add("old");
+}
+
+function review(found, first = true) {
   state.checked = found;
   const about = [`${found.files.length} photographs`, `${found.width} x ${found.height} pixels`, `${found.bits} bits`, `curve: ${found.gamma}`, `mask: ${found.mask}, ${found.pixels.toLocaleString("en")} pixels`];
   $("facts").replaceChildren(...about.map((text) => element("span", {}, text)));
@@ -94,16 +122,19 @@ function review(found) {
   $("findings").replaceChildren(...(items.length ? items : [element("li", {}, "No problems found.")]));
   $("notes").replaceChildren(...found.notes.map((note) => element("li", {}, note)));
   $("lights-row").hidden = !found.lights_there;
-  const chosen = $("method").value;
-  $("method").replaceChildren(...found.methods.map(({ name }) => element("option", { value: name }, name === "auto" ? "recommended" : name)));
-  if (found.methods.some(({ name }) => name === chosen)) $("method").value = chosen;
+  fillSelect("method", found.methods.map(({ name }) => [name, name === "auto" ? "recommended" : name]));
   describeMethod();
+  fillSelect("pose", found.poses.map((name) => [name, name]));
+  $("pose-row").hidden = $("all-poses").hidden = found.poses.length < 2;
+  $("every-row").hidden = !found.film;
+  for (const [id, word] of [["ambient", "ambient"], ["dark", "dark"]]) fillSelect(id, [["", `the one with "${word}" in its name, if there is one`], ["none", "none"], ...found.pictures.map((name) => [name, name])]);
+  foresee(found);
   painter.load(inSet(`files/view/picture.jpg?${stamp}`), inSet(`files/view/mask.png?${stamp}`));
   balls.load(found.width, found.height, found.balls);
   $("mask-use").disabled = $("ball-use").disabled = true;
   $("mask-reset").disabled = found.mask !== "painted";
   $("review").hidden = $("choose").hidden = false;
-  $("review").scrollIntoView({ behavior: "smooth" });
+  if (first) $("review").scrollIntoView({ behavior: "smooth" });
 }
 
 function describeMethod() { $("method-about").textContent = state.checked.methods.find(({ name }) => name === $("method").value)?.about ?? ""; }
@@ -120,16 +151,16 @@ async function sendMask(blob) {
 async function infer(event) {
   event.preventDefault();
   $("start").disabled = true;
-  const asked = { ...options(), method: $("method").value };
-  for (const name of ["refine", "discontinuities", "anyway"]) asked[name] = $(name).checked;
-  asked.scale = $("scale").value;
-  asked.flat = $("flat").value;
-  asked.focal = $("focal").value;
-  asked.light_distance = $("light-distance").value;
+  const poses = event.submitter === $("all-poses") ? state.checked.poses : [$("pose").value];
   try {
     if (!$("mask-use").disabled) await ask(inSet("mask"), { method: "PUT", body: await painter.blob() });
-    const found = await follow(await post(inSet("start/infer"), asked), $("run-status"), "Surface");
-    if (found) { state.runs.push(found); await show(found); $("results").scrollIntoView({ behavior: "smooth" }); }
+    for (const pose of poses) {
+      const found = await follow(await post(inSet("start/infer"), { ...options(), pose }), $("run-status"), poses.length > 1 ? `Pose ${pose}` : "Surface");
+      if (!found) break;
+      state.runs.push(found);
+      await show(found);
+    }
+    if (state.runs.length) $("results").scrollIntoView({ behavior: "smooth" });
   } catch (error) { showError($("run-status"), error); }
   $("start").disabled = false;
 }
@@ -138,11 +169,13 @@ async function infer(event) {
 
 const inRun = (path, run = state.run) => inSet(`files/runs/${run.number}/view/${path}`);
 
+const nameRun = (run) => `${run.number}. ${run.pose ? `${run.pose}, ` : ""}${run.method}`;
+
 async function show(run) {
   state.run = run;
   $("results").hidden = false;
   $("runs").replaceChildren(...state.runs.map((other) => {
-    const button = element("button", { type: "button", "aria-pressed": String(other === run) }, `${other.number}. ${other.method}`);
+    const button = element("button", { type: "button", "aria-pressed": String(other === run) }, nameRun(other));
     button.addEventListener("click", () => show(other));
     return button;
   }));
@@ -156,6 +189,7 @@ async function show(run) {
   $("run-facts").replaceChildren(...facts.map((text) => element("span", {}, text)), ...(run.terms ? [element("span", {}, `weights: ${run.terms}`)] : []));
   $("download").href = inSet(`runs/${run.number}/download`);
   $("report").href = inSet(`files/runs/${run.number}/files/report.html`);
+  listExports(run);
   $("normals").src = inRun("normals.png");
   $("depth").src = inRun("depth.png");
   const [basis, tables] = await Promise.all([inRun("basis.bin"), run.tables && inRun("tables.bin")].map(async (address) => address && (await fetch(address)).arrayBuffer()));
@@ -170,6 +204,31 @@ async function show(run) {
     state.mesh ??= new MeshView($("mesh"));
     await state.mesh.load(inRun("mesh.ply"));
   } catch (error) { $("mesh").replaceChildren(element("p", { class: "note" }, `The surface cannot be shown here: ${error.message}`)); }
+}
+
+// ---- For other programs ----
+
+function listExports(run) {
+  $("export-status").hidden = true;
+  $("exports").replaceChildren(...run.exports.map(({ name, who, what }) => {
+    const button = element("button", { type: "button", class: "secondary", "aria-label": `Get ${what} for ${who}` }, "Get");
+    const row = element("li", {}, element("p", {}, element("b", {}, who), element("br"), element("span", {}, what)), button);
+    button.addEventListener("click", () => takeAway(run, name, row, button));
+    return row;
+  }));
+}
+
+async function takeAway(run, name, row, button) {
+  row.querySelector(".finding")?.remove();
+  button.disabled = true;
+  try {
+    const made = await follow(await post(inSet("start/export"), { run: run.number, name }), $("export-status"), "Export");
+    if (made) element("a", { href: inSet(`files/runs/${run.number}/${made.file}`), download: made.name }).click();
+  } catch (error) {
+    $("export-status").hidden = true;
+    row.append(element("p", { class: "finding error", role: "alert" }, error.message));
+  }
+  button.disabled = false;
 }
 
 function drawLights(run) {
@@ -236,7 +295,7 @@ function compare() {
   $("compare-card").hidden = state.runs.length < 2;
   if (state.runs.length < 2) return;
   for (const [id, offset] of [["left", 1], ["right", 0]]) {
-    $(id).replaceChildren(...state.runs.map((run, place) => element("option", { value: place + 1 }, `${run.number}. ${run.method}`)));
+    $(id).replaceChildren(...state.runs.map((run, place) => element("option", { value: place + 1 }, nameRun(run))));
     $(id).value = state.runs.length - offset;
   }
   showCompared();
@@ -274,7 +333,11 @@ $("ball-find").addEventListener("click", () => check({ balls: ["auto"] }));
 $("ball-add").addEventListener("click", () => balls.add());
 $("ball-use").addEventListener("click", () => check());
 $("method").addEventListener("change", describeMethod);
-for (const id of ["gamma", "lights", "frame"]) $(id).addEventListener("change", () => { if (id !== "frame" || $("lights").checked) check(); });
+$("foresee").addEventListener("click", () => check({}, $("run-status")));
+for (const id of ["pose", "every"]) $(id).addEventListener("change", () => check());
+$("form").addEventListener("change", doubt);
+for (const id of ["gamma", "lights", "frame"]) $(id).addEventListener("change", () => { if (id !== "frame" || $("lights").checked) check({}, $("run-status")); });
+$("light-distance").addEventListener("change", () => { $("distance").hidden = $("distance-note").hidden = $("light-distance").value !== ""; });
 $("form").addEventListener("submit", infer);
 const hover = $("normals").parentElement;
 hover.tabIndex = 0;

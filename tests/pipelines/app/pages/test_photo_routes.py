@@ -120,10 +120,14 @@ def test_a_focal_length_is_used(address: str, hills: Path) -> None:
     def infer(focal: object) -> dict:
         return client.wait(client.post(f"{path}/start/infer", {"method": "factorisation", "focal": focal}))
 
-    assert infer("50")["result"]["camera"] == "perspective, focal length 118 px (--focal)"  # of 72 x 72 pixels
+    assert infer("50")["result"]["camera"] == "perspective, focal length 118 px, as given"  # of 72 x 72 pixels
     assert infer("")["result"]["camera"] == "orthographic, looking along -z"
-    assert infer("400px")["result"]["camera"] == "perspective, focal length 400 px (--focal)"
-    for focal, said in (("0", "--focal 0mm: must be above 0"), (-3, "must be above 0"), ("wide", "unknown --focal")):
+    assert infer("400px")["result"]["camera"] == "perspective, focal length 400 px, as given"
+    for focal, said in (
+        ("0mm", '"Focal length" 0mm: must be above 0'),
+        (-3, "must be above 0"),
+        ("wide", 'unknown "Focal length"'),
+    ):
         job = infer(focal)
         assert job["state"] == "failed" and said in job["message"]
 
@@ -141,7 +145,7 @@ def test_a_distance_of_the_lamps_is_used(address: str, hills: Path) -> None:
     assert found["lamps"] == "the lamps stood about 4 object sizes away, as given"
     assert found["distances"] == [4.0] * len(found["files"])
     job = infer(light_distance="near")
-    assert job["state"] == "failed" and "--light-distance" in job["message"]
+    assert job["state"] == "failed" and "How far away the lamps stood" in job["message"]
 
 
 def test_balls_are_found_and_used(address: str, tmp_path: Path) -> None:
