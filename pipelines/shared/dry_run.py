@@ -34,7 +34,7 @@ def list_work(expected: "Workload", out: str | Path) -> dict[str, str]:
     return {
         "method": expected.method,
         "stages": expected.describe_stages(),
-        "files": f"{', '.join(expected.files)}, report.html into {out}",
+        "results": f"{', '.join(expected.files)}, report.html into {out}",
     }
 
 

@@ -13,7 +13,7 @@ from starlette.routing import Route
 
 from pipelines.app.common import uploads
 from pipelines.app.common.archives import pack, unpack
-from pipelines.app.common.incoming import Incoming, list_names, open_upload, receive, run_in_thread
+from pipelines.app.common.incoming import Incoming, list_files, open_upload, receive, run_in_thread
 from pipelines.app.common.jobs import replace_nonfinite
 from pipelines.app.common.refusals import Refused
 from pipelines.app.common.sessions import Session
@@ -48,11 +48,12 @@ async def upload(request: Request) -> Response:
     name, given = request.path_params["set"], request.path_params["name"]
     folder = session.find_place(name) / PHOTOS
     zipped = given.lower().endswith(".zip")
-    given = uploads.clean_name(given, (".zip",)) if zipped else uploads.clean_name(given)
-    if len(list_names(folder)) >= limits.files:
+    given = str(uploads.clean_place(given, (".zip",) if zipped else uploads.USABLE))
+    if len(list_files(folder)) >= limits.files:
         raise InputError(f"more than {limits.files} files; leave some out")
     async with open_upload(session, limits.bytes, name) as coming:
         path = coming.folder / given
+        path.parent.mkdir(exist_ok=True)
         await receive(request.stream(), path, coming, uploads.most_bytes(given))
         there = await run_in_thread(_accept, coming, path, folder, limits)
     return JSONResponse({"files": there})
@@ -61,9 +62,10 @@ async def upload(request: Request) -> Response:
 def _accept(coming: Incoming, path: Path, folder: Path, limits: Limits) -> int:
     """Check an upload and move it into a set's folder; return how many files are there then."""
     if path.suffix.lower() == ".zip":
-        return coming.add(unpack(path, coming.folder / "unpacked", limits, coming), folder, limits.files)
+        base = coming.folder / "unpacked"
+        return coming.add(unpack(path, base, limits, coming), folder, limits.files, base)
     uploads.check_pixels(path, limits)
-    return coming.add([path], folder, limits.files)
+    return coming.add([path], folder, limits.files, coming.folder)
 
 
 @accept_uploads
@@ -176,7 +178,7 @@ def _find_run(request: Request) -> Path:
 
 ROUTES = [
     Route("/sets", make_set, methods=["POST"]),
-    Route("/sets/{set}/uploads/{name}", upload, methods=["PUT"]),
+    Route("/sets/{set}/uploads/{name:path}", upload, methods=["PUT"]),
     Route("/sets/{set}/mask", upload_mask, methods=["PUT"]),
     Route("/sets/{set}/start/{task}", start_task, methods=["POST"]),
     Route("/sets/{set}/files/{path:path}", send_file),

@@ -124,7 +124,7 @@ def _foresee(args: argparse.Namespace, pose: "Pose", photos: "Photographs") -> t
         if args.scale != 1.0 and (args.scale != "auto" or expected.quick is not None):
             photos, _, options = look_through(args, pose, told.append)
             expected = plan(photos, args.method, **options)
-        rows = dry_run.list_input(photos) | {"time": expected.describe()} | dry_run.list_work(expected, "the ZIP")
+        rows = {"time": expected.describe()} | dry_run.list_input(photos) | dry_run.list_work(expected, "the ZIP")
         if not args.anyway:
             expected.check()
     except InputError as error:

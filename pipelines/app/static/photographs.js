@@ -32,7 +32,7 @@ async function upload(files) {
     box.replaceChildren(`Loading ${files.length} file${files.length > 1 ? "s" : ""}`, bar);
     box.hidden = false;
     for (const file of files) {
-      await ask(inSet(`uploads/${encodeURIComponent(file.name)}`), { method: "PUT", body: file });
+      await ask(inSet(`uploads/${encodeURIComponent(file.place || file.webkitRelativePath || file.name)}`), { method: "PUT", body: file });
       bar.value += 1;
     }
     await check();
@@ -57,7 +57,7 @@ async function listDropped(transfer) {
   const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
   const files = [];
   const walk = async (entry) => {
-    if (entry.isFile) files.push(await new Promise((resolve, reject) => entry.file(resolve, reject)));
+    if (entry.isFile) files.push(Object.assign(await new Promise((resolve, reject) => entry.file(resolve, reject)), { place: entry.fullPath.slice(1) }));
     else {
       const reader = entry.createReader();
       for (;;) {

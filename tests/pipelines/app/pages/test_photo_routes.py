@@ -8,6 +8,7 @@ import time
 import zipfile
 import zlib
 from pathlib import Path
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -111,6 +112,52 @@ def test_a_film_is_taken_apart(address: str, tmp_path: Path) -> None:
     assert client.send("PUT", f"{path}/uploads/lamp.mp4", b"nothing")[0] == 200
     job = client.wait(client.post(f"{path}/start/check"))
     assert job["state"] == "failed" and job["message"].startswith("lamp.mp4: damaged or not a film")
+
+
+def test_poses_are_told_apart(address: str, hills: Path) -> None:
+    """As a folder and as a ZIP; a pose is looked at, and inferred, by its name."""
+    files = {
+        f"ps_{pose}/{path.name}": path.read_bytes() for pose in ("left", "right") for path in hills.glob("[1-4].png")
+    }
+    masks = {f"{pose}.png": (hills / "mask.png").read_bytes() for pose in ("left", "right")}
+    for zipped in (False, True):
+        client = Client(address)
+        path = client.new_set()
+        sent = (
+            {"all.zip": archive(**files, **masks)} if zipped else {f"toy/{name}": data for name, data in files.items()}
+        )
+        for name, data in sent.items():
+            assert client.send("PUT", f"{path}/uploads/{quote(name, safe='')}", data)[0] == 200
+        checked = client.wait(client.post(f"{path}/start/check", {"pose": "right"}))["result"]
+        assert (checked["poses"], checked["pose"]) == (["left", "right"], "right")
+        assert checked["mask"] == ("file" if zipped else "automatic")
+        assert len(checked["files"]) == 4
+    shown = client.wait(client.post(f"{path}/start/infer", {"method": "factorisation", "pose": "left"}))["result"]
+    assert shown["pose"] == "left"
+    job = client.wait(client.post(f"{path}/start/check", {"pose": "lift"}))
+    assert job["state"] == "failed" and "did you mean 'left'" in job["message"]
+    path, picture = client.new_set(), (hills / "1.png").read_bytes()
+    there = (("ps_a.png", 200), ("ps_a.png/1.png", 400), ("ps_b.png/1.png", 200), ("ps_b.png", 400))  # a file, a folder
+    for name, expected in (*there, ("ps_b.png/1.png", 400)):
+        status, said = client.send("PUT", f"{path}/uploads/{quote(name, safe='')}", picture)
+        assert status == expected and ("two files of this name" in said.decode()) == (status == 400), name
+
+
+def test_what_will_happen_is_said_before_it_starts(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+
+    def check(**asked: object) -> dict:
+        return client.wait(client.post(f"{path}/start/check", asked))["result"]
+
+    said = dict(check(method="factorisation", pixel_size="0.5", scale="0.5")["work"])
+    assert "pictures of 36x36: about" in said["time"] and "GiB of memory" in said["time"]
+    assert said["size"].startswith("1 mm a pixel") and said["results"].endswith("report.html into the ZIP")
+    assert said["files"].startswith("1.png to 12.png") and said["object"] and said["curve"] and said["camera"]
+    refused = check(method="least-squares")
+    assert refused["work"] == [] and "needs the lights" in refused["trouble"] and "--" not in refused["trouble"]
+    film = client.wait(client.post(f"{path}/start/check", {"every": 2}))
+    assert film["state"] == "failed" and film["message"].startswith('"Every so many frames" 2: ')
 
 
 def test_a_focal_length_is_used(address: str, hills: Path) -> None:
