@@ -6,6 +6,7 @@ A set of photographs is a folder with `photos` (what was uploaded), `painted.png
 
 import argparse
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ from render.shared.files import write_json
 from render.shared.progress import share_out, stage
 
 if TYPE_CHECKING:
-    from sdps.photos import Photographs, Pose
+    from sdps.photos import Finding, Photographs, Pose
 
 VIEW, TRUTH = "view", "truth.npy"
 _EXAMPLE = {"shape": "bunny", "material": "red-phenolic", "lights": "near-uniform:48", "size": 256, "spp": 32}
@@ -89,13 +90,16 @@ def check(place: str, **asked: Any) -> dict[str, Any]:
         "mask": photos.mask_origin if not (folder / PAINTED).is_file() else "painted",
         "pixels": int(photos.mask.sum()), "notes": [say_plainly(note) for note in photos.notes],
         "lit": photos.light_directions is not None, "balls": [_show_ball(ball) for ball in photos.balls],
-        "findings": [{"level": item.level, "text": say_plainly(item.text), "images": list(item.images)}
-                     for item in findings],
+        "findings": _list_findings(findings),
         "lights_there": _has_lights(folder / PHOTOS), "methods": list_methods(photos.light_directions is not None),
         "poses": [one.name for one in poses], "pose": pose.name, "film": pose.room is not None,
         "pictures": sorted(path.name for path in pose.folder.iterdir() if path.suffix.lower() in PICTURES),
         "work": [[name, say_plainly(text)] for name, text in work.items()], "trouble": say_plainly(trouble),
     }  # fmt: skip
+
+
+def _list_findings(findings: "Sequence[Finding]") -> list[dict[str, Any]]:
+    return [{"level": item.level, "text": say_plainly(item.text), "images": list(item.images)} for item in findings]
 
 
 def _draw(photos: "Photographs", view: Path) -> None:
@@ -150,7 +154,7 @@ def list_methods(lit: bool) -> list[dict[str, str]]:
     from sdps.models.registry import COMBINATIONS
 
     there = sdps.available_methods()
-    found = [{"name": "auto", "about": "the best method for these photographs (recommended)"}]
+    found = [{"name": "auto", "about": "the best there is for these photographs"}]
     for name, about in there.items():
         combined = name in COMBINATIONS
         classical = name in METHODS and METHODS[name].calibrated == lit
@@ -183,13 +187,14 @@ def infer(place: str, number: int, **asked: Any) -> dict[str, Any]:
     with share_out(_INFERRING | (_REFINING if refined else {})), speak_plainly(folder):
         stage("reading")
         poses, pose = find_poses(folder, answers)
-        result, _ = infer_pose(make_arguments(folder, pose, answers), pose, lambda text: None)
+        result, said = infer_pose(make_arguments(folder, pose, answers), pose, lambda text: None)
         (run / VIEW).mkdir(parents=True, exist_ok=True)
         shown = object_view.write(result, run / VIEW)
         result.save(run / "files")
         write_page(run / "files" / "report.html", result)
     shown |= {"number": number, "error": _measure_error(folder, result.normals, result.photos.mask)}
     shown |= {"pose": pose.name if len(poses) > 1 else "", "exports": list_exports()}
+    shown["findings"] = _list_findings(result.findings[said:])
     shown |= {key: say_plainly(shown[key]) for key in ("verdict", "camera", "lamps")}
     write_json(run / ASKED, answers)
     write_json(run / VIEW / "view.json", shown)

@@ -6,7 +6,7 @@ import { MaskPainter } from "./mask_painter.js";
 import { MeshView } from "./mesh_view.js";
 import { LightPad, Reflectance } from "./relight.js";
 
-const state = { set: null, checked: null, runs: [], run: null, mesh: null, thumbs: [] };
+const state = { set: null, checked: null, runs: [], run: null, mesh: null, told: 0 };
 const painter = new MaskPainter($("mask"), () => { $("mask-use").disabled = $("mask-reset").disabled = false; });
 const balls = new BallCircles($("ball-circles"), $("mask"), $("balls"), () => { $("ball-use").disabled = false; });
 const inSet = (path) => `/photographs/sets/${state.set}/${path}`;
@@ -84,8 +84,10 @@ const options = () => ({
 
 async function check(more = {}, box = $("load-status")) {
   try {
+    const told = state.told;
     const found = await follow(await post(inSet("start/check"), { ...options(), ...more }), box, "Checks");
     if (found) review(found, box === $("load-status"));
+    if (found && told !== state.told) doubt(); // answers changed meanwhile
   } catch (error) { showError(box, error); }
 }
 
@@ -94,6 +96,9 @@ function fillSelect(id, rows) {
   $(id).replaceChildren(...rows.map(([value, text]) => element("option", { value }, text)));
   if (rows.some(([value]) => value === chosen)) $(id).value = chosen;
 }
+
+const listFindings = ({ findings, files }) => findings.map(({ level, text, images }) => element("li", { class: level }, element("b", {}, `${level}: `), text,
+  images.length && images.length < files.length ? element("span", { class: "note" }, ` (${images.slice(0, 6).join(", ")}${images.length > 6 ? ", ..." : ""})`) : ""));
 
 // Say what a run would do, or what would stop it.
 function foresee(found) {
@@ -105,6 +110,7 @@ function foresee(found) {
 }
 
 function doubt() {
+  state.told += 1;
   $("foresee").disabled = false;
   $("work").classList.add("old");
 }
@@ -117,9 +123,7 @@ function review(found, first = true) {
   const stamp = Date.now();
   $("thumbs").replaceChildren(...found.files.map((name, number) => element("figure", { class: marked.has(name) ? "marked" : "" },
     element("img", { src: inSet(`files/view/${number}.jpg?${stamp}`), alt: name, loading: "lazy" }), element("figcaption", { title: name }, name))));
-  const items = found.findings.map(({ level, text, images }) => element("li", { class: level }, element("b", {}, `${level}: `), text,
-    images.length && images.length < found.files.length ? element("span", { class: "note" }, ` (${images.slice(0, 6).join(", ")}${images.length > 6 ? ", ..." : ""})`) : ""));
-  $("findings").replaceChildren(...(items.length ? items : [element("li", {}, "No problems found.")]));
+  $("findings").replaceChildren(...(found.findings.length ? listFindings(found) : [element("li", {}, "No problems found.")]));
   $("notes").replaceChildren(...found.notes.map((note) => element("li", {}, note)));
   $("lights-row").hidden = !found.lights_there;
   fillSelect("method", found.methods.map(({ name }) => [name, name === "auto" ? "recommended" : name]));
@@ -179,14 +183,19 @@ async function show(run) {
     button.addEventListener("click", () => show(other));
     return button;
   }));
-  const facts = [`method: ${run.method}`, `${seconds(run.seconds)}`, `${run.components} part${run.components > 1 ? "s" : ""}`, `integrability: ${run.integrability}°`];
-  if (run.camera?.startsWith("perspective")) facts.push(`camera: ${run.camera}`);
+  const facts = [];
+  if (run.expected !== null) facts.push(`normals are probably off by ${run.expected}°`);
+  if (run.error !== null) facts.push(`they are off by ${run.error}°: the truth is known here`);
   if (run.lamps) facts.push(run.lamps);
-  if (run.residual !== null) facts.push(`deviation from Lambert's law: ${run.residual}`);
-  if (run.error !== null) facts.push(`error of the normals: ${run.error}°`);
+  if (run.camera?.startsWith("perspective")) facts.push(`camera: ${run.camera}`);
+  facts.push(`normals and surface disagree by ${run.integrability}°`);
+  if (run.residual !== null) facts.push(`${Math.round(100 * run.residual)} % of the brightness is not that of a matt surface`);
+  if (run.components > 1) facts.push(`${run.components} parts`);
+  facts.push(`took ${seconds(run.seconds)}`);
   $("verdict").hidden = !run.verdict;
   $("verdict").textContent = run.verdict;
   $("run-facts").replaceChildren(...facts.map((text) => element("span", {}, text)), ...(run.terms ? [element("span", {}, `weights: ${run.terms}`)] : []));
+  $("run-findings").replaceChildren(...listFindings(run));
   $("download").href = inSet(`runs/${run.number}/download`);
   $("report").href = inSet(`files/runs/${run.number}/files/report.html`);
   listExports(run);
@@ -212,7 +221,7 @@ function listExports(run) {
   $("export-status").hidden = true;
   $("exports").replaceChildren(...run.exports.map(({ name, who, what }) => {
     const button = element("button", { type: "button", class: "secondary", "aria-label": `Get ${what} for ${who}` }, "Get");
-    const row = element("li", {}, element("p", {}, element("b", {}, who), element("br"), element("span", {}, what)), button);
+    const row = element("li", {}, element("p", {}, element("b", {}, who), element("span", {}, what)), button);
     button.addEventListener("click", () => takeAway(run, name, row, button));
     return row;
   }));
@@ -286,7 +295,7 @@ function drawChart({ observed, model }, [row, column], run) {
   if (model) svg.append(element("polyline", { points: model.map((v, i) => `${x(i)},${y(v)}`).join(" "), fill: "none", stroke: "var(--accent)", "stroke-width": 0.7 }));
   observed.forEach((v, i) => svg.append(element("circle", { cx: x(i), cy: y(v), r: 0.9, fill: "#e0702c" }, element("title", {}, `${run.files[i]}: ${v.toFixed(4)}`))));
   $("chart").replaceChildren(svg);
-  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: ${run.tables ? "the refined model" : "Lambert's law"} for what was found. ` : ""}Highest: ${most.toFixed(3)}.`;
+  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: what ${run.tables ? "was found" : "a matt surface"} would look like. ` : ""}Highest: ${most.toFixed(3)}.`;
 }
 
 // ---- Comparison ----
@@ -335,7 +344,7 @@ $("ball-use").addEventListener("click", () => check());
 $("method").addEventListener("change", describeMethod);
 $("foresee").addEventListener("click", () => check({}, $("run-status")));
 for (const id of ["pose", "every"]) $(id).addEventListener("change", () => check());
-$("form").addEventListener("change", doubt);
+$("form").addEventListener("input", doubt);
 for (const id of ["gamma", "lights", "frame"]) $(id).addEventListener("change", () => { if (id !== "frame" || $("lights").checked) check({}, $("run-status")); });
 $("light-distance").addEventListener("change", () => { $("distance").hidden = $("distance-note").hidden = $("light-distance").value !== ""; });
 $("form").addEventListener("submit", infer);

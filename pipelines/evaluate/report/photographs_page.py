@@ -177,9 +177,9 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
     checks = Table(title="Checks", header=("level", "what"), rows=(*findings, *notes), prose=(1,))
     facts = result.summary()
     rows = [("seconds", f"{facts['seconds']:.1f}"), ("parts of the surface", str(result.depth.components)),
-            ("integrability, RMS residual", f"{result.depth.residual:.2f}°")]  # fmt: skip
+            ("normals and surface disagree by", f"{result.depth.residual:.2f}°")]  # fmt: skip
     if result.residuals is not None:
-        rows.append(("photographs against Lambert's law, relative RMS", f"{result.residuals.overall:.3f}"))
+        rows.append(("brightness that a matt surface does not explain", f"{result.residuals.overall:.0%}"))
     rows += _refinement_rows(facts)
     if "expected_normal_error_degrees" in facts and ("fused" in facts or "refined" not in facts):
         rows.append(("error of the normals to expect", f"{facts['expected_normal_error_degrees']}°"))
