@@ -286,11 +286,12 @@ def _tell_flat(found: Estimate, flat: Flatness) -> Iterator[Finding]:
     """Say what was done with a flat thing, where something was."""
     if found.tilt is not None:
         why = "Said to be flat" if flat.asked else "This looks like a flat thing"
+        other = "--flat" if flat.wish == "turned" else "--flat turned"
         slow = f" Slopes were flattened over {flat.share:.0%} of the width." if flat.share else ""
         yield Finding(
             "note",
             f"{why}: its mean plane, {found.tilt:.0f} degrees off, was made to face the camera.{slow} If what stands "
-            "out is hollow, use --flat turned; if it is not flat, --flat no.",
+            f"out is hollow, use {other}; if it is not flat, --flat no.",
         )
 
 

@@ -31,12 +31,14 @@ _SAID = {
     r"run `sdps infer` again": "find the surface again",
     r" \(in Python load\([^)]*\)\)": "",
     r" \(--focal\)": ", as given",
+    r"orthographic, looking along -z": "taken for far away: no focal length is known",
     r"; --images takes what it names": "",
     r"--images '!([^']*)'": r"load them again without \1",
     r"(name (?:one|the right one)) with --mask(?: FILE)?": "load one",
     r"--principal COLUMN,ROW": '"Principal point"',
     r"--flat turned": '"Is it flat?": yes, but hollow',
     r"--flat no\b": '"Is it flat?": no',
+    r"use --flat\b": 'use "Is it flat?": yes',
     r"--intensities equal": '"How strong the lamps were": all equally strong',
 }  # fmt: skip
 _LABELS = {

@@ -131,7 +131,7 @@ function review(found, first = true) {
   fillSelect("pose", found.poses.map((name) => [name, name]));
   $("pose-row").hidden = $("all-poses").hidden = found.poses.length < 2;
   $("every-row").hidden = !found.film;
-  for (const [id, word] of [["ambient", "ambient"], ["dark", "dark"]]) fillSelect(id, [["", `the one with "${word}" in its name, if there is one`], ["none", "none"], ...found.pictures.map((name) => [name, name])]);
+  for (const [id, word] of [["ambient", "ambient"], ["dark", "dark"]]) fillSelect(id, [["", `by its name ("${word}")`], ["none", "none"], ...found.pictures.map((name) => [name, name])]);
   foresee(found);
   painter.load(inSet(`files/view/picture.jpg?${stamp}`), inSet(`files/view/mask.png?${stamp}`));
   balls.load(found.width, found.height, found.balls);
@@ -184,11 +184,11 @@ async function show(run) {
     return button;
   }));
   const facts = [];
-  if (run.expected !== null) facts.push(`normals are probably off by ${run.expected}°`);
-  if (run.error !== null) facts.push(`they are off by ${run.error}°: the truth is known here`);
+  if (run.expected !== null) facts.push(`normals are probably off by ${run.expected.toFixed(1)}°`);
+  if (run.error !== null) facts.push(`they are off by ${run.error.toFixed(1)}°: the truth is known here`);
   if (run.lamps) facts.push(run.lamps);
   if (run.camera?.startsWith("perspective")) facts.push(`camera: ${run.camera}`);
-  facts.push(`normals and surface disagree by ${run.integrability}°`);
+  facts.push(`normals and surface disagree by ${run.integrability.toFixed(1)}°`);
   if (run.residual !== null) facts.push(`${Math.round(100 * run.residual)} % of the brightness is not that of a matt surface`);
   if (run.components > 1) facts.push(`${run.components} parts`);
   facts.push(`took ${seconds(run.seconds)}`);

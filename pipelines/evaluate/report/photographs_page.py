@@ -64,11 +64,13 @@ def _section(result: "Inference") -> SectionWriter:
     from sdps.surface.views import strip
 
     photos, mask = result.photos, result.photos.mask
+    sure = result.expected_error
     text = (
-        f"{len(photos)} photographs of {photos.shape[1]}x{photos.shape[0]} pixels, {photos.bits} bits, gamma "
-        f"{photos.gamma}; mask: {photos.mask_origin}, {int(mask.sum())} pixels. Method: {result.method}. Frame: "
-        f"x right, y up, z to the camera; lights from the surface to the light. The camera is {name_camera(photos)}. "
-        f"{tell_lamps(result)}"
+        f"{'' if sure is None else f'The normals are probably off by {sure[mask].mean():.1f} degrees. '}"
+        f"{tell_lamps(result)} The camera is {name_camera(photos)}. {len(photos)} photographs of {photos.shape[1]}x"
+        f"{photos.shape[0]} pixels, {photos.bits} bits, tone curve {photos.gamma}; mask: {photos.mask_origin}, "
+        f"{int(mask.sum())} pixels. Method: {result.method}. Axes: x right, y up, z to the camera; lights from the "
+        "surface to the light."
     )
     section = Section(
         name="photographs",

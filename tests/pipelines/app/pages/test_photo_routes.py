@@ -168,7 +168,7 @@ def test_a_focal_length_is_used(address: str, hills: Path) -> None:
         return client.wait(client.post(f"{path}/start/infer", {"method": "factorisation", "focal": focal}))
 
     assert infer("50")["result"]["camera"] == "perspective, focal length 118 px, as given"  # of 72 x 72 pixels
-    assert infer("")["result"]["camera"] == "orthographic, looking along -z"
+    assert infer("")["result"]["camera"] == "taken for far away: no focal length is known"
     assert infer("400px")["result"]["camera"] == "perspective, focal length 400 px, as given"
     for focal, said in (
         ("0mm", '"Focal length" 0mm: must be above 0'),
@@ -217,7 +217,9 @@ def test_a_flat_thing_at_a_size_that_fits(address: str, hills: Path) -> None:
     client = Client(address)
     path = client.new_set(hills)
     asked = {"method": "factorisation", "flat": "turned", "scale": "auto"}
-    assert client.wait(client.post(f"{path}/start/infer", asked))["state"] == "done"
+    job = client.wait(client.post(f"{path}/start/infer", asked))
+    assert job["state"] == "done"
+    assert 'hollow, use "Is it flat?": yes; if it is not flat, "Is it flat?": no' in job["result"]["findings"][-1]["text"]
     with zipfile.ZipFile(io.BytesIO(client.get(f"{path}/runs/1/download"))) as opened:
         facts = json.loads(opened.read("result.json"))
     assert facts["flat"]["tilt_degrees"] > 0.0 and facts["scale"] == 1.0
