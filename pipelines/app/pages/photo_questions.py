@@ -12,7 +12,8 @@ from render.shared.errors import InputError, unknown
 if TYPE_CHECKING:
     from sdps.photos import Pose
 
-PHOTOS, PAINTED = "photos", "painted.png"
+PHOTOS, PAINTED, BALL = "photos", "painted.png", "ball-{}"
+"""In a set: the photographs, a mask painted on the page, and pictures of a ball alone, the first to the ninth time."""
 _CHOICES = {
     "gamma": ("auto", "linear", "srgb", "2.2"),
     "scale": ("1", "0.5", "0.25", "auto"),
@@ -22,7 +23,7 @@ _CHOICES = {
 }
 _TEXTS = {"method": "auto", "frame": "y-up", "light_distance": "auto", "focal": "", "principal": "", "ambient": "",
           "dark": "", "pose": ""}  # fmt: skip
-_NUMBERS = {"pixel_size": float, "every": int}
+_NUMBERS = {"pixel_size": float, "every": int, "ball_alone": int}
 _TICKED = ("lights", "refine", "anyway", "discontinuities")
 _LONGEST = 80
 _MOST_BALLS, _BALL = 8, re.compile(r"(?:chrome:|white:)?(?:auto|-?[0-9.]{1,20}(?:,-?[0-9.]{1,20}){2})")
@@ -69,7 +70,7 @@ def read_answers(asked: dict[str, Any]) -> dict[str, Any]:
         try:
             found[name] = None if given in (None, "") else kind(given)
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"{_LABELS[name.replace('_', '-')]}: must be a number") from error
+            raise InputError(f"{_LABELS.get(name.replace('_', '-'), name)}: must be a number") from error
     return found | {name: asked.get(name) is True for name in _TICKED} | {"balls": _read_balls(asked.get("balls"))}
 
 
@@ -117,7 +118,8 @@ def make_arguments(place: Path, pose: "Pose", answers: dict[str, Any]) -> argpar
     args.focal = (f"{focal}mm" if focal[-1:].isdigit() else focal) or None  # the page asks for millimetres
     args.scale = answers["scale"] if answers["scale"] == "auto" else float(answers["scale"])
     args.refine, args.flatten = None if answers["refine"] else False, float(answers["flatten"])
-    args.ball = answers["balls"] or None
+    alone = [str(place / BALL.format(answers["ball_alone"]))] if answers["ball_alone"] else []
+    args.ball = [*answers["balls"], *alone] or None
     for name in ("ambient", "dark"):
         said = answers[name]
         setattr(args, name, (said or None) if said in ("", "none") else pose.folder / Path(said).name)

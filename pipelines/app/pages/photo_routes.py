@@ -19,7 +19,7 @@ from pipelines.app.common.refusals import Refused
 from pipelines.app.common.sessions import Session
 from pipelines.app.common.uploads import Limits
 from pipelines.app.pages.handling import accept_uploads, find_file, queue_task, read_number
-from pipelines.app.pages.photo_questions import PAINTED, PHOTOS, read_answers
+from pipelines.app.pages.photo_questions import BALL, PAINTED, PHOTOS, read_answers
 from render.shared.decoding import decoding
 from render.shared.errors import InputError, unknown
 
@@ -42,13 +42,17 @@ async def make_set(request: Request) -> Response:
 
 @accept_uploads
 async def upload(request: Request) -> Response:
-    """Receive one file, or a ZIP, which is unpacked at once: all of its files or none."""
+    """Receive a photograph, a picture of a ball alone, or a ZIP, which is unpacked at once: all or nothing."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
     name, given = request.path_params["set"], request.path_params["name"]
-    folder = session.find_place(name) / PHOTOS
+    place, ball = session.find_place(name), "ball" in request.path_params
+    folder = place / (BALL.format(read_number(request, "ball")) if ball else PHOTOS)
     zipped = given.lower().endswith(".zip")
     given = str(uploads.clean_place(given, (".zip",) if zipped else uploads.USABLE))
+    if ball:
+        given = Path(given).name
+        folder.mkdir(exist_ok=True)
     if len(list_files(folder)) >= limits.files:
         raise InputError(f"more than {limits.files} files; leave some out")
     async with open_upload(session, limits.bytes, name) as coming:
@@ -179,6 +183,7 @@ def _find_run(request: Request) -> Path:
 ROUTES = [
     Route("/sets", make_set, methods=["POST"]),
     Route("/sets/{set}/uploads/{name:path}", upload, methods=["PUT"]),
+    Route("/sets/{set}/ball/{ball}/{name:path}", upload, methods=["PUT"]),
     Route("/sets/{set}/mask", upload_mask, methods=["PUT"]),
     Route("/sets/{set}/start/{task}", start_task, methods=["POST"]),
     Route("/sets/{set}/files/{path:path}", send_file),

@@ -6,7 +6,7 @@ import { MaskPainter } from "./mask_painter.js";
 import { MeshView } from "./mesh_view.js";
 import { LightPad, Reflectance } from "./relight.js";
 
-const state = { set: null, checked: null, runs: [], run: null, mesh: null, told: 0 };
+const state = { set: null, checked: null, runs: [], run: null, mesh: null, told: 0, alone: 0, alones: 0 };
 const painter = new MaskPainter($("mask"), () => { $("mask-use").disabled = $("mask-reset").disabled = false; });
 const balls = new BallCircles($("ball-circles"), $("mask"), $("balls"), () => { $("ball-use").disabled = false; });
 const inSet = (path) => `/photographs/sets/${state.set}/${path}`;
@@ -17,24 +17,28 @@ async function begin() {
   state.set = (await post("/photographs/sets")).set;
   state.runs = [];
   balls.balls = [];
+  state.alone = state.alones = 0;
   for (const id of ["pose", "ambient", "dark"]) $(id).replaceChildren();
   $("every").value = "";
   for (const id of ["review", "choose", "results"]) $(id).hidden = true;
 }
 
-async function upload(files) {
+// Load photographs, which begins a new set, or pictures of a ball alone.
+async function upload(files, alone = false) {
   const box = $("load-status");
   try {
     if (!files.length) throw new Error("none of the chosen files can be used");
-    await begin();
+    if (!alone) await begin();
+    const place = alone ? `ball/${state.alones += 1}` : "uploads";
     const bar = element("progress", { max: files.length, value: 0, "aria-label": "Uploading" });
     box.className = "status";
     box.replaceChildren(`Loading ${files.length} file${files.length > 1 ? "s" : ""}`, bar);
     box.hidden = false;
     for (const file of files) {
-      await ask(inSet(`uploads/${encodeURIComponent(file.place || file.webkitRelativePath || file.name)}`), { method: "PUT", body: file });
+      await ask(inSet(`${place}/${encodeURIComponent(file.place || file.webkitRelativePath || file.name)}`), { method: "PUT", body: file });
       bar.value += 1;
     }
+    if (alone) state.alone = state.alones;
     await check();
   } catch (error) { showError(box, error); }
 }
@@ -79,7 +83,7 @@ const ANSWERED = ["method", "gamma", "frame", "scale", "flat", "flatten", "ambie
 // Return the answers to all questions of the page, as the server reads them.
 const options = () => ({
   ...Object.fromEntries([...TICKED.map((id) => [id, $(id).checked]), ...ANSWERED.map((id) => [id, $(id).value])]),
-  pixel_size: $("pixel-size").value, light_distance: $("light-distance").value || $("distance").value, balls: balls.values(),
+  pixel_size: $("pixel-size").value, light_distance: $("light-distance").value || $("distance").value, balls: balls.values(), ball_alone: state.alone || "",
 });
 
 async function check(more = {}, box = $("load-status")) {
@@ -135,6 +139,8 @@ function review(found, first = true) {
   foresee(found);
   painter.load(inSet(`files/view/picture.jpg?${stamp}`), inSet(`files/view/mask.png?${stamp}`));
   balls.load(found.width, found.height, found.balls);
+  $("ball-alone").hidden = !state.alone;
+  $("ball-alone").firstChild.textContent = `The lights are those of a ${found.ball_alone} ball in pictures of its own.`;
   $("mask-use").disabled = $("ball-use").disabled = true;
   $("mask-reset").disabled = found.mask !== "painted";
   $("review").hidden = $("choose").hidden = false;
@@ -340,6 +346,9 @@ $("mask-use").addEventListener("click", async () => sendMask(await painter.blob(
 $("mask-reset").addEventListener("click", () => sendMask(new Blob([])));
 $("ball-find").addEventListener("click", () => check({ balls: ["auto"] }));
 $("ball-add").addEventListener("click", () => balls.add());
+$("ball-load").addEventListener("click", () => $("ball-files").click());
+$("ball-files").addEventListener("change", () => { const chosen = filterUsable($("ball-files").files); $("ball-files").value = ""; upload(chosen, true); });
+$("ball-leave").addEventListener("click", () => { state.alone = 0; check(); });
 $("ball-use").addEventListener("click", () => check());
 $("method").addEventListener("change", describeMethod);
 $("foresee").addEventListener("click", () => check({}, $("run-status")));

@@ -213,13 +213,30 @@ def test_balls_are_found_and_used(address: str, tmp_path: Path) -> None:
         )
 
 
+def test_a_ball_in_pictures_of_its_own(address: str, hills: Path, tmp_path: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+    for number, lamp in enumerate(LIGHTS, start=1):
+        write_balls(tmp_path, [paint(lamp, 1.0)])  # whose object is a white ball
+        (picture,) = tmp_path.glob("*.png")
+        assert client.send("PUT", f"{path}/ball/1/{number}.png", picture.read_bytes())[0] == 200
+    found = client.wait(client.post(f"{path}/start/check", {"ball_alone": 1}))["result"]
+    assert found["lit"] and found["balls"] == [] and found["ball_alone"] == "white"
+    assert len(found["files"]) == len(LIGHTS)
+    job = client.wait(client.post(f"{path}/start/infer", {"method": "least-squares", "ball_alone": 1}))
+    assert np.abs(np.array(job["result"]["lights"]) - LIGHTS).max() < 0.05
+    job = client.wait(client.post(f"{path}/start/check", {"ball_alone": 2}))
+    assert job["state"] == "failed" and "no such folder" in job["message"]
+
+
 def test_a_flat_thing_at_a_size_that_fits(address: str, hills: Path) -> None:
     client = Client(address)
     path = client.new_set(hills)
     asked = {"method": "factorisation", "flat": "turned", "scale": "auto"}
     job = client.wait(client.post(f"{path}/start/infer", asked))
     assert job["state"] == "done"
-    assert 'hollow, use "Is it flat?": yes; if it is not flat, "Is it flat?": no' in job["result"]["findings"][-1]["text"]
+    said = job["result"]["findings"][-1]["text"]
+    assert 'hollow, use "Is it flat?": yes; if it is not flat, "Is it flat?": no' in said
     with zipfile.ZipFile(io.BytesIO(client.get(f"{path}/runs/1/download"))) as opened:
         facts = json.loads(opened.read("result.json"))
     assert facts["flat"]["tilt_degrees"] > 0.0 and facts["scale"] == 1.0
