@@ -301,7 +301,7 @@ function drawChart({ observed, model }, [row, column], run) {
   if (model) svg.append(element("polyline", { points: model.map((v, i) => `${x(i)},${y(v)}`).join(" "), fill: "none", stroke: "var(--accent)", "stroke-width": 0.7 }));
   observed.forEach((v, i) => svg.append(element("circle", { cx: x(i), cy: y(v), r: 0.9, fill: "#e0702c" }, element("title", {}, `${run.files[i]}: ${v.toFixed(4)}`))));
   $("chart").replaceChildren(svg);
-  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: what ${run.tables ? "was found" : "a matt surface"} would look like. ` : ""}Highest: ${most.toFixed(3)}.`;
+  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: computed ${run.tables ? "from what was found" : "for a matt surface"}. ` : ""}Highest: ${most.toFixed(3)}.`;
 }
 
 // ---- Comparison ----
