@@ -139,9 +139,9 @@ def rehearse(args: argparse.Namespace, pose: "Pose") -> int:
     from sdps.api import ask_about_lights, plan, stop
 
     photos, findings, options = look_through(args, pose, sys.stdout.write)
-    sys.stdout.write(dry_run.describe_input(photos))
+    sys.stdout.write(dry_run.write_rows(dry_run.list_input(photos)))
     expected = plan(photos, args.method, **options)
-    sys.stdout.write(f"{expected.describe()}\n{dry_run.describe_work(expected, args.out)}")
+    sys.stdout.write(f"{expected.describe()}\n{dry_run.write_rows(dry_run.list_work(expected, args.out))}")
     sys.stdout.flush()
     stop(photos, findings, args.anyway)
     if not args.anyway:

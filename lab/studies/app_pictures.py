@@ -22,6 +22,7 @@ from playwright.sync_api import sync_playwright
 
 _WIDTH, _HEIGHT, _PATIENCE = 1000, 760, 600_000  # pixels; milliseconds a step may take
 _QUALITY = 85
+_NARROW = 900  # pixels of the tall pictures
 
 
 def main() -> int:
@@ -63,8 +64,12 @@ def _wait(address: str) -> None:
     raise SystemExit(f"{address}: no answer")
 
 
-def _keep(png: bytes, path: Path) -> None:
+def _keep(png: bytes, path: Path, width: int = 0) -> None:
+    """Write a picture, reduced to a width where one is named."""
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    if width:
+        height = round(picture.shape[0] * width / picture.shape[1])
+        picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
 
 
@@ -74,14 +79,14 @@ def _photographs(page: Any, args: argparse.Namespace, address: str) -> None:
     page.click("#example")
     page.wait_for_selector("#findings li")
     page.wait_for_timeout(1000)
-    _keep(page.locator("#main").screenshot(), args.out / "app_photographs.jpg")
+    _keep(page.locator("#main").screenshot(), args.out / "app_photographs.jpg", _NARROW)
     page.click("#start")
     page.locator("#mesh canvas").wait_for()
     page.locator("#relit-light input").first.fill("135")
     page.locator(".hover").focus()
     page.keyboard.press("ArrowDown")
     page.wait_for_timeout(3000)
-    _keep(page.locator("#results").screenshot(), args.out / "app_results.jpg")
+    _keep(page.locator("#results").screenshot(), args.out / "app_results.jpg", _NARROW)
 
 
 def _studio(page: Any, args: argparse.Namespace, address: str) -> None:

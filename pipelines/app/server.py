@@ -18,7 +18,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from pipelines.app.common.jobs import Jobs
-from pipelines.app.common.refusals import Refused
+from pipelines.app.common.refusals import Refused, format_size
 from pipelines.app.common.sessions import COOKIE, Sessions
 from pipelines.app.common.uploads import USABLE, Limits, list_kinds
 from pipelines.app.pages import data_routes, photo_routes, studio_routes
@@ -131,7 +131,8 @@ async def _send_page(request: Request) -> Response:
     accepted = ",".join((*USABLE, ".zip"))
     template = HERE / "templates" / f"{name}.html.j2"
     return HTMLResponse(
-        fill(template, pages=PAGES, page=name, limits=limits, accepted=accepted, kinds=list_kinds()),
+        fill(template, pages=PAGES, page=name, limits=limits, accepted=accepted, kinds=list_kinds(),
+             size=format_size(limits.bytes)),
     )  # fmt: skip
 
 

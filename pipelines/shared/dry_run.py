@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from sdps.surface.workload import Workload
 
 
-def describe_input(photos: "Photographs") -> str:
-    """Return one line each: kind of files, curve, object, lights, camera and size."""
+def list_input(photos: "Photographs") -> dict[str, str]:
+    """Say, by name: kind of files, curve, object, lights, camera and size."""
     share, mask = photos.mask.mean(), photos.mask
     curves = {"linear": "linear, taken as it is", "srgb": "sRGB, taken off"}
     curve = curves.get(str(photos.gamma), f"a power of {photos.gamma}, taken off")
     sides = [int(np.ptp(np.flatnonzero(mask.any(axis=axis)))) + 1 for axis in (1, 0)]
     where = "the whole frame" if mask.all() else f"{sides[1]}x{sides[0]} pixels around it, {share:.0%} of the frame"
-    rows = {
+    return {
         "files": f"{photos.files[0]} to {photos.files[-1]}, {photos.coding}",
         "curve": curve,
         "object": f"{int(mask.sum()):,} pixels, {where}; mask: {photos.mask_origin}",
@@ -27,16 +27,19 @@ def describe_input(photos: "Photographs") -> str:
         "camera": photos.camera_summary,
         "size": _name_size(photos),
     }
-    return "".join(f"{name}: {text}\n" for name, text in rows.items())
 
 
-def describe_work(expected: "Workload", out: Path) -> str:
-    """Return one line each: method, stages with their time, and the files to come."""
-    rows = {
+def list_work(expected: "Workload", out: str | Path) -> dict[str, str]:
+    """Say, by name: method, stages with their time, and the files to come."""
+    return {
         "method": expected.method,
         "stages": expected.describe_stages(),
-        "files": f"{', '.join(expected.files)}, report.html into {out}",
+        "results": f"{', '.join(expected.files)}, report.html into {out}",
     }
+
+
+def write_rows(rows: dict[str, str]) -> str:
+    """Return a line of each."""
     return "".join(f"{name}: {text}\n" for name, text in rows.items())
 
 

@@ -21,6 +21,7 @@ TASKS = {
     "example": "pipelines.app.pages.photo_tasks:render_example",
     "check": "pipelines.app.pages.photo_tasks:check",
     "infer": "pipelines.app.pages.photo_tasks:infer",
+    "export": "pipelines.app.pages.run_exports:export",
     "gallery": "pipelines.app.pages.studio_tasks:render_gallery",
     "scene": "pipelines.app.pages.studio_tasks:render_scene",
     "keep": "pipelines.app.pages.studio_tasks:pack_scene",

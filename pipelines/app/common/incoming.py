@@ -50,32 +50,36 @@ class Incoming:
         self._session.give(size)
         self.size -= size
 
-    def add(self, files: Sequence[Path], folder: Path, most: int) -> int:
+    def add(self, files: Sequence[Path], folder: Path, most: int, base: Path | None = None) -> int:
         """Move files into the place's folder, all or none, and return how many files are there then.
 
         Args:
             files: Complete and checked.
             folder: Of the place.
             most: Files that may be there.
+            base: A folder above the files, below which they lie as they shall lie in the place's; None: just there.
 
         Raises:
             InputError: a duplicate name, too many files, or a place that was removed.
         """
+        names = [file.name if base is None else file.relative_to(base).as_posix() for file in files]
         with self._session.lock:
-            there = list_names(folder)
-            for file in files:
-                if file.name in there:
-                    raise InputError(f"{file.name}: there are two files of this name; rename one")
+            there = list_files(folder)
+            folders = {name.rpartition("/")[0] for name in (*there, *names)}
+            for name in names:
+                if name in there | folders or name.rpartition("/")[0] in there:
+                    raise InputError(f"{name}: there are two files of this name; rename one")
             if len(there) + len(files) > most:
                 raise InputError(f"more than {most} files; leave some out")
-            moved: list[Path] = []
+            moved: list[tuple[Path, Path]] = []
             try:
-                for file in files:
-                    os.rename(file, folder / file.name)
-                    moved.append(file)
+                for file, target in zip(files, (folder / name for name in names), strict=True):
+                    target.parent.mkdir(exist_ok=True)
+                    os.rename(file, target)
+                    moved.append((file, target))
             except OSError:
-                for file in moved:
-                    os.rename(folder / file.name, file)
+                for file, target in moved:
+                    os.rename(target, file)
                 raise
             self._session.keep(self._place, self.size)
             self.size = 0
@@ -195,6 +199,19 @@ def list_names(folder: Path) -> set[str]:
         return set(os.listdir(folder))
     except FileNotFoundError as error:
         raise InputError(GONE) from error
+
+
+def list_files(folder: Path) -> set[str]:
+    """Return the files in a place's folder and in folders in it, by their paths.
+
+    Raises:
+        InputError: the place was removed.
+    """
+    found = set()
+    for name in list_names(folder):
+        below = folder / name
+        found |= {f"{name}/{inner}" for inner in list_names(below)} if below.is_dir() else {name}
+    return found
 
 
 async def run_in_thread(function: Callable[..., T], *values: object) -> T:

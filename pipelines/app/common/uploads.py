@@ -5,7 +5,7 @@ import struct
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from PIL import Image
@@ -14,6 +14,7 @@ from render.shared.errors import InputError
 from render.shared.files import parse_json
 from sdps.photos.light_files import SUFFIXES as LIGHT_FILES
 from sdps.photos.pictures.picture_kinds import FILMS, SUFFIXES, picture_kind
+from sdps.photos.pictures.picture_names import name_layout
 
 PICTURES = tuple(SUFFIXES)
 """Suffixes of the pictures that `sdps infer` and the app read."""
@@ -55,6 +56,17 @@ def clean_name(name: str, allowed: tuple[str, ...] = USABLE) -> str:
     if Path(last).suffix.lower() not in allowed or not Path(last).stem:
         raise InputError(f"{last or 'file'}: cannot be used here; give one of {', '.join(allowed)}")
     return last
+
+
+def clean_place(name: str, allowed: tuple[str, ...] = USABLE) -> PurePosixPath:
+    """Return where a file of this path goes: its clean name, below its folder where that is one of several poses.
+
+    Raises:
+        InputError: as `clean_name`.
+    """
+    last, folders = clean_name(name, allowed), re.split(r"[/\\]", name)[:-1]
+    folder = _NAME.sub("_", folders[-1]).strip(" .")[-_LONGEST // 4 :] if folders else ""
+    return PurePosixPath(folder, last) if name_layout(folder) else PurePosixPath(last)
 
 
 async def read_settings(stream: AsyncIterator[bytes]) -> dict[str, Any]:

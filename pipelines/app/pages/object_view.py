@@ -72,6 +72,7 @@ def write(result: "Inference", folder: Path) -> dict[str, Any]:
         "confidence": [confidence[name] for name in result.photos.files] if confidence else [],
         "components": result.depth.components, "integrability": facts["depth"]["residual_degrees"],
         "residual": facts.get("lambertian_residual"), "camera": facts["camera"],
+        "expected": facts.get("expected_normal_error_degrees"),
         "lamps": facts["lamps"]["text"],
         "distances": [] if facts["lamps"]["far"] else _round_distances(result.lamp_distances),
     }  # fmt: skip

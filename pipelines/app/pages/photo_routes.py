@@ -2,9 +2,6 @@
 
 import asyncio
 import io
-import re
-import threading
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -15,27 +12,22 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from pipelines.app.common import uploads
-from pipelines.app.common.archives import unpack
-from pipelines.app.common.incoming import Incoming, list_names, open_upload, receive, run_in_thread
+from pipelines.app.common.archives import pack, unpack
+from pipelines.app.common.incoming import Incoming, list_files, open_upload, receive, run_in_thread
 from pipelines.app.common.jobs import replace_nonfinite
 from pipelines.app.common.refusals import Refused
 from pipelines.app.common.sessions import Session
 from pipelines.app.common.uploads import Limits
 from pipelines.app.pages.handling import accept_uploads, find_file, queue_task, read_number
+from pipelines.app.pages.photo_questions import BALL, PAINTED, PHOTOS, read_answers
 from render.shared.decoding import decoding
 from render.shared.errors import InputError, unknown
-from render.shared.files import atomic_path
 
-PHOTOS, PAINTED = "photos", "painted.png"
-_GAMMAS = ("auto", "linear", "srgb", "2.2")
-_SCALES = ("1", "0.5", "0.25", "auto")
-_FLAT = ("auto", "yes", "turned", "no")
-_TASKS = ("example", "check", "infer")
+_TASKS = ("example", "check", "infer", "export")
 _MOST_MASK = 32 * 2**20
 _MOST_RUNS = 20
 _MOST_SETS = 12
-_MOST_BALLS, _BALL = 8, re.compile(r"(?:chrome:|white:)?(?:auto|-?[0-9.]{1,20}(?:,-?[0-9.]{1,20}){2})")
-_PACKING = threading.Lock()
+_GONE = "that run was removed; start it again"
 
 
 async def make_set(request: Request) -> Response:
@@ -50,17 +42,22 @@ async def make_set(request: Request) -> Response:
 
 @accept_uploads
 async def upload(request: Request) -> Response:
-    """Receive one file, or a ZIP, which is unpacked at once: all of its files or none."""
+    """Receive a photograph, a picture of a ball alone, or a ZIP, which is unpacked at once: all or nothing."""
     session: Session = request.state.session
     limits: Limits = request.app.state.limits
     name, given = request.path_params["set"], request.path_params["name"]
-    folder = session.find_place(name) / PHOTOS
+    place, ball = session.find_place(name), "ball" in request.path_params
+    folder = place / (BALL.format(read_number(request, "ball")) if ball else PHOTOS)
     zipped = given.lower().endswith(".zip")
-    given = uploads.clean_name(given, (".zip",)) if zipped else uploads.clean_name(given)
-    if len(list_names(folder)) >= limits.files:
+    given = str(uploads.clean_place(given, (".zip",) if zipped else uploads.USABLE))
+    if ball:
+        given = Path(given).name
+        folder.mkdir(exist_ok=True)
+    if len(list_files(folder)) >= limits.files:
         raise InputError(f"more than {limits.files} files; leave some out")
     async with open_upload(session, limits.bytes, name) as coming:
         path = coming.folder / given
+        path.parent.mkdir(exist_ok=True)
         await receive(request.stream(), path, coming, uploads.most_bytes(given))
         there = await run_in_thread(_accept, coming, path, folder, limits)
     return JSONResponse({"files": there})
@@ -69,9 +66,10 @@ async def upload(request: Request) -> Response:
 def _accept(coming: Incoming, path: Path, folder: Path, limits: Limits) -> int:
     """Check an upload and move it into a set's folder; return how many files are there then."""
     if path.suffix.lower() == ".zip":
-        return coming.add(unpack(path, coming.folder / "unpacked", limits, coming), folder, limits.files)
+        base = coming.folder / "unpacked"
+        return coming.add(unpack(path, base, limits, coming), folder, limits.files, base)
     uploads.check_pixels(path, limits)
-    return coming.add([path], folder, limits.files)
+    return coming.add([path], folder, limits.files, coming.folder)
 
 
 @accept_uploads
@@ -107,18 +105,20 @@ def _store_mask(coming: Incoming, source: Path, target: Path, limits: Limits) ->
 
 
 async def start_task(request: Request) -> Response:
-    """Queue a task for a set: the example, the checks or an inference."""
+    """Queue a task for a set: the example, the checks, an inference, or an export of a run."""
     session: Session = request.state.session
     name, task = request.path_params["set"], request.path_params["task"]
     if task not in _TASKS:
         raise unknown("task", task, _TASKS)
-    asked = await uploads.read_settings(request.stream()) if task != "example" else {}
+    asked = await uploads.read_settings(request.stream())
     place = session.find_place(name)  # only now, since it may have been removed meanwhile
     arguments: dict[str, Any] = {"place": str(place)}
-    if task != "example":
-        arguments |= {"gamma": _read_choice(asked, "gamma", _GAMMAS), "lights": asked.get("lights") is True}
-        arguments["frame"] = str(asked.get("frame", "y-up"))[:40]
-        arguments["balls"] = _read_balls(asked.get("balls"))
+    if task == "export":
+        number = str(asked.get("run"))[:9]
+        if not number.isdecimal() or not (place / "runs" / number / "view" / "view.json").is_file():
+            raise InputError(_GONE)
+        return queue_task(request, task, number=int(number), name=str(asked.get("name"))[:80], **arguments)
+    arguments |= read_answers(asked)
     run = None
     if task == "infer":
         runs = [int(path.name) for path in (place / "runs").glob("*")]
@@ -127,34 +127,13 @@ async def start_task(request: Request) -> Response:
         latest = max(runs, default=0) + 1
         run = place / "runs" / str(latest)
         run.mkdir(parents=True)
-        arguments |= {"number": latest, "method": str(asked.get("method", "auto"))[:80]}
-        arguments |= {key: asked.get(key) is True for key in ("refine", "anyway", "discontinuities")}
-        scale = _read_choice(asked, "scale", _SCALES)
-        arguments["scale"] = scale if scale == "auto" else float(scale)
-        arguments["flat"] = _read_choice(asked, "flat", _FLAT)
-        arguments["focal"] = str(asked.get("focal") or "")[:40]
-        arguments["light_distance"] = str(asked.get("light_distance") or "auto")[:40]
+        arguments["number"] = latest
     try:
         return queue_task(request, task, **arguments)
     except Refused:
         if run is not None:
             run.rmdir()
         raise
-
-
-def _read_choice(asked: dict[str, Any], key: str, known: tuple[str, ...]) -> str:
-    value = str(asked.get(key, known[0]))
-    if value not in known:
-        raise InputError(f"{key}: must be one of {', '.join(known)}")
-    return value
-
-
-def _read_balls(said: Any) -> list[str]:
-    """Return balls in the pictures; a folder, which `sdps.load` takes as well, is none."""
-    balls = [] if said is None else said
-    if not isinstance(balls, list) or len(balls) > _MOST_BALLS or not all(_BALL.fullmatch(str(one)) for one in balls):
-        raise InputError(f"balls: must be at most {_MOST_BALLS} circles x,y,radius, or auto")
-    return [str(one) for one in balls]
 
 
 async def send_file(request: Request) -> Response:
@@ -190,30 +169,21 @@ async def send_archive(request: Request) -> Response:
     """Send all files that `sdps infer` writes as one ZIP."""
     run = _find_run(request)
     archive = run / "sdps-infer.zip"
-    await run_in_thread(_pack, run / "files", archive)
+    await run_in_thread(pack, run / "files", archive)
     return FileResponse(archive, filename=archive.name)
-
-
-def _pack(folder: Path, archive: Path) -> None:
-    with _PACKING:  # two requests for the same run would write the same file
-        if archive.is_file():
-            return
-        with atomic_path(archive) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as opened:
-            for path in sorted(folder.rglob("*")):
-                if path.is_file():
-                    opened.write(path, path.relative_to(folder))
 
 
 def _find_run(request: Request) -> Path:
     run = request.state.session.find_place(request.path_params["set"]) / "runs" / str(read_number(request, "run"))
     if not (run / "view" / "view.json").is_file():
-        raise InputError("that run was removed; start it again")
+        raise InputError(_GONE)
     return run
 
 
 ROUTES = [
     Route("/sets", make_set, methods=["POST"]),
-    Route("/sets/{set}/uploads/{name}", upload, methods=["PUT"]),
+    Route("/sets/{set}/uploads/{name:path}", upload, methods=["PUT"]),
+    Route("/sets/{set}/ball/{ball}/{name:path}", upload, methods=["PUT"]),
     Route("/sets/{set}/mask", upload_mask, methods=["PUT"]),
     Route("/sets/{set}/start/{task}", start_task, methods=["POST"]),
     Route("/sets/{set}/files/{path:path}", send_file),

@@ -1,25 +1,39 @@
 """What the worker does with photographs: the example, the checks, an inference and the files the page shows.
 
 A set of photographs is a folder with `photos` (what was uploaded), `painted.png` (a mask painted on the page), `view`
-(thumbnails) and `runs/<number>`, each with `files` (what `sdps infer` writes) and `view`.
+(thumbnails) and `runs/<number>`, each with `files` (what `sdps infer` writes), `view`, `asked.json` and `exports`.
 """
 
+import argparse
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
 
+from pipelines.app.common.uploads import PICTURES
 from pipelines.app.pages import object_view
+from pipelines.app.pages.photo_questions import (
+    PAINTED,
+    PHOTOS,
+    find_poses,
+    make_arguments,
+    read_answers,
+    say_plainly,
+    speak_plainly,
+)
+from pipelines.app.pages.run_exports import ASKED, list_exports
 from pipelines.shared import pictures
 from render.shared.errors import InputError
 from render.shared.files import write_json
 from render.shared.progress import share_out, stage
 
-PHOTOS, VIEW, PAINTED, TRUTH = "photos", "view", "painted.png", "truth.npy"
+if TYPE_CHECKING:
+    from sdps.photos import Finding, Photographs, Pose
+
+VIEW, TRUTH = "view", "truth.npy"
 _EXAMPLE = {"shape": "bunny", "material": "red-phenolic", "lights": "near-uniform:48", "size": 256, "spp": 32}
 _THUMBNAIL, _PICTURE = 112, 640
 _CHECKING = {"reading": 2.0, "checks": 1.0, "pictures": 1.0}
@@ -31,7 +45,7 @@ _INFERRING = {
 _REFINING = {"refinement": 40.0, "second look": 20.0}
 
 
-def render_example(place: str) -> dict[str, Any]:
+def render_example(place: str, **asked: Any) -> dict[str, Any]:
     """Render the bunny under 48 lights of unequal strength as 16-bit photographs with a mask; then check them."""
     import render
     from pipelines.evaluate.workbench import write_photographs
@@ -43,15 +57,15 @@ def render_example(place: str) -> dict[str, Any]:
     images = images / np.percentile(images[:, view.mask], 99.9)
     write_photographs(Path(place) / PHOTOS, images, view.mask)
     np.save(Path(place) / TRUTH, view.normals)
-    return check(place)
+    return check(place, **asked)
 
 
-def check(place: str, **options: Any) -> dict[str, Any]:
-    """Read and check the photographs, and make their thumbnails.
+def check(place: str, **asked: Any) -> dict[str, Any]:
+    """Read and check the photographs, make their thumbnails, and say what a run would do.
 
     Args:
         place: The set's folder.
-        options: `gamma`, `frame`, `lights` (use the lights file among the photographs), `balls` of `sdps.load`.
+        asked: Of `photo_questions.read_answers`, or as it takes them.
 
     Returns:
         What the page shows.
@@ -59,33 +73,69 @@ def check(place: str, **options: Any) -> dict[str, Any]:
     Raises:
         InputError: photographs that cannot be used; paths are relative to the set's folder.
     """
-    from sdps import photos as photographs
+    from pipelines.infer import look_through
 
-    folder = Path(place)
-    with share_out(_CHECKING), _shorten_paths(folder):
+    folder, answers = Path(place), read_answers(asked)
+    with share_out(_CHECKING), speak_plainly(folder):
         stage("reading")
-        photos = _load(folder, anyway=True, **options)
-        stage("checks")
-        findings = photographs.check(photos)
-        view = folder / VIEW
-        view.mkdir(exist_ok=True)
-        exposure = pictures.auto_exposure(photos[0:1], photos.mask)
-        for number in range(len(photos)):
-            shown = pictures.tone_map(photos[number : number + 1][0], exposure)
-            _save(view / f"{number}.jpg", shown, _THUMBNAIL)
-            if number == len(photos) // 2:
-                _save(view / "picture.jpg", shown, _PICTURE)
-            stage("pictures", number + 1, len(photos))
-        Image.fromarray(photos.mask.astype(np.uint8) * 255).save(view / "mask.png")
+        poses, pose = find_poses(folder, answers)
+        args = make_arguments(folder, pose, answers | {"anyway": True, "scale": "1"})
+        photos, findings, _ = look_through(args, pose, lambda text: None)
+        _draw(photos, folder / VIEW)
+        args = make_arguments(folder, pose, answers)
+        work, trouble = _foresee(args, pose, photos)
     height, width = photos.shape
     return {
         "files": list(photos.files), "width": width, "height": height, "bits": photos.bits, "gamma": str(photos.gamma),
         "mask": photos.mask_origin if not (folder / PAINTED).is_file() else "painted",
-        "pixels": int(photos.mask.sum()), "notes": list(photos.notes), "lit": photos.light_directions is not None,
-        "balls": [_show_ball(ball) for ball in photos.balls],
-        "findings": [{"level": item.level, "text": item.text, "images": list(item.images)} for item in findings],
+        "pixels": int(photos.mask.sum()), "notes": [say_plainly(note) for note in photos.notes],
+        "lit": photos.light_directions is not None,
+        "balls": [_show_ball(ball) for ball in photos.balls if ball.folder is None],
+        "ball_alone": next((ball.kind for ball in photos.balls if ball.folder is not None), ""),
+        "findings": _list_findings(findings),
         "lights_there": _has_lights(folder / PHOTOS), "methods": list_methods(photos.light_directions is not None),
+        "poses": [one.name for one in poses], "pose": pose.name, "film": pose.room is not None,
+        "pictures": sorted(path.name for path in pose.folder.iterdir() if path.suffix.lower() in PICTURES),
+        "work": [[name, say_plainly(text)] for name, text in work.items()], "trouble": say_plainly(trouble),
     }  # fmt: skip
+
+
+def _list_findings(findings: "Sequence[Finding]") -> list[dict[str, Any]]:
+    return [{"level": item.level, "text": say_plainly(item.text), "images": list(item.images)} for item in findings]
+
+
+def _draw(photos: "Photographs", view: Path) -> None:
+    """Write thumbnails, the picture that is painted on, and the mask."""
+    view.mkdir(exist_ok=True)
+    exposure = pictures.auto_exposure(photos[0:1], photos.mask)
+    for number in range(len(photos)):
+        shown = pictures.tone_map(photos[number : number + 1][0], exposure)
+        _save(view / f"{number}.jpg", shown, _THUMBNAIL)
+        if number == len(photos) // 2:
+            _save(view / "picture.jpg", shown, _PICTURE)
+        stage("pictures", number + 1, len(photos))
+    Image.fromarray(photos.mask.astype(np.uint8) * 255).save(view / "mask.png")
+
+
+def _foresee(args: argparse.Namespace, pose: "Pose", photos: "Photographs") -> tuple[dict[str, str], str]:
+    """Return what `sdps infer --dry-run` says of photographs of full size, by name, and what would stop a run."""
+    from pipelines.infer import look_through
+    from pipelines.shared import dry_run
+    from sdps.api import plan
+
+    told: list[str] = []
+    try:
+        options: dict[str, Any] = {"refine": args.refine, "discontinuities": args.discontinuities}
+        expected = plan(photos, args.method, **options)
+        if args.scale != 1.0 and (args.scale != "auto" or expected.quick is not None):
+            photos, _, options = look_through(args, pose, told.append)
+            expected = plan(photos, args.method, **options)
+        rows = {"time": expected.describe()} | dry_run.list_input(photos) | dry_run.list_work(expected, "the ZIP")
+        if not args.anyway:
+            expected.check()
+    except InputError as error:
+        return {}, str(error)
+    return rows, ""
 
 
 def _show_ball(ball: Any) -> dict[str, Any]:
@@ -106,7 +156,7 @@ def list_methods(lit: bool) -> list[dict[str, str]]:
     from sdps.models.registry import COMBINATIONS
 
     there = sdps.available_methods()
-    found = [{"name": "auto", "about": "the best method for these photographs (recommended)"}]
+    found = [{"name": "auto", "about": "the best there is for these photographs"}]
     for name, about in there.items():
         combined = name in COMBINATIONS
         classical = name in METHODS and METHODS[name].calibrated == lit
@@ -115,17 +165,13 @@ def list_methods(lit: bool) -> list[dict[str, str]]:
     return found
 
 
-def infer(place: str, number: int, method: str, refine: bool, anyway: bool, discontinuities: bool,
-          flat: Any = "auto", scale: float | str = 1.0, **options: Any) -> dict[str, Any]:  # fmt: skip
+def infer(place: str, number: int, **asked: Any) -> dict[str, Any]:
     """Run a method, write all files of `sdps infer` and what the page shows.
 
     Args:
         place: The set's folder.
         number: Of the run.
-        refine: Refine where `sdps.infer` does by default.
-        method, anyway, discontinuities, flat: As of `sdps.infer`.
-        scale: As of `sdps.load`, or `auto`: what takes under ten minutes.
-        options: As of `check`, `light_distance`, and `focal`: 35 mm equivalent in millimetres.
+        asked: As of `check`.
 
     Returns:
         What the page shows of the run.
@@ -133,27 +179,27 @@ def infer(place: str, number: int, method: str, refine: bool, anyway: bool, disc
     Raises:
         InputError: as `sdps.infer`.
     """
-    import sdps
     from pipelines.evaluate.report.photographs_page import write_page
+    from pipelines.infer import infer_pose
 
-    folder = Path(place)
+    folder, answers = Path(place), read_answers(asked)
     run = folder / "runs" / str(number)
     _remove_failed_runs(run)
-    shares = _INFERRING | (_REFINING if refine or method.endswith(("+refine", "+fuse")) else {})
-    with share_out(shares), _shorten_paths(folder):
+    refined = answers["refine"] or answers["method"].endswith(("+refine", "+fuse"))
+    with share_out(_INFERRING | (_REFINING if refined else {})), speak_plainly(folder):
         stage("reading")
-        options |= {"anyway": anyway, "whole_frame": flat in ("yes", "turned")}
-        how: dict[str, Any] = {"refine": None if refine else False, "discontinuities": discontinuities}
-        photos = _load(folder, scale=1.0 if scale == "auto" else float(scale), **options)
-        if scale == "auto" and (quick := sdps.plan(photos, method, **how).quick) is not None:
-            photos = _load(folder, scale=quick[0], **options)
-        result = sdps.infer(photos, method, anyway=anyway, flat=flat, **how)
-        (run / "view").mkdir(parents=True, exist_ok=True)
-        shown = object_view.write(result, run / "view")
+        poses, pose = find_poses(folder, answers)
+        result, said = infer_pose(make_arguments(folder, pose, answers), pose, lambda text: None)
+        (run / VIEW).mkdir(parents=True, exist_ok=True)
+        shown = object_view.write(result, run / VIEW)
         result.save(run / "files")
         write_page(run / "files" / "report.html", result)
-    shown |= {"number": number, "error": _measure_error(folder, result.normals, photos.mask)}
-    write_json(run / "view" / "view.json", shown)
+    shown |= {"number": number, "error": _measure_error(folder, result.normals, result.photos.mask)}
+    shown |= {"pose": pose.name if len(poses) > 1 else "", "exports": list_exports()}
+    shown["findings"] = _list_findings(result.findings[said:])
+    shown |= {key: say_plainly(shown[key]) for key in ("verdict", "camera", "lamps")}
+    write_json(run / ASKED, answers)
+    write_json(run / VIEW / "view.json", shown)
     return shown
 
 
@@ -176,21 +222,6 @@ def _measure_error(folder: Path, normals: np.ndarray, mask: np.ndarray) -> float
     return round(normal_mae(normals, truth, mask & (np.linalg.norm(truth, axis=-1) > 0.5)), 2)
 
 
-def _load(
-    folder: Path, *, anyway: bool, gamma: str = "auto", frame: str = "y-up", lights: bool = False, scale: float = 1.0,
-    focal: str = "", light_distance: str = "auto", balls: Sequence[str] = (), whole_frame: bool = False,
-) -> Any:  # fmt: skip
-    from sdps import photos
-
-    painted = folder / PAINTED
-    (pose,) = photos.find_poses(folder / PHOTOS, inside=folder)  # it has no folders, so there is one
-    return photos.load(
-        pose, mask=painted if painted.is_file() else None, lights="folder" if lights else None,
-        frame=frame, gamma=gamma, anyway=anyway, scale=scale, balls=balls, whole_frame=whole_frame,
-        light_distance=light_distance, focal=f"{focal}mm" if focal[-1:].isdigit() else focal,  # as the page asks for it
-    )  # fmt: skip
-
-
 def _has_lights(folder: Path) -> bool:
     """Return whether there is a lights file; if there are several, `_load` reports that."""
     from sdps.photos.light_files import find_lights
@@ -205,13 +236,3 @@ def _save(path: Path, picture: np.ndarray, side: int) -> None:
     image = Image.fromarray(picture)
     image.thumbnail((side, side))
     image.save(path, quality=88)
-
-
-@contextmanager
-def _shorten_paths(folder: Path) -> Iterator[None]:
-    """Remove the temporary folder from error messages."""
-    try:
-        yield
-    except InputError as error:
-        text = str(error).replace(f"{folder / PHOTOS}/", "").replace(str(folder / PHOTOS), "photographs")
-        raise InputError(text.replace(f"{folder}/", "")) from error

@@ -3,6 +3,7 @@
 import { element } from "./jobs.js";
 
 const FIELDS = { x: "column", y: "row", radius: "radius" };
+const KINDS = { "": "as it looks", chrome: "chrome, a mirror", white: "white, matt" };
 
 export class BallCircles {
   constructor(svg, canvas, list, touched) {
@@ -14,7 +15,7 @@ export class BallCircles {
 
   // Show the balls of photographs of some size; `highlights` of each are [column, row].
   load(width, height, balls) {
-    [this.width, this.height, this.balls] = [width, height, balls.map((ball) => ({ highlights: [], ...ball }))];
+    [this.width, this.height, this.balls] = [width, height, balls.map((ball, number) => ({ highlights: [], said: balls.length === this.balls.length ? this.balls[number].said : "", ...ball }))];
     this.svg.setAttribute("viewBox", `-0.5 -0.5 ${width} ${height}`);
     this.fit();
     this.draw();
@@ -22,11 +23,11 @@ export class BallCircles {
   }
 
   // Return the balls as the server reads them.
-  values() { return this.balls.map(({ x, y, radius }) => [x, y, radius].map((value) => Math.round(value * 100) / 100).join()); }
+  values() { return this.balls.map(({ x, y, radius, said }) => (said ? `${said}:` : "") + [x, y, radius].map((value) => Math.round(value * 100) / 100).join()); }
 
   add() {
     const radius = Math.min(this.width, this.height) / 10;
-    this.balls.push({ x: this.width / 2, y: this.height / 2, radius, kind: "new", highlights: [] });
+    this.balls.push({ x: this.width / 2, y: this.height / 2, radius, kind: "", highlights: [] });
     this.change();
     this.showRows();
     this.list.lastElementChild.querySelector("input").focus();
@@ -83,9 +84,11 @@ export class BallCircles {
         });
         return element("label", {}, `${word} `, input);
       });
+      const kind = element("select", { "aria-label": `${name}: kind` }, ...Object.entries(KINDS).map(([value, text]) => element("option", { value, selected: value === (ball.said ?? "") }, value || !ball.kind ? text : `${text}: ${ball.kind}`)));
+      kind.addEventListener("change", () => { [ball.said, ball.highlights] = [kind.value, []]; this.change(); });
       const remove = element("button", { type: "button", class: "secondary", "aria-label": `Remove ball ${number + 1}` }, "Remove");
       remove.addEventListener("click", () => { this.balls.splice(number, 1); this.change(); this.showRows(); });
-      return element("li", {}, element("b", {}, `${name} (${ball.kind})`), ...inputs, remove);
+      return element("li", {}, element("b", {}, name), kind, ...inputs, remove);
     }));
   }
 }

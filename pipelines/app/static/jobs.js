@@ -37,7 +37,7 @@ export function showError(box, error) {
 const STAGES = {
   "": "starting", reading: "reading the photographs", checks: "checking the photographs", pictures: "making thumbnails", lights: "finding the lights",
   normals: "finding the normals", refinement: "refining", depth: "building the surface", albedo: "finding the colours", surface: "drawing the surface", meshes: "writing meshes",
-  "relit pictures": "relighting", page: "writing the report",
+  "relit pictures": "relighting", page: "writing the report", export: "writing the files", "second look": "looking a second time",
 };
 
 export function seconds(value) {

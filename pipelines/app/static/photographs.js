@@ -6,7 +6,7 @@ import { MaskPainter } from "./mask_painter.js";
 import { MeshView } from "./mesh_view.js";
 import { LightPad, Reflectance } from "./relight.js";
 
-const state = { set: null, checked: null, runs: [], run: null, mesh: null, thumbs: [] };
+const state = { set: null, checked: null, runs: [], run: null, mesh: null, told: 0, alone: 0, alones: 0 };
 const painter = new MaskPainter($("mask"), () => { $("mask-use").disabled = $("mask-reset").disabled = false; });
 const balls = new BallCircles($("ball-circles"), $("mask"), $("balls"), () => { $("ball-use").disabled = false; });
 const inSet = (path) => `/photographs/sets/${state.set}/${path}`;
@@ -17,22 +17,28 @@ async function begin() {
   state.set = (await post("/photographs/sets")).set;
   state.runs = [];
   balls.balls = [];
+  state.alone = state.alones = 0;
+  for (const id of ["pose", "ambient", "dark"]) $(id).replaceChildren();
+  $("every").value = "";
   for (const id of ["review", "choose", "results"]) $(id).hidden = true;
 }
 
-async function upload(files) {
+// Load photographs, which begins a new set, or pictures of a ball alone.
+async function upload(files, alone = false) {
   const box = $("load-status");
   try {
     if (!files.length) throw new Error("none of the chosen files can be used");
-    await begin();
+    if (!alone) await begin();
+    const place = alone ? `ball/${state.alones += 1}` : "uploads";
     const bar = element("progress", { max: files.length, value: 0, "aria-label": "Uploading" });
     box.className = "status";
     box.replaceChildren(`Loading ${files.length} file${files.length > 1 ? "s" : ""}`, bar);
     box.hidden = false;
     for (const file of files) {
-      await ask(inSet(`uploads/${encodeURIComponent(file.name)}`), { method: "PUT", body: file });
+      await ask(inSet(`${place}/${encodeURIComponent(file.place || file.webkitRelativePath || file.name)}`), { method: "PUT", body: file });
       bar.value += 1;
     }
+    if (alone) state.alone = state.alones;
     await check();
   } catch (error) { showError(box, error); }
 }
@@ -42,7 +48,7 @@ async function example() {
   $("example").disabled = true;
   try {
     await begin();
-    const found = await follow(await post(inSet("start/example")), box, "Example");
+    const found = await follow(await post(inSet("start/example"), options()), box, "Example");
     if (found) review(found);
   } catch (error) { showError(box, error); }
   $("example").disabled = false;
@@ -55,7 +61,7 @@ async function listDropped(transfer) {
   const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
   const files = [];
   const walk = async (entry) => {
-    if (entry.isFile) files.push(await new Promise((resolve, reject) => entry.file(resolve, reject)));
+    if (entry.isFile) files.push(Object.assign(await new Promise((resolve, reject) => entry.file(resolve, reject)), { place: entry.fullPath.slice(1) }));
     else {
       const reader = entry.createReader();
       for (;;) {
@@ -71,17 +77,49 @@ async function listDropped(transfer) {
 
 // ---- Checks and mask ----
 
-const options = () => ({ gamma: $("gamma").value, lights: $("lights").checked, frame: $("frame").value, balls: balls.values() });
+const TICKED = ["lights", "refine", "discontinuities", "anyway"];
+const ANSWERED = ["method", "gamma", "frame", "scale", "flat", "flatten", "ambient", "dark", "focal", "principal", "intensities", "every", "pose"];
 
-async function check(more = {}) {
-  const box = $("load-status");
+// Return the answers to all questions of the page, as the server reads them.
+const options = () => ({
+  ...Object.fromEntries([...TICKED.map((id) => [id, $(id).checked]), ...ANSWERED.map((id) => [id, $(id).value])]),
+  pixel_size: $("pixel-size").value, light_distance: $("light-distance").value || $("distance").value, balls: balls.values(), ball_alone: state.alone || "",
+});
+
+async function check(more = {}, box = $("load-status")) {
   try {
+    const told = state.told;
     const found = await follow(await post(inSet("start/check"), { ...options(), ...more }), box, "Checks");
-    if (found) review(found);
+    if (found) review(found, box === $("load-status"));
+    if (found && told !== state.told) doubt(); // answers changed meanwhile
   } catch (error) { showError(box, error); }
 }
 
-function review(found) {
+function fillSelect(id, rows) {
+  const chosen = $(id).value;
+  $(id).replaceChildren(...rows.map(([value, text]) => element("option", { value }, text)));
+  if (rows.some(([value]) => value === chosen)) $(id).value = chosen;
+}
+
+const listFindings = ({ findings, files }) => findings.map(({ level, text, images }) => element("li", { class: level }, element("b", {}, `${level}: `), text,
+  images.length && images.length < files.length ? element("span", { class: "note" }, ` (${images.slice(0, 6).join(", ")}${images.length > 6 ? ", ..." : ""})`) : ""));
+
+// Say what a run would do, or what would stop it.
+function foresee(found) {
+  $("trouble").hidden = !found.trouble;
+  $("trouble").textContent = found.trouble;
+  $("work").replaceChildren(...found.work.flatMap(([name, text]) => [element("dt", {}, name), element("dd", {}, text)]));
+  $("work").classList.remove("old");
+  $("foresee").disabled = true;
+}
+
+function doubt() {
+  state.told += 1;
+  $("foresee").disabled = false;
+  $("work").classList.add("old");
+}
+
+function review(found, first = true) {
   state.checked = found;
   const about = [`${found.files.length} photographs`, `${found.width} x ${found.height} pixels`, `${found.bits} bits`, `curve: ${found.gamma}`, `mask: ${found.mask}, ${found.pixels.toLocaleString("en")} pixels`];
   $("facts").replaceChildren(...about.map((text) => element("span", {}, text)));
@@ -89,21 +127,24 @@ function review(found) {
   const stamp = Date.now();
   $("thumbs").replaceChildren(...found.files.map((name, number) => element("figure", { class: marked.has(name) ? "marked" : "" },
     element("img", { src: inSet(`files/view/${number}.jpg?${stamp}`), alt: name, loading: "lazy" }), element("figcaption", { title: name }, name))));
-  const items = found.findings.map(({ level, text, images }) => element("li", { class: level }, element("b", {}, `${level}: `), text,
-    images.length && images.length < found.files.length ? element("span", { class: "note" }, ` (${images.slice(0, 6).join(", ")}${images.length > 6 ? ", ..." : ""})`) : ""));
-  $("findings").replaceChildren(...(items.length ? items : [element("li", {}, "No problems found.")]));
+  $("findings").replaceChildren(...(found.findings.length ? listFindings(found) : [element("li", {}, "No problems found.")]));
   $("notes").replaceChildren(...found.notes.map((note) => element("li", {}, note)));
   $("lights-row").hidden = !found.lights_there;
-  const chosen = $("method").value;
-  $("method").replaceChildren(...found.methods.map(({ name }) => element("option", { value: name }, name === "auto" ? "recommended" : name)));
-  if (found.methods.some(({ name }) => name === chosen)) $("method").value = chosen;
+  fillSelect("method", found.methods.map(({ name }) => [name, name === "auto" ? "recommended" : name]));
   describeMethod();
+  fillSelect("pose", found.poses.map((name) => [name, name]));
+  $("pose-row").hidden = $("all-poses").hidden = found.poses.length < 2;
+  $("every-row").hidden = !found.film;
+  for (const [id, word] of [["ambient", "ambient"], ["dark", "dark"]]) fillSelect(id, [["", `by its name ("${word}")`], ["none", "none"], ...found.pictures.map((name) => [name, name])]);
+  foresee(found);
   painter.load(inSet(`files/view/picture.jpg?${stamp}`), inSet(`files/view/mask.png?${stamp}`));
   balls.load(found.width, found.height, found.balls);
+  $("ball-alone").hidden = !state.alone;
+  $("ball-alone").firstChild.textContent = `The lights are those of a ${found.ball_alone} ball in pictures of its own.`;
   $("mask-use").disabled = $("ball-use").disabled = true;
   $("mask-reset").disabled = found.mask !== "painted";
   $("review").hidden = $("choose").hidden = false;
-  $("review").scrollIntoView({ behavior: "smooth" });
+  if (first) $("review").scrollIntoView({ behavior: "smooth" });
 }
 
 function describeMethod() { $("method-about").textContent = state.checked.methods.find(({ name }) => name === $("method").value)?.about ?? ""; }
@@ -120,16 +161,16 @@ async function sendMask(blob) {
 async function infer(event) {
   event.preventDefault();
   $("start").disabled = true;
-  const asked = { ...options(), method: $("method").value };
-  for (const name of ["refine", "discontinuities", "anyway"]) asked[name] = $(name).checked;
-  asked.scale = $("scale").value;
-  asked.flat = $("flat").value;
-  asked.focal = $("focal").value;
-  asked.light_distance = $("light-distance").value;
+  const poses = event.submitter === $("all-poses") ? state.checked.poses : [$("pose").value];
   try {
     if (!$("mask-use").disabled) await ask(inSet("mask"), { method: "PUT", body: await painter.blob() });
-    const found = await follow(await post(inSet("start/infer"), asked), $("run-status"), "Surface");
-    if (found) { state.runs.push(found); await show(found); $("results").scrollIntoView({ behavior: "smooth" }); }
+    for (const pose of poses) {
+      const found = await follow(await post(inSet("start/infer"), { ...options(), pose }), $("run-status"), poses.length > 1 ? `Pose ${pose}` : "Surface");
+      if (!found) break;
+      state.runs.push(found);
+      await show(found);
+    }
+    if (state.runs.length) $("results").scrollIntoView({ behavior: "smooth" });
   } catch (error) { showError($("run-status"), error); }
   $("start").disabled = false;
 }
@@ -138,24 +179,32 @@ async function infer(event) {
 
 const inRun = (path, run = state.run) => inSet(`files/runs/${run.number}/view/${path}`);
 
+const nameRun = (run) => `${run.number}. ${run.pose ? `${run.pose}, ` : ""}${run.method}`;
+
 async function show(run) {
   state.run = run;
   $("results").hidden = false;
   $("runs").replaceChildren(...state.runs.map((other) => {
-    const button = element("button", { type: "button", "aria-pressed": String(other === run) }, `${other.number}. ${other.method}`);
+    const button = element("button", { type: "button", "aria-pressed": String(other === run) }, nameRun(other));
     button.addEventListener("click", () => show(other));
     return button;
   }));
-  const facts = [`method: ${run.method}`, `${seconds(run.seconds)}`, `${run.components} part${run.components > 1 ? "s" : ""}`, `integrability: ${run.integrability}°`];
-  if (run.camera?.startsWith("perspective")) facts.push(`camera: ${run.camera}`);
+  const facts = [];
+  if (run.expected !== null) facts.push(`normals are probably off by ${run.expected.toFixed(1)}°`);
+  if (run.error !== null) facts.push(`they are off by ${run.error.toFixed(1)}°: the truth is known here`);
   if (run.lamps) facts.push(run.lamps);
-  if (run.residual !== null) facts.push(`deviation from Lambert's law: ${run.residual}`);
-  if (run.error !== null) facts.push(`error of the normals: ${run.error}°`);
+  if (run.camera?.startsWith("perspective")) facts.push(`camera: ${run.camera}`);
+  facts.push(`normals and surface disagree by ${run.integrability.toFixed(1)}°`);
+  if (run.residual !== null) facts.push(`${Math.round(100 * run.residual)} % of the brightness is not that of a matt surface`);
+  if (run.components > 1) facts.push(`${run.components} parts`);
+  facts.push(`took ${seconds(run.seconds)}`);
   $("verdict").hidden = !run.verdict;
   $("verdict").textContent = run.verdict;
   $("run-facts").replaceChildren(...facts.map((text) => element("span", {}, text)), ...(run.terms ? [element("span", {}, `weights: ${run.terms}`)] : []));
+  $("run-findings").replaceChildren(...listFindings(run));
   $("download").href = inSet(`runs/${run.number}/download`);
   $("report").href = inSet(`files/runs/${run.number}/files/report.html`);
+  listExports(run);
   $("normals").src = inRun("normals.png");
   $("depth").src = inRun("depth.png");
   const [basis, tables] = await Promise.all([inRun("basis.bin"), run.tables && inRun("tables.bin")].map(async (address) => address && (await fetch(address)).arrayBuffer()));
@@ -170,6 +219,31 @@ async function show(run) {
     state.mesh ??= new MeshView($("mesh"));
     await state.mesh.load(inRun("mesh.ply"));
   } catch (error) { $("mesh").replaceChildren(element("p", { class: "note" }, `The surface cannot be shown here: ${error.message}`)); }
+}
+
+// ---- For other programs ----
+
+function listExports(run) {
+  $("export-status").hidden = true;
+  $("exports").replaceChildren(...run.exports.map(({ name, who, what }) => {
+    const button = element("button", { type: "button", class: "secondary", "aria-label": `Get ${what} for ${who}` }, "Get");
+    const row = element("li", {}, element("p", {}, element("b", {}, who), element("span", {}, what)), button);
+    button.addEventListener("click", () => takeAway(run, name, row, button));
+    return row;
+  }));
+}
+
+async function takeAway(run, name, row, button) {
+  row.querySelector(".finding")?.remove();
+  button.disabled = true;
+  try {
+    const made = await follow(await post(inSet("start/export"), { run: run.number, name }), $("export-status"), "Export");
+    if (made) element("a", { href: inSet(`files/runs/${run.number}/${made.file}`), download: made.name }).click();
+  } catch (error) {
+    $("export-status").hidden = true;
+    row.append(element("p", { class: "finding error", role: "alert" }, error.message));
+  }
+  button.disabled = false;
 }
 
 function drawLights(run) {
@@ -227,7 +301,7 @@ function drawChart({ observed, model }, [row, column], run) {
   if (model) svg.append(element("polyline", { points: model.map((v, i) => `${x(i)},${y(v)}`).join(" "), fill: "none", stroke: "var(--accent)", "stroke-width": 0.7 }));
   observed.forEach((v, i) => svg.append(element("circle", { cx: x(i), cy: y(v), r: 0.9, fill: "#e0702c" }, element("title", {}, `${run.files[i]}: ${v.toFixed(4)}`))));
   $("chart").replaceChildren(svg);
-  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: ${run.tables ? "the refined model" : "Lambert's law"} for what was found. ` : ""}Highest: ${most.toFixed(3)}.`;
+  $("chart-note").textContent = `Row ${row * run.step}, column ${column * run.step}. Dots: the photographs, in order; ${model ? `line: computed ${run.tables ? "from what was found" : "for a matt surface"}. ` : ""}Highest: ${most.toFixed(3)}.`;
 }
 
 // ---- Comparison ----
@@ -236,7 +310,7 @@ function compare() {
   $("compare-card").hidden = state.runs.length < 2;
   if (state.runs.length < 2) return;
   for (const [id, offset] of [["left", 1], ["right", 0]]) {
-    $(id).replaceChildren(...state.runs.map((run, place) => element("option", { value: place + 1 }, `${run.number}. ${run.method}`)));
+    $(id).replaceChildren(...state.runs.map((run, place) => element("option", { value: place + 1 }, nameRun(run))));
     $(id).value = state.runs.length - offset;
   }
   showCompared();
@@ -272,9 +346,16 @@ $("mask-use").addEventListener("click", async () => sendMask(await painter.blob(
 $("mask-reset").addEventListener("click", () => sendMask(new Blob([])));
 $("ball-find").addEventListener("click", () => check({ balls: ["auto"] }));
 $("ball-add").addEventListener("click", () => balls.add());
+$("ball-load").addEventListener("click", () => $("ball-files").click());
+$("ball-files").addEventListener("change", () => { const chosen = filterUsable($("ball-files").files); $("ball-files").value = ""; upload(chosen, true); });
+$("ball-leave").addEventListener("click", () => { state.alone = 0; check(); });
 $("ball-use").addEventListener("click", () => check());
 $("method").addEventListener("change", describeMethod);
-for (const id of ["gamma", "lights", "frame"]) $(id).addEventListener("change", () => { if (id !== "frame" || $("lights").checked) check(); });
+$("foresee").addEventListener("click", () => check({}, $("run-status")));
+for (const id of ["pose", "every"]) $(id).addEventListener("change", () => check());
+$("form").addEventListener("input", doubt);
+for (const id of ["gamma", "lights", "frame"]) $(id).addEventListener("change", () => { if (id !== "frame" || $("lights").checked) check({}, $("run-status")); });
+$("light-distance").addEventListener("change", () => { $("distance").hidden = $("distance-note").hidden = $("light-distance").value !== ""; });
 $("form").addEventListener("submit", infer);
 const hover = $("normals").parentElement;
 hover.tabIndex = 0;

@@ -64,11 +64,13 @@ def _section(result: "Inference") -> SectionWriter:
     from sdps.surface.views import strip
 
     photos, mask = result.photos, result.photos.mask
+    sure = result.expected_error
     text = (
-        f"{len(photos)} photographs of {photos.shape[1]}x{photos.shape[0]} pixels, {photos.bits} bits, gamma "
-        f"{photos.gamma}; mask: {photos.mask_origin}, {int(mask.sum())} pixels. Method: {result.method}. Frame: "
-        f"x right, y up, z to the camera; lights from the surface to the light. The camera is {name_camera(photos)}. "
-        f"{tell_lamps(result)}"
+        f"{'' if sure is None else f'The normals are probably off by {sure[mask].mean():.1f} degrees. '}"
+        f"{tell_lamps(result)} The camera is {name_camera(photos)}. {len(photos)} photographs of {photos.shape[1]}x"
+        f"{photos.shape[0]} pixels, {photos.bits} bits, tone curve {photos.gamma}; mask: {photos.mask_origin}, "
+        f"{int(mask.sum())} pixels. Method: {result.method}. Axes: x right, y up, z to the camera; lights from the "
+        "surface to the light."
     )
     section = Section(
         name="photographs",
@@ -177,9 +179,9 @@ def _tables(result: "Inference") -> tuple[Table, ...]:
     checks = Table(title="Checks", header=("level", "what"), rows=(*findings, *notes), prose=(1,))
     facts = result.summary()
     rows = [("seconds", f"{facts['seconds']:.1f}"), ("parts of the surface", str(result.depth.components)),
-            ("integrability, RMS residual", f"{result.depth.residual:.2f}°")]  # fmt: skip
+            ("normals and surface disagree by", f"{result.depth.residual:.2f}°")]  # fmt: skip
     if result.residuals is not None:
-        rows.append(("photographs against Lambert's law, relative RMS", f"{result.residuals.overall:.3f}"))
+        rows.append(("brightness that a matt surface does not explain", f"{result.residuals.overall:.0%}"))
     rows += _refinement_rows(facts)
     if "expected_normal_error_degrees" in facts and ("fused" in facts or "refined" not in facts):
         rows.append(("error of the normals to expect", f"{facts['expected_normal_error_degrees']}°"))

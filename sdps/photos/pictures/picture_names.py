@@ -7,6 +7,9 @@ from pathlib import Path
 
 MASK, NORMALS, AMBIENT, DARK = "a mask", "normals", "an ambient picture", "a dark frame"
 
+MESHROOM, UNIPS = "ps_", ".data"
+"""Begin and end of the names of folders of poses, as programs lay them out."""
+
 _WORDS = {
     MASK: "mask masks maske masque silhouette silhouettes segmentation",
     NORMALS: "normal normals normalmap normalmaps normalen nrm nrml",
@@ -33,6 +36,14 @@ def split_words(name: str) -> list[str]:
     """Return the words of a file name without its suffix, in lower case; `x.normalMap-01_B` has x, normal, map, b."""
     runs = re.findall(r"[^\W\d_]+", Path(name).stem)
     return [word.lower() for run in runs for word in _HUMPS.sub(" ", run).split()]
+
+
+def name_layout(folder: str) -> str:
+    """Return which program gives folders of poses such names, `MESHROOM` or `UNIPS`; empty for others."""
+    name = folder.lower()
+    if name.startswith(MESHROOM) and len(name) > len(MESHROOM):
+        return MESHROOM
+    return UNIPS if name.endswith(UNIPS) and len(name) > len(UNIPS) else ""
 
 
 def name_roles(names: Sequence[str]) -> dict[str, str]:

@@ -23,24 +23,26 @@ class Export:
     """A form that some program wants.
 
     Attributes:
-        about: Who wants it, and what is written, in one line.
+        about: Who wants it, and what is written: two parts of one line, with a colon between them.
         write: The function that writes it.
+        from_pictures: It is made of the photographs, where these are at hand.
     """
 
     about: str
     write: Writer
+    from_pictures: bool = False
 
 
 EXPORTS: dict[str, Export] = {
-    **{f"normals-{name}": Export(f"normals for {wanted.who}: PNG of 16 bits, EXR", partial(write_normals, name))
+    **{f"normals-{name}": Export(f"{wanted.who}: normals as 16-bit PNG and EXR", partial(write_normals, name))
        for name, wanted in CONVENTIONS.items()},
-    "height": Export("inspection, displacement: height as float and 16-bit TIFF, mm where known", write_heights),
+    "height": Export("inspection, displacement: height as 32- and 16-bit TIFF, in mm where known", write_heights),
     "gradients": Export("inspection: slopes dz/dx and dz/dy as TIFF", write_gradients),
     "curvature": Export("inspection: mean and Gaussian curvature as TIFF", write_curvatures),
-    "materials": Export("Blender, universal PS: base colour, roughness, metallic (if refined)", write_materials),
-    "gltf": Export("viewers, engines: mesh with these maps as .glb (if refined)", write_gltf),
-    "ptm": Export("heritage viewers: relightable .ptm (LRGB)", partial(write_relightable, "ptm")),
-    "rti": Export("heritage viewers: relightable .rti (HSH)", partial(write_relightable, "rti")),
+    "materials": Export("Blender: base colour, roughness and metallic as PNG (if refined)", write_materials),
+    "gltf": Export("viewers, game engines: mesh with its materials as .glb (if refined)", write_gltf),
+    "ptm": Export("RTIViewer: relightable .ptm (LRGB)", partial(write_relightable, "ptm"), from_pictures=True),
+    "rti": Export("RTIViewer: relightable .rti (HSH)", partial(write_relightable, "rti"), from_pictures=True),
     "lp": Export("RTIBuilder, RelightLab, Meshroom: light directions as .lp", write_lp),
     "diligent": Export("MATLAB scripts: lights as DiLiGenT's text files", write_diligent),
     "bini": Export("BiNI: normal_map.png, mask.png, K.txt", write_bini),

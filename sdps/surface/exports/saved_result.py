@@ -12,6 +12,7 @@ from render.shared.errors import InputError
 from render.shared.files import parse_json, read_json, read_text
 from render.shared.images import read_image
 from sdps.core.geometry import Camera
+from sdps.photos.faults import Faults
 from sdps.photos.light_files import read_lights
 
 if TYPE_CHECKING:
@@ -187,7 +188,7 @@ def _read_lights(folder: Path) -> SavedLights | None:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: not a lights.json ({error}); {_AGAIN}") from error
-    found = read_lights(path, files)
+    found = read_lights(path, files, faults=Faults(anyway=True))  # a method may find lights behind the object
     gains = np.ones(len(files), np.float32) if found.intensities is None else found.intensities
     nearness = None if found.distances is None else 0.5 / found.distances
     return SavedLights(files, found.directions, gains, nearness)

@@ -68,6 +68,34 @@ def test_photographs(page, address: str, tmp_path: Path) -> None:
     with page.expect_download() as download:
         page.click("#download")
     assert download.value.suggested_filename == "sdps-infer.zip"
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Get normals as 16-bit PNG and EXR for Unreal").click()
+    assert download.value.suggested_filename == "normals-directx.zip"
+    page.get_by_role("button", name="Get normalMaps.sfm").click()
+    page.locator("#exports .finding", has_text='again with "Focal length"').wait_for()
+
+
+def test_questions_and_poses(page, address: str, tmp_path: Path) -> None:
+    images, mask = folders.matte(hemisphere_lights(4, np.random.default_rng(0)), size=40)
+    for pose in ("left", "right"):
+        folders.write_folder(tmp_path / f"ps_{pose}", images, mask, bits=8)
+    page.goto(f"{address}/photographs")
+    page.set_input_files("#folder", tmp_path)
+    page.locator("#pose option").nth(1).wait_for(state="attached")
+    page.select_option("#pose", "right")
+    page.locator("#work").get_by_text("1.png to 4.png").wait_for()
+    page.click("#more summary")
+    page.select_option("#method", "factorisation")
+    page.select_option("#light-distance", label="this far:")
+    page.fill("#distance", "400mm")
+    page.click("#foresee")
+    page.locator("#run-status.error", has_text='"Size of a pixel"').wait_for()
+    page.fill("#pixel-size", "0.2")
+    page.click("#foresee")
+    page.locator("#work").get_by_text("0.2 mm a pixel").wait_for()
+    page.click("#all-poses")
+    page.get_by_role("button", name="2. right, factorisation").wait_for()
+    assert page.get_by_role("button", name="1. left, factorisation").count() == 1
 
 
 def test_balls(page, address: str, tmp_path: Path) -> None:
@@ -90,6 +118,7 @@ def test_balls(page, address: str, tmp_path: Path) -> None:
     assert float(column.input_value()) > 216.0  # from 214.5
     column.fill("214")
     page.keyboard.press("Tab")
+    page.get_by_label("Ball 1: kind").select_option("chrome")
     page.click("#ball-use")
     assert eventually(lambda: page.locator(".ball-spot").count() == len(pictures))
     page.click("#ball-add")

@@ -102,7 +102,7 @@ def test_runs_that_failed_leave_no_files(tmp_path: Path) -> None:
             (runs / str(number) / "view" / "view.json").write_text("{}")
     (tmp_path / "photos").mkdir()
     with pytest.raises(InputError):
-        photo_tasks.infer(str(tmp_path), 4, "auto", False, False, False)
+        photo_tasks.infer(str(tmp_path), 4)
     assert {path.name for path in runs.iterdir()} <= {"1", "4", "5"}  # 5 waits for its turn
 
 

@@ -36,7 +36,7 @@ def test_it_says_what_will_happen_and_writes_nothing(folder: Path, tmp_path: Pat
                  "the rest", "nothing was written"):  # fmt: skip
         assert part in said, (part, said)
     assert main(["infer", str(folder), *flags, "--anyway"]) == 0
-    listed = said.split("files: ")[2].split(" into ")[0].split(", ")
+    listed = said.split("results: ")[1].split(" into ")[0].split(", ")
     assert sorted(listed) == sorted(path.name for path in out.iterdir())
 
 

@@ -18,11 +18,10 @@ from render.shared.tables import natural_key
 from sdps.photos.light_files import SUFFIXES as LIGHT_FILES
 from sdps.photos.pictures.listing import LISTS
 from sdps.photos.pictures.picture_kinds import FILMS, SUFFIXES, UNREAD
-from sdps.photos.pictures.picture_names import MASK, name_roles
+from sdps.photos.pictures.picture_names import MASK, MESHROOM, UNIPS, name_layout, name_roles
 from sdps.photos.pictures.sources.archive_files import unpack_folders
 from sdps.photos.pictures.sources.film_frames import FLAG, check_every, is_film, take_frames
 
-MESHROOM, UNIPS = "ps_", ".data"
 _UNIPS_PICTURES = "L*"
 _FEWEST = 2  # pictures in a folder that is a pose
 
@@ -126,19 +125,21 @@ def only_pose(place: "str | Path | Pose", every: int | None = None) -> Pose:
 def _descend(folder: Path) -> Path:
     """Return the folder that is all there is in a folder, as in a ZIP of one; itself where there is more."""
     inside = list(folder.iterdir())
-    return _descend(inside[0]) if len(inside) == 1 and inside[0].is_dir() and not _kind(folder) else folder
+    return _descend(inside[0]) if len(inside) == 1 and inside[0].is_dir() and not name_layout(folder.name) else folder
 
 
 def _in_folder(asked: Path, folder: Path) -> tuple[Pose, ...]:
     """Return the poses of a folder."""
-    if _kind(folder):
+    if name_layout(folder.name):
         return (_pose(asked, folder),)
     try:
         below = sorted((path for path in folder.iterdir() if path.is_dir()), key=lambda path: natural_key(path.name))
     except OSError:  # reading it says what is wrong
         below = []
     for kind in (MESHROOM, UNIPS):
-        poses = [_pose(asked, path) for path in below if _kind(path) == kind and len(_pictures(path)) >= _FEWEST]
+        poses = [
+            _pose(asked, path) for path in below if name_layout(path.name) == kind and len(_pictures(path)) >= _FEWEST
+        ]
         names = [pose.name.lower() for pose in poses]
         if poses and not _has_photographs(folder, names):
             if len(poses) == 1:
@@ -160,7 +161,7 @@ def _has_photographs(folder: Path, poses: Sequence[str]) -> bool:
 def _pose(asked: Path, folder: Path) -> Pose:
     """Return the pose that is a folder of Meshroom or of the UniPS family."""
     above = (folder.absolute().parent,)
-    if _kind(folder) == MESHROOM:
+    if name_layout(folder.name) == MESHROOM:
         name = folder.name[len(MESHROOM) :]
         beside = _beside(folder, name)
         notes = () if beside is None else (f"{beside.name} beside {folder.name} is its mask, as Meshroom has it",)
@@ -199,14 +200,6 @@ def _only_film(folder: Path) -> Path | None:
     if len(films) > 1:
         raise InputError(f"{folder}: holds {len(films)} films ({list_names([film.name for film in films])}); name one")
     return films[0]
-
-
-def _kind(folder: Path) -> str:
-    """Return which program lays out folders with such names; empty for others."""
-    name = folder.name.lower()
-    if name.startswith(MESHROOM) and len(name) > len(MESHROOM):
-        return MESHROOM
-    return UNIPS if name.endswith(UNIPS) and len(name) > len(UNIPS) else ""
 
 
 def _beside(place: Path, stem: str) -> Path | None:

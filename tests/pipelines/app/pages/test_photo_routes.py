@@ -8,6 +8,7 @@ import time
 import zipfile
 import zlib
 from pathlib import Path
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -113,6 +114,52 @@ def test_a_film_is_taken_apart(address: str, tmp_path: Path) -> None:
     assert job["state"] == "failed" and job["message"].startswith("lamp.mp4: damaged or not a film")
 
 
+def test_poses_are_told_apart(address: str, hills: Path) -> None:
+    """As a folder and as a ZIP; a pose is looked at, and inferred, by its name."""
+    files = {
+        f"ps_{pose}/{path.name}": path.read_bytes() for pose in ("left", "right") for path in hills.glob("[1-4].png")
+    }
+    masks = {f"{pose}.png": (hills / "mask.png").read_bytes() for pose in ("left", "right")}
+    for zipped in (False, True):
+        client = Client(address)
+        path = client.new_set()
+        sent = (
+            {"all.zip": archive(**files, **masks)} if zipped else {f"toy/{name}": data for name, data in files.items()}
+        )
+        for name, data in sent.items():
+            assert client.send("PUT", f"{path}/uploads/{quote(name, safe='')}", data)[0] == 200
+        checked = client.wait(client.post(f"{path}/start/check", {"pose": "right"}))["result"]
+        assert (checked["poses"], checked["pose"]) == (["left", "right"], "right")
+        assert checked["mask"] == ("file" if zipped else "automatic")
+        assert len(checked["files"]) == 4
+    shown = client.wait(client.post(f"{path}/start/infer", {"method": "factorisation", "pose": "left"}))["result"]
+    assert shown["pose"] == "left"
+    job = client.wait(client.post(f"{path}/start/check", {"pose": "lift"}))
+    assert job["state"] == "failed" and "did you mean 'left'" in job["message"]
+    path, picture = client.new_set(), (hills / "1.png").read_bytes()
+    there = (("ps_a.png", 200), ("ps_a.png/1.png", 400), ("ps_b.png/1.png", 200), ("ps_b.png", 400))  # a file, a folder
+    for name, expected in (*there, ("ps_b.png/1.png", 400)):
+        status, said = client.send("PUT", f"{path}/uploads/{quote(name, safe='')}", picture)
+        assert status == expected and ("two files of this name" in said.decode()) == (status == 400), name
+
+
+def test_what_will_happen_is_said_before_it_starts(address: str, hills: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+
+    def check(**asked: object) -> dict:
+        return client.wait(client.post(f"{path}/start/check", asked))["result"]
+
+    said = dict(check(method="factorisation", pixel_size="0.5", scale="0.5")["work"])
+    assert "pictures of 36x36: about" in said["time"] and "GiB of memory" in said["time"]
+    assert said["size"].startswith("1 mm a pixel") and said["results"].endswith("report.html into the ZIP")
+    assert said["files"].startswith("1.png to 12.png") and said["object"] and said["curve"] and said["camera"]
+    refused = check(method="least-squares")
+    assert refused["work"] == [] and "needs the lights" in refused["trouble"] and "--" not in refused["trouble"]
+    film = client.wait(client.post(f"{path}/start/check", {"every": 2}))
+    assert film["state"] == "failed" and film["message"].startswith('"Every so many frames" 2: ')
+
+
 def test_a_focal_length_is_used(address: str, hills: Path) -> None:
     client = Client(address)
     path = client.new_set(hills)
@@ -120,10 +167,14 @@ def test_a_focal_length_is_used(address: str, hills: Path) -> None:
     def infer(focal: object) -> dict:
         return client.wait(client.post(f"{path}/start/infer", {"method": "factorisation", "focal": focal}))
 
-    assert infer("50")["result"]["camera"] == "perspective, focal length 118 px (--focal)"  # of 72 x 72 pixels
-    assert infer("")["result"]["camera"] == "orthographic, looking along -z"
-    assert infer("400px")["result"]["camera"] == "perspective, focal length 400 px (--focal)"
-    for focal, said in (("0", "--focal 0mm: must be above 0"), (-3, "must be above 0"), ("wide", "unknown --focal")):
+    assert infer("50")["result"]["camera"] == "perspective, focal length 118 px, as given"  # of 72 x 72 pixels
+    assert infer("")["result"]["camera"] == "taken for far away: no focal length is known"
+    assert infer("400px")["result"]["camera"] == "perspective, focal length 400 px, as given"
+    for focal, said in (
+        ("0mm", '"Focal length" 0mm: must be above 0'),
+        (-3, "must be above 0"),
+        ("wide", 'unknown "Focal length"'),
+    ):
         job = infer(focal)
         assert job["state"] == "failed" and said in job["message"]
 
@@ -141,7 +192,7 @@ def test_a_distance_of_the_lamps_is_used(address: str, hills: Path) -> None:
     assert found["lamps"] == "the lamps stood about 4 object sizes away, as given"
     assert found["distances"] == [4.0] * len(found["files"])
     job = infer(light_distance="near")
-    assert job["state"] == "failed" and "--light-distance" in job["message"]
+    assert job["state"] == "failed" and "How far away the lamps stood" in job["message"]
 
 
 def test_balls_are_found_and_used(address: str, tmp_path: Path) -> None:
@@ -162,11 +213,30 @@ def test_balls_are_found_and_used(address: str, tmp_path: Path) -> None:
         )
 
 
+def test_a_ball_in_pictures_of_its_own(address: str, hills: Path, tmp_path: Path) -> None:
+    client = Client(address)
+    path = client.new_set(hills)
+    for number, lamp in enumerate(LIGHTS, start=1):
+        write_balls(tmp_path, [paint(lamp, 1.0)])  # whose object is a white ball
+        (picture,) = tmp_path.glob("*.png")
+        assert client.send("PUT", f"{path}/ball/1/{number}.png", picture.read_bytes())[0] == 200
+    found = client.wait(client.post(f"{path}/start/check", {"ball_alone": 1}))["result"]
+    assert found["lit"] and found["balls"] == [] and found["ball_alone"] == "white"
+    assert len(found["files"]) == len(LIGHTS)
+    job = client.wait(client.post(f"{path}/start/infer", {"method": "least-squares", "ball_alone": 1}))
+    assert np.abs(np.array(job["result"]["lights"]) - LIGHTS).max() < 0.05
+    job = client.wait(client.post(f"{path}/start/check", {"ball_alone": 2}))
+    assert job["state"] == "failed" and "no such folder" in job["message"]
+
+
 def test_a_flat_thing_at_a_size_that_fits(address: str, hills: Path) -> None:
     client = Client(address)
     path = client.new_set(hills)
     asked = {"method": "factorisation", "flat": "turned", "scale": "auto"}
-    assert client.wait(client.post(f"{path}/start/infer", asked))["state"] == "done"
+    job = client.wait(client.post(f"{path}/start/infer", asked))
+    assert job["state"] == "done"
+    said = job["result"]["findings"][-1]["text"]
+    assert 'hollow, use "Is it flat?": yes; if it is not flat, "Is it flat?": no' in said
     with zipfile.ZipFile(io.BytesIO(client.get(f"{path}/runs/1/download"))) as opened:
         facts = json.loads(opened.read("result.json"))
     assert facts["flat"]["tilt_degrees"] > 0.0 and facts["scale"] == 1.0

@@ -8,9 +8,10 @@ from saved_results import GAINS, LIGHTS, NAMES, save_result
 
 from render.shared.errors import InputError
 from render.shared.files import read_json
-from sdps.photos.light_files import read_intensities, read_lights
+from sdps.photos.light_files import read_intensities, read_lights, write_lights
 from sdps.surface.exports.light_exports import write_alicevision_lights
 from sdps.surface.exports.registry import write_exports
+from sdps.surface.exports.saved_result import read_result
 
 
 def test_lights_are_read_again(tmp_path: Path) -> None:
@@ -34,6 +35,14 @@ def test_pictures_that_are_numbered_from_1_keep_their_lights(tmp_path: Path) -> 
     (json,) = write_alicevision_lights(result, tmp_path)
     numbered = [f"{number}.png" for number in range(1, 5)]
     assert np.allclose(read_lights(json, numbered).directions, LIGHTS, atol=2e-6)
+
+
+def test_lights_that_a_method_found_behind_the_object_are_written(tmp_path: Path) -> None:
+    save_result(tmp_path / "result")
+    behind = LIGHTS * (1, 1, -1)
+    write_lights(tmp_path / "result" / "lights.json", NAMES, behind)
+    (lp,) = write_exports(read_result(tmp_path / "result"), ["lp"], tmp_path / "out")
+    assert np.allclose(read_lights(lp, NAMES, "z-away").directions, LIGHTS, atol=2e-6)
 
 
 def test_a_result_without_lights_says_so(tmp_path: Path) -> None:
