@@ -291,7 +291,10 @@ def _tell_flat(found: Estimate, flat: Flatness, *, lit: bool) -> Iterator[Findin
     if lit:
         side = ""
     elif flat.wish == "turned":
-        side = " What stood out was turned to be hollow, as asked."
+        side = (
+            " What stood out was turned to be hollow, as asked. If what should stand out is hollow, use --flat; "
+            "if it is not flat, --flat no."
+        )
     elif found.side_by:
         side = f" Which parts stand out and which are hollow is told by {found.side_by}."
     else:
@@ -300,7 +303,8 @@ def _tell_flat(found: Estimate, flat: Flatness, *, lit: bool) -> Iterator[Findin
             "a place that you know, and use --flat turned if it is inside out."
         )
     level = f"{why}: its mean plane, {found.tilt:.0f} degrees off, was made to face the camera."
-    yield Finding("note", f"{level}{slow}{side} If it is not flat, use --flat no.")
+    last = "" if flat.wish == "turned" and not lit else " If it is not flat, use --flat no."
+    yield Finding("note", f"{level}{slow}{side}{last}")
 
 
 def _runner(
