@@ -1,6 +1,7 @@
 """`sdps infer`: photographs in; normals, lights, depth, meshes and a page out; and nothing where they are bad."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -35,6 +36,7 @@ from sdps.methods.parse import parse
 from sdps.models.checkpoint import TrainedModel, save_weights
 from sdps.models.registry import create
 
+ROOT = Path(__file__).parents[2]
 LIGHTS = hemisphere_lights(16, np.random.default_rng(0))
 GAINS = np.linspace(0.6, 1.0, 16)
 FILES = ["depth.npy", "lights.json", "mask.png", "mesh.glb", "mesh.obj", "mesh.ply", "normal.exr", "normal.npy",
@@ -257,7 +259,7 @@ def test_the_self_test_scores_itself(tmp_path: Path, capsys) -> None:
 @pytest.mark.slow
 def test_many_photographs_do_not_need_more_memory(tmp_path: Path) -> None:
     normals, mask = scenes.sphere(192)
-    peaks = {}
+    environment, peaks = os.environ | {"PYTHONPATH": str(ROOT)}, {}
     for count in (100, 1000):
         lights = hemisphere_lights(count, np.random.default_rng(1))
         folder = tmp_path / str(count)
@@ -268,7 +270,7 @@ def test_many_photographs_do_not_need_more_memory(tmp_path: Path) -> None:
         (folder / "names.txt").write_text("\n".join(f"{number}.png" for number in range(count)))
         models = random_models(tmp_path / f"runs-{count}")
         command = [sys.executable, "tests/support/infer_memory.py", str(folder), str(models)]
-        done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+        done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT, env=environment)
         peaks[count] = json.loads(done.stdout.splitlines()[-1])["peak_gib"]
     assert peaks[1000] < 1.3 * peaks[100]
     assert peaks[1000] < 3.0

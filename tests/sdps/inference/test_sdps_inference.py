@@ -1,6 +1,7 @@
 """Inference: what comes out does not depend on how the object is framed, chunked or ordered."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -341,9 +342,10 @@ def test_pixel_networks_see_the_whole_pixel(estimator: Estimator, monkeypatch: p
 
 @pytest.mark.slow
 def test_a_thousand_images_fit_in_two_gibibytes() -> None:
-    script = Path(__file__).parents[2] / "support" / "inference_memory.py"
-    command = [sys.executable, str(script), "1000", "nenet", "lcnet"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=script.parent)
+    root = Path(__file__).parents[3]
+    command = [sys.executable, "tests/support/inference_memory.py", "1000", "nenet", "lcnet"]
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=root, env=environment)
     measured = json.loads(done.stdout)
     assert measured["finite"]
     assert measured["object_share"] > 0.8
