@@ -200,7 +200,7 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
         seconds = _normal_network(runner).inference_seconds(images, size.pixels, size.box, views)
         found["normals"] = slower * seconds + once * _tile_count(size, runner)
     if runner.method.refined:
-        each = 0.6e-6 + 55e-9 * images * (_NEAR_LAMPS if runner.method.lighting != TRUE_LIGHTS else 1.0)
+        each = 0.6e-6 + 38e-9 * images * (_NEAR_LAMPS if runner.method.lighting != TRUE_LIGHTS else 1.0)
         coarse, fine = 2000 * (1.5e-3 + 2800 * each), 120 * size.pixels * each
         found["refinement"] = (coarse + fine) / threads + 3 * once
     if runner.method.fused:
