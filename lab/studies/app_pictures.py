@@ -67,6 +67,7 @@ def _wait(address: str) -> None:
 def _keep(png: bytes, path: Path, width: int = 0) -> None:
     """Write a picture, reduced to a width where one is named."""
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None  # the browser made it
     if width:
         height = round(picture.shape[0] * width / picture.shape[1])
         picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)

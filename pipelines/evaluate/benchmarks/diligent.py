@@ -153,7 +153,7 @@ def _object(source: Source, config: DiligentConfig) -> TestObject:
         raise InputError(f"{source.folder}: {len(taken)} images, --images wants {config.images}")
     if config.images:
         taken = np.sort(generator(0, source.shape, "images").permutation(taken)[: config.images])
-    files = [source.folder / source.images[number] for number in taken]
+    files = [source.folder / source.images[number] for number in taken.tolist()]
     extra = [value for value in (config.images, config.focal) if value]
     return build_object(
         source.shape, Images.of_files(files, lambda path: _read(path, config.bits)), truth.mask,
