@@ -303,7 +303,7 @@ def _tell_flat(found: Estimate, flat: Flatness, *, lit: bool) -> Iterator[Findin
             "a place that you know, and use --flat turned if it is inside out."
         )
     level = f"{why}: its mean plane, {found.tilt:.0f} degrees off, was made to face the camera."
-    last = "" if flat.wish == "turned" and not lit else " If it is not flat, use --flat no."
+    last = "" if flat.wish == "turned" else " If it is not flat, use --flat no."
     yield Finding("note", f"{level}{slow}{side}{last}")
 
 

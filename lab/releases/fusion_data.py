@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lab.shared.answered_scenes import answer, keep
+from lab.shared.answered_scenes import answer, keep, make_runner
+from lab.shared.scene_parts import add_part
 from lab.studies.refinement_study import render_scenes
 from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import read_shard
@@ -24,10 +25,6 @@ from render.shared.seeds import generator
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Rig
 from sdps.data.augment import exposure_scale
 from sdps.data.sample_geometry import lay_out, place
-from sdps.inference.inference_config import InferenceConfig
-from sdps.methods.parse import parse
-from sdps.methods.pretrained import finder
-from sdps.methods.runner import Runner
 from sdps.refinement.refine import RefineConfig
 
 PRESETS = tuple(Path(__file__).parents[1] / "presets" / f"fusion_{name}.yaml" for name in ("ship", "world"))
@@ -73,17 +70,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Render and answer."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--part", default="0/1", metavar="K/N", help="every N-th scene, from the K-th on")
+    add_part(parser)
     parser.add_argument("--models", type=Path, help="folder of runs with networks to take before the shipped ones")
     parser.add_argument("--networks", default="sdps-frames+refine,true+frames+refine", help="without and with lights")
     args = parser.parse_args(arguments)
-    number, parts = (int(word) for word in args.part.split("/"))
     rendered = [render_scenes(preset, args.out / preset.stem) for preset in PRESETS]
     scenes = [(folder, spec) for folder in rendered for spec in read_manifest(folder)]
-    find = finder(args.models)
-    views = InferenceConfig(light_views=8, normal_views=8)
-    unlit, lit = (Runner(parse(text, find), find, views, _QUICK) for text in args.networks.split(","))
-    for folder, spec in tqdm(scenes[number::parts], disable=None, miniters=1):
+    unlit, lit = (make_runner(text, args.models, _QUICK) for text in args.networks.split(","))
+    for folder, spec in tqdm(args.part.take(scenes), disable=None, miniters=1):
         path = args.out / "answers" / f"{spec.id.replace('/', '_')}.npz"
         if path.exists():
             continue

@@ -12,10 +12,14 @@ from render.shared.files import atomic_path
 from render.shared.imaging.vectors import unit
 from sdps.core.geometry import UNKNOWN, Rig
 from sdps.core.metrics import angle_degrees
+from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.fusion.evidence import Evidence, find_place
 from sdps.methods.fusion.fuse import join
 from sdps.methods.fusion.network import FusionNet
+from sdps.methods.parse import parse
+from sdps.methods.pretrained import finder
 from sdps.methods.runner import Runner
+from sdps.refinement.refine import RefineConfig
 from sdps.refinement.trust import RefinedEstimate, choose
 
 _LOSS = 0.3  # degrees; what counts as losing
@@ -41,6 +45,12 @@ class Answered:
     truth: np.ndarray
     held_out: bool
     lights: tuple[float, float]
+
+
+def make_runner(method: str, models: Path | None = None, refining: RefineConfig | None = None) -> Runner:
+    """Return a method whose networks see eight turned views; `models`: folder of runs to look in first."""
+    find = finder(models)
+    return Runner(parse(method, find), find, InferenceConfig(light_views=8, normal_views=8), refining)
 
 
 def answer(

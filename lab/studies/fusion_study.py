@@ -16,14 +16,11 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from lab.shared.answered_scenes import answer, keep, read_all, tabulate
+from lab.shared.answered_scenes import answer, keep, make_runner, read_all, tabulate
+from lab.shared.scene_parts import add_part
 from lab.studies.refinement_study import PRESET, Scene, render_scenes
 from render.records.manifest import read_manifest
-from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.fusion.fuse import WEIGHTS, load_fusion
-from sdps.methods.parse import parse
-from sdps.methods.pretrained import finder
-from sdps.methods.runner import Runner
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,21 +30,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--images", type=int, nargs="+", default=[0], help="of each scene (default: all)")
     parser.add_argument("--lights", action="store_true", help="lights are given")
     parser.add_argument("--every", type=int, default=1, help="take every so many scenes")
-    parser.add_argument("--part", default="0/1", metavar="K/N", help="of these every N-th, from the K-th on")
+    add_part(parser)
     parser.add_argument("--merltest", type=Path, help="folder with the scenes of `sdps evaluate merltest`")
     parser.add_argument("--method", default="", help="such as lightset+frames+refine")
     parser.add_argument("--models", type=Path, help="folder of runs")
     parser.add_argument("--weights", type=Path, default=WEIGHTS, help="that join")
     args = parser.parse_args(arguments)
     folder = args.merltest or render_scenes(PRESET, args.out / "scenes")
-    find = finder(args.models)
     method = args.method or ("true+frames+refine" if args.lights else "sdps-frames+refine")
-    runner = Runner(parse(method, find), find, InferenceConfig(light_views=8, normal_views=8))
-    first, parts = (int(word) for word in args.part.split("/"))
+    runner = make_runner(method, args.models)
     groups = {}
     for images in args.images:
         place = args.out / f"{method}-{images or 'all'}{'-merltest' if args.merltest else ''}"
-        for number, spec in tqdm(list(enumerate(read_manifest(folder)))[:: args.every][first::parts], disable=None):
+        for number, spec in tqdm(args.part.take(list(enumerate(read_manifest(folder)))[:: args.every]), disable=None):
             file = place / f"{spec.id.replace('/', '_')}.npz"
             if file.exists():
                 continue

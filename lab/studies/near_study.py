@@ -18,18 +18,15 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.shared.answered_scenes import answer
+from lab.shared.answered_scenes import answer, make_runner
+from lab.shared.scene_parts import add_part
 from pipelines.shared.text_tables import render_text
 from render.api import render_views
 from render.planning.light_sets import draw
 from sdps.core.geometry import Camera, Rig
 from sdps.core.metrics import angle_degrees
 from sdps.data.sample_geometry import lay_out, place
-from sdps.inference.inference_config import InferenceConfig
-from sdps.methods.fusion.evidence import find_place
-from sdps.methods.fusion.fuse import join, load_fusion
-from sdps.methods.parse import parse
-from sdps.methods.pretrained import finder
+from sdps.methods.fusion.fuse import fuse
 from sdps.methods.runner import Runner
 from sdps.refinement.refine import RefineConfig, refine
 
@@ -90,9 +87,8 @@ def measure(runner: Runner, shape: str, material: str, distance: float, focal: f
 
     camera = Camera() if lens is None else Camera(lens * _SIDE / 2)
     answered, evidence = answer(runner, images, mask, None, None, rig=Rig(camera))
-    begun, near, joined = answered.start, answered.refined, answered.refined.normals.copy()
-    if evidence is not None:
-        joined[find_place(mask)] = join(evidence, load_fusion())[0]
+    begun, near = answered.start, answered.refined
+    joined = near.normals if evidence is None else fuse(answered, evidence, mask).normals
     start = begun.normals, begun.light_directions, begun.intensities
     distant = refine(images, mask, *start, config=_QUICK, rig=Rig(nearness=np.zeros(_LAMPS)))
     answers = [(each.normals, each.light_directions) for each in (begun, distant, near)]
@@ -121,16 +117,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("out", type=Path)
     parser.add_argument("--every", type=int, default=1, help="take every so many pairs of shape and material")
-    parser.add_argument("--part", default="0/1", metavar="K/N", help="every N-th scene, from the K-th on")
+    add_part(parser)
     args = parser.parse_args(arguments)
     args.out.mkdir(parents=True, exist_ok=True)
     file = args.out / "rows.jsonl"
     lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
     kept = {tuple(row[:4]): Row(*row) for row in map(json.loads, lines)}
-    first, parts = (int(word) for word in args.part.split("/"))
-    wanted, find = list(settings(args.every))[first::parts], finder(None)
-    views = InferenceConfig(light_views=8, normal_views=8)
-    runner = Runner(parse("sdps-frames+refine", find), find, views, _QUICK)
+    wanted, runner = args.part.take(list(settings(args.every))), make_runner("sdps-frames+refine", refining=_QUICK)
     for number, setting in enumerate(wanted, start=1):
         if setting not in kept:
             kept[setting] = measure(runner, *setting)

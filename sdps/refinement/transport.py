@@ -76,18 +76,21 @@ def trace(
     """
     unit = np.ascontiguousarray(normals, np.float32)
     field, points, above, ways = _lay(heights, mask, unit, lights, camera)
-    lit = np.ones(ways.shape[:2], np.bool_)
-    _shadows(field, above, np.ascontiguousarray(ways), lit)
     factors = np.zeros((len(points), len(points)), np.float32)
     area = (1.0 / np.maximum(unit[:, 2], _STEEPEST)).astype(np.float32)
     _form_factors(field, points, above, unit, area, factors)
     factors /= np.maximum(factors.sum(axis=1, keepdims=True), 1.0)
-    return Transport(lit, factors)
+    return Transport(_find_lit(field, above, ways), factors)
 
 
 def trace_shadows(heights: np.ndarray, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:
     """Return which pixels nothing blocks the light of, (P, L) bool, seen without perspective; arguments of `trace`."""
     field, _, above, ways = _lay(heights, mask, np.ascontiguousarray(normals, np.float32), lights, ORTHOGRAPHIC)
+    return _find_lit(field, above, ways)
+
+
+def _find_lit(field: np.ndarray, above: np.ndarray, ways: np.ndarray) -> np.ndarray:
+    """Return which rays (P, L, 3) from points (P, 3) leave the height field (H, W), (P, L) bool."""
     lit = np.ones(ways.shape[:2], np.bool_)
     _shadows(field, above, np.ascontiguousarray(ways), lit)
     return lit

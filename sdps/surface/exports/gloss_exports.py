@@ -132,7 +132,7 @@ def read_surface(result: SavedResult) -> Surface:
 
 
 def _find_materials(result: SavedResult) -> Materials:
-    """Return the materials of a result's pixels; fitted one time, for all exports that want them."""
+    """Return the materials of a result's pixels, fitted once for all exports that want them."""
     found = _FITTED.get(result)
     if found is None:
         surface = read_surface(result)

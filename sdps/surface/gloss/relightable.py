@@ -91,7 +91,7 @@ def fit_near_pictures(pictures: Pictures, expand: Expand, lights: PixelLights) -
     """Return the same where each of n pixels sees the lamps from directions of its own.
 
     Args:
-        pictures: L arrays (n, 3), read a time for every four million pixels, their falloff taken off.
+        pictures: L arrays (n, 3), their falloff taken off; read once for every four million pixels.
         expand: Gives what the numbers are multiplied with.
         lights: Of the n pixels.
     """
