@@ -94,6 +94,8 @@ class CorrectedNetwork(FusionNetwork):
     kept_bytes = 6
     sees_places = True
     tells_errors = True
+    shared = ("feature", "enter", "smaller", "quarter", "surroundings", "back", "leave")
+    """Parts that networks of all kinds have: training of one may start from another's."""
 
     def _build_map(self, context: int) -> None:
         """Add the layers from pixels' features of 128 channels to normals and errors; `context` as in `FrameNet`."""
