@@ -164,7 +164,7 @@ def look_through(
     from sdps.photos import check
 
     options = {"models": args.models, "config": inference_config(args), "refine": args.refine,
-               "discontinuities": args.discontinuities}  # fmt: skip
+               "discontinuities": args.discontinuities, "lit_by": args.lit_by}  # fmt: skip
     flat = Flatness(args.flat, args.flatten)
 
     def read(scale: float) -> "Photographs":

@@ -63,6 +63,9 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--refine", action=argparse.BooleanOptionalAction, default=None,
                         help="refine normals and lights until a simple model explains the photographs, and join that "
                         "with what the network says (default: where a network finds the normals)")  # fmt: skip
+    parser.add_argument("--lit-by", choices=(AUTO, "lamp", "any"), default=AUTO,
+                        help="one lamp at a time in a dark room, or any light: a room, a window, several lamps "
+                        "(default: auto, by how the photographs look)")  # fmt: skip
     parser.add_argument("--anyway", action="store_true",
                         help="go on where a check of the photographs stops (the report says which)")  # fmt: skip
     parser.add_argument("--scale", type=_read_scale, default=1.0, metavar="F|auto",

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from render.shared.errors import InputError
+from render.shared.errors import InputError, unknown
 from sdps.classical import registry as classical
 from sdps.core.estimate import Estimate
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Rig
@@ -32,7 +32,7 @@ from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
 from sdps.methods.flat_things import NOT_FLAT, Flatness, Wish
-from sdps.methods.light_witness import question_lights, see_lights
+from sdps.methods.light_witness import ANY_LIGHT, DIRECT, question_lights, see_directness, see_lights
 from sdps.methods.method import AFTER, FUSE, REFINE, Method
 from sdps.methods.parse import can_fuse, finish, parse, uses_networks
 from sdps.methods.runner import Runner
@@ -49,6 +49,8 @@ from sdps.training.trainer import TrainingResult
 __all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "load", "plan", "train"]
 
 AUTO = "auto"
+LIT_BY = (AUTO, "lamp", "any")
+"""What lit photographs: to be found from them, one lamp at a time in the dark, or any light."""
 _LEARNED = ("sdps-frames", "sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
 _CALIBRATED = ("frames", "psfcn", "robust-least-squares")
 """Tried in this order; the parts may be trained or shipped one by one."""
@@ -69,27 +71,26 @@ def infer(
     anyway: bool = False,
     flat: Wish = "auto",
     flatten: float = 0.0,
+    lit_by: str = AUTO,
 ) -> Inference:
     """Estimate normals and lights of photographs.
 
     Args:
-        photos: Of `load`. Lights they carry are used, once a network has looked whether they are those of the
-            photographs; of lights without intensities it finds these.
+        photos: Of `load`. Lights they carry are used, once a network has compared them; it finds missing intensities.
         method: A combination (`sdps`), lights and normals (`lcnet+psfcn`), a normal model or a classical method;
             `auto` for the best there is: a pretrained network, or a classical method where there is none.
         models: Folder of trained runs (`out` of `train`) to take weights from before the pretrained ones.
         config: How networks are used; the defaults are those of every command.
-        refine: Refine by inverse rendering (`sdps.refinement`), and join that with what the network says where it tells
-            its errors (`sdps.methods.fusion`): `+fuse` after a method, or else `+refine`. None: where a network finds
-            the normals and the images are enough.
+        refine: Refine (`sdps.refinement`), and join that with what the network says where it tells its errors
+            (`sdps.methods.fusion`). None: where a network finds the normals and the images are enough.
         discontinuities: Let the depth jump where neighbouring slopes disagree.
         findings: Of `check`, if it ran before.
         anyway: Go on where the checks found an error. The method may still find that it cannot.
         flat, flatten: What is done with flat things: wish and share of `sdps.methods.flat_things.Flatness`.
+        lit_by: Of `LIT_BY`: what method `auto` is to assume where no lights are given.
 
     Returns:
-        Normals (H, W, 3), light directions (L, 3) and intensities (L,), and what follows from them: depth, albedo,
-        relit pictures. Camera frame: x right, y up, z to the camera.
+        Normals, lights, and what follows from them: depth, albedo, relit pictures. Frame: x right, y up, z to the camera.
 
     Raises:
         InputError: photographs that cannot be used, or a method that is not there or cannot use them, in one line.
@@ -97,6 +98,7 @@ def infer(
     findings = tuple(check(photos)) if findings is None else findings
     stop(photos, findings, anyway)
     known = photos.light_directions is not None, photos.intensities is not None
+    method, seen = choose_method(method, photos, photos.mask, lit_by, known[0], models)
     runner = _runner(method, known, models, config, refine, len(photos), Flatness(flat, flatten))
     forecast = workload(photos, runner, discontinuities=discontinuities)
     if not anyway:
@@ -105,16 +107,18 @@ def infer(
     intensities, more = (photos.intensities, ()) if not known[0] else ask_about_lights(photos, models, config)
     stop(photos, findings := (*findings, *more), anyway)
     found, name = _estimate(runner, photos, intensities), runner.method.name
-    took, findings = time.perf_counter() - began, (*findings, *_tell_flat(found, runner.flat, lit=known[0]))
+    took, findings = time.perf_counter() - began, (*findings, *seen, *_tell_flat(found, runner.flat, lit=known[0]))
     return Inference(photos, name, found, findings, runner.files, discontinuities, took, forecast)
 
 
 def plan(
     photos: Photographs, method: str = AUTO, *, models: str | Path | None = None,
     config: InferenceConfig | None = None, refine: bool | None = None, discontinuities: bool = False,
+    lit_by: str = AUTO,
 ) -> Workload:  # fmt: skip
     """Return about what `infer` will take, in seconds and memory; arguments as of `infer`."""
     known = photos.light_directions is not None, photos.intensities is not None
+    method, _ = choose_method(method, photos, photos.mask, lit_by, known[0], models)
     runner = _runner(method, known, models, config, refine, len(photos))
     return workload(photos, runner, discontinuities=discontinuities)
 
@@ -157,6 +161,7 @@ def estimate(
         InputError: sizes that do not fit, values that are not finite, an empty mask, or a method that is not there or
             wants lights that are not given.
     """
+    method, _ = choose_method(method, images, mask, AUTO, light_directions is not None, models)
     runner = _runner(method, (light_directions is not None, intensities is not None), models, config)
     if light_directions is not None and intensities is None:
         check_lights(len(images), light_directions)
@@ -273,6 +278,43 @@ def ask_about_lights(
     remedy = "look whether the circle is right, and whether the same lamps lit both" if photos.balls else ""
     level, text = advise(fit, photos.files, photos.lights_name, photos.lights_frame, remedy)
     return intensities, (Finding(level, text),)
+
+
+def choose_method(
+    method: str, images: ImageSource, mask: np.ndarray, lit_by: str, lit: bool, models: str | Path | None = None
+) -> tuple[str, tuple[Finding, ...]]:
+    """Return the method that `auto` stands for where no lamp lights the images alone, else what was asked for.
+
+    Args:
+        method: As of `infer`.
+        images, mask: As of `estimate`.
+        lit_by: Of `LIT_BY`.
+        lit: Light directions are given.
+        models: As of `infer`.
+
+    Returns:
+        The method, and what is to be said of it.
+
+    Raises:
+        InputError: an unknown `lit_by`, or no weights for any light where that was asked for.
+    """
+    if lit_by not in LIT_BY:
+        raise unknown("lit_by", lit_by, LIT_BY)
+    if method.partition("+")[0] != AUTO or lit or lit_by == "lamp":
+        return method, ()
+    find, chosen = _finder(models), method.replace(AUTO, ANY_LIGHT, 1)
+    if lit_by == "any":
+        find(ANY_LIGHT)
+        return chosen, ()
+    directness = see_directness(images, mask, find)
+    if directness is None or directness >= DIRECT:
+        return method, ()
+    text = (
+        "The light does not come from one lamp at a time: the room, or several lamps, light the pictures as well. So "
+        "the normals are found by a network for any light, which finds no lights and no albedo. For better ones darken "
+        "the room and use one lamp; if you did, say so with --lit-by lamp."
+    )
+    return chosen, (Finding("note", text),)
 
 
 def _estimate(runner: Runner, photos: Photographs, intensities: np.ndarray | None) -> Estimate:

@@ -12,8 +12,9 @@ that was stopped goes on.
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ LIGHTS = {
 }
 COUNTS = (4, 8, 16)
 METHODS = ("anylight", "sdps-frames", "sdps-frames+fuse", "pf14")
-_SIDE = 128
+_SIDE, _ROWS = 128, "rows.jsonl"
 _WIDEST = 50.0
 """Degrees from any direction to the nearest light in scenes that surroundings are mixed from."""
 
@@ -76,36 +77,68 @@ def photograph(scene: SceneSpec, store: SceneStore, light: str) -> Batch:
     return make_sample(scene, store.load(scene), options, generator(0, "any-light", light, scene.id))
 
 
-def measure(scene: SceneSpec, sample: Batch, light: str, methods: Sequence[str], models: Path | None) -> Iterator[Row]:
-    """Yield the errors of methods that see some of a scene's images, and all."""
+def measure_scene(
+    scene: SceneSpec, sample: Batch, light: str, methods: Sequence[str], models: Path | None
+) -> Iterator[Row]:
+    """Yield the errors of methods that see some of a rendered scene's images, and all."""
     mask = sample.mask[0].numpy() > 0.5
     images = np.ascontiguousarray(sample.images.numpy().transpose(0, 2, 3, 1))
-    truth = sample.normals.numpy().transpose(1, 2, 0)[mask]
+    truth = sample.normals.numpy().transpose(1, 2, 0)
     lens = scene.view.camera_distance
     camera = Camera(lens * _SIDE / 2) if lens else Camera()
     for count in COUNTS:
         for method in methods:
-            try:
-                found = estimate(images[:count], mask, method, camera=camera, models=models).normals[mask]
-                error = round(float(angle_degrees(found, truth).mean()), 3)
-            except InputError as reason:  # too few images for a method
-                sys.stderr.write(f"{method}, {count} images: {reason}\n")
-                error = None
+            error = measure(images[:count], mask, truth, method, camera=camera, models=models)
             yield Row(light, scene.id, count, method, error)
 
 
-def summarise(rows: Sequence[Row], methods: Sequence[str]) -> str:
+def measure(
+    images: np.ndarray, mask: np.ndarray, truth: np.ndarray, method: str, *, camera: Camera, models: Path | None
+) -> float | None:
+    """Return the mean error of a method's normals in degrees; None where it refuses the images, which it says.
+
+    Args:
+        images: (L, H, W, 3), linear radiance.
+        mask: (H, W) bool.
+        truth: (H, W, 3), unit normals.
+        method, camera, models: As of `sdps.estimate`.
+    """
+    try:
+        found = estimate(images, mask, method, camera=camera, models=models).normals[mask]
+    except InputError as reason:  # too few images for a method
+        sys.stderr.write(f"{method}, {len(images)} images: {reason}\n")
+        return None
+    return round(float(angle_degrees(found, truth[mask]).mean()), 3)
+
+
+def summarise(
+    rows: Sequence[Row], methods: Sequence[str], lights: Iterable[str] = LIGHTS, counts: Sequence[int] = COUNTS
+) -> str:
     """Return the mean errors by light, number of images and method."""
     lines = []
-    for light in LIGHTS:
-        for count in COUNTS:
-            some = [row for row in rows if (row.light, row.images) == (light, count)]
-            errors = [
-                [row.error for row in some if row.method == method and row.error is not None] for method in methods
-            ]
-            cells = [f"{np.mean(each):.2f}" if each else "-" for each in errors]
-            lines.append([light, str(count), str(len({row.scene for row in some})), *cells])
+    for light, count in product(lights, counts):
+        some = [row for row in rows if (row.light, row.images) == (light, count)]
+        errors = [[row.error for row in some if row.method == method and row.error is not None] for method in methods]
+        cells = [f"{np.mean(each):.2f}" if each else "-" for each in errors]
+        lines.append([light, str(count), str(len({row.scene for row in some})), *cells])
     return render_text("Mean error of the normals, degrees", ["light", "images", "scenes", *methods], lines)
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """Return the rows that were kept in a folder, which is made where there is none."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / _ROWS
+    return [Row(**json.loads(line)) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
+
+
+def keep_rows(folder: Path, rows: Sequence[Row]) -> None:
+    """Add rows to those of a folder, and say them."""
+    with (folder / _ROWS).open("a", encoding="utf-8") as out:
+        out.writelines(json.dumps(vars(row)) + "\n" for row in rows)
+    for light, scene in dict.fromkeys((row.light, row.scene) for row in rows):
+        said = [row.error for row in rows if (row.light, row.scene) == (light, scene)]
+        sys.stdout.write(f"{light}, {scene}: {said}\n")
+    sys.stdout.flush()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -117,9 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scenes", type=int, default=40)
     parser.add_argument("--methods", nargs="+", default=METHODS)
     args = parser.parse_args(arguments)
-    args.out.mkdir(parents=True, exist_ok=True)
-    file = args.out / "rows.jsonl"
-    rows = [Row(**json.loads(line)) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
+    rows = read_rows(args.out)
     scenes, store = list_finished(args.data, "val", skip_missing=True), SceneStore(args.data, cache=False)
     chosen = {light: choose(scenes, light, args.scenes) for light in LIGHTS}
     wanted = [(light, scene) for number in range(args.scenes) for light in LIGHTS
@@ -127,11 +158,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for light, scene in wanted:
         done = {row.method for row in rows if (row.light, row.scene, row.images) == (light, scene.id, COUNTS[-1])}
         if missing := [method for method in args.methods if method not in done]:
-            new = list(measure(scene, photograph(scene, store, light), light, missing, args.models))
+            new = list(measure_scene(scene, photograph(scene, store, light), light, missing, args.models))
             rows += new
-            with file.open("a", encoding="utf-8") as out:
-                out.writelines(json.dumps(vars(row)) + "\n" for row in new)
-            sys.stdout.write(f"{light}, {scene.id}: {[row.error for row in new]}\n")
+            keep_rows(args.out, new)
     kept = {(light, scene.id) for light, scene in wanted}
     sys.stdout.write(summarise([row for row in rows if (row.light, row.scene) in kept], args.methods))
     return 0

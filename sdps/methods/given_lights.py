@@ -101,22 +101,44 @@ def reduce_images(images: ImageSource, mask: np.ndarray) -> ReducedImages:
         images: Linear radiance of any overall scale.
         mask: (H, W) bool, not empty.
     """
+    read, share = read_small(images, mask, range(len(images)), _SIDE)
+    small = share > (0.99 if (share > 0.99).sum() >= 50 else 0.5)
+    values = read[:, small] / np.maximum(share, 1e-6)[small][:, None]  # (L, P, 3)
+    values = remove_stray_light(values, stray_light(values)).mean(-1).astype(np.float64)
+    rows, columns = _box(mask)
+    return ReducedImages(values / max(values.mean(), 1e-12), small, small & _rim(mask, rows, columns, small.shape))
+
+
+def read_small(
+    images: ImageSource, mask: np.ndarray, numbers: Sequence[int], side: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Read some images, one at a time, and reduce the object's box to at most `side` pixels a side.
+
+    Args:
+        images: (L, H, W, 3).
+        mask: (H, W) bool, not empty.
+        numbers: Which images.
+        side: Of the box's longer side.
+
+    Returns:
+        Images (l, h, w, 3) float32, black outside the object, and the object's share of each pixel, (h, w).
+    """
+    rows, columns = _box(mask)
+    inside = mask[rows, columns]
+    shrink = max(1.0, max(inside.shape) / side)
+    shape = max(1, round(inside.shape[0] / shrink)), max(1, round(inside.shape[1] / shrink))
+    found = []
+    for number in numbers:
+        image = np.asarray(images[number : number + 1])[0][rows, columns].astype(np.float32)
+        found.append(reduce_image(np.where(inside[..., None], image, np.float32(0.0)), shape))
+    return np.stack(found), reduce_image(inside.astype(np.float32), shape)
+
+
+def _box(mask: np.ndarray) -> tuple[slice, slice]:
+    """Return the rows and columns of the object's box in a mask (H, W)."""
     lines = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     rows, columns = (slice(int(found[0]), int(found[-1]) + 1) for found in lines)
-    height, width = mask[rows, columns].shape
-    shrink = max(1.0, max(height, width) / _SIDE)
-    shape = max(1, round(height / shrink)), max(1, round(width / shrink))
-    inside = mask[rows, columns].astype(np.float32)
-    share = reduce_image(inside, shape)
-    small = share > (0.99 if (share > 0.99).sum() >= 50 else 0.5)
-    grey = []
-    for number in range(len(images)):
-        image = np.asarray(images[number : number + 1])[0][rows, columns].astype(np.float32)
-        image = np.where(mask[rows, columns][..., None], image, np.float32(0.0))
-        grey.append((reduce_image(image, shape) / np.maximum(share, 1e-6)[..., None])[small])
-    values = np.stack(grey)  # (L, P, 3)
-    values = remove_stray_light(values, stray_light(values)).mean(-1).astype(np.float64)
-    return ReducedImages(values / max(values.mean(), 1e-12), small, small & _rim(mask, rows, columns, shape))
+    return rows, columns
 
 
 def _rim(mask: np.ndarray, rows: slice, columns: slice, shape: tuple[int, int]) -> np.ndarray:

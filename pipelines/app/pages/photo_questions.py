@@ -17,6 +17,7 @@ PHOTOS, PAINTED, BALL = "photos", "painted.png", "ball-{}"
 _CHOICES = {
     "gamma": ("auto", "linear", "srgb", "2.2"),
     "scale": ("1", "0.5", "0.25", "auto"),
+    "lit_by": ("auto", "lamp", "any"),
     "flat": ("auto", "yes", "turned", "no"),
     "flatten": ("0", "0.1", "0.25", "0.5"),
     "intensities": ("", "equal", "folder"),
@@ -40,11 +41,13 @@ _SAID = {
     r"--flat turned": '"Is it flat?": yes, but hollow',
     r"--flat no\b": '"Is it flat?": no',
     r"use --flat\b": 'use "Is it flat?": yes',
+    r"--lit-by lamp": '"How was it lit?": by one lamp at a time',
     r"--intensities equal": '"How strong the lamps were": all equally strong',
 }  # fmt: skip
 _LABELS = {
     "method": "Method", "refine": "Refine", "gamma": "Tone curve", "scale": "Size of the pictures",
-    "flat": "Is it flat?", "flatten": "Flatten", "focal": "Focal length", "principal": "Principal point",
+    "lit-by": "How was it lit?", "flat": "Is it flat?", "flatten": "Flatten", "focal": "Focal length",
+    "principal": "Principal point",
     "pixel-size": "Size of a pixel", "light-distance": "How far away the lamps stood", "lights": "Use the lights file",
     "frame": "Axes of the lights file", "intensities": "How strong the lamps were", "ball": "Balls", "mask": "Mask",
     "ambient": "Picture with the lamp off", "dark": "Picture with the lens covered", "every": "Every so many frames",
@@ -110,7 +113,8 @@ def make_arguments(place: Path, pose: "Pose", answers: dict[str, Any]) -> argpar
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     args, focal, painted = parser.parse_args([]), answers["focal"], place / PAINTED
-    for name in ("method", "gamma", "frame", "flat", "light_distance", "pixel_size", "anyway", "discontinuities"):
+    plain = ("method", "lit_by", "gamma", "frame", "flat", "light_distance", "pixel_size", "anyway", "discontinuities")
+    for name in plain:
         setattr(args, name, answers[name])
     args.mask = painted if painted.is_file() else None
     args.lights = "folder" if answers["lights"] else None

@@ -125,7 +125,8 @@ def _foresee(args: argparse.Namespace, pose: "Pose", photos: "Photographs") -> t
 
     told: list[str] = []
     try:
-        options: dict[str, Any] = {"refine": args.refine, "discontinuities": args.discontinuities}
+        options: dict[str, Any] = {"refine": args.refine, "discontinuities": args.discontinuities,
+                                   "lit_by": args.lit_by}  # fmt: skip
         expected = plan(photos, args.method, **options)
         if args.scale != 1.0 and (args.scale != "auto" or expected.quick is not None):
             photos, _, options = look_through(args, pose, told.append)
@@ -160,7 +161,7 @@ def list_methods(lit: bool) -> list[dict[str, str]]:
     for name, about in there.items():
         combined = name in COMBINATIONS
         classical = name in METHODS and METHODS[name].calibrated == lit
-        if (combined and not lit) or classical or (name == "psfcn" and lit):
+        if (combined and not lit) or classical or name == ("psfcn" if lit else "anylight"):
             found.append({"name": name, "about": about})
     return found
 
