@@ -90,7 +90,7 @@ def infer(
         lit_by: Of `LIT_BY`: what method `auto` is to assume where no lights are given.
 
     Returns:
-        Normals, lights, and what follows from them: depth, albedo, relit pictures. Frame: x right, y up, z to the camera.
+        Normals, lights, and what follows: depth, albedo, relit pictures. Frame: x right, y up, z to the camera.
 
     Raises:
         InputError: photographs that cannot be used, or a method that is not there or cannot use them, in one line.
