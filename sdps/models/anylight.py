@@ -32,6 +32,8 @@ _WIDTHS = (32, 64, 96)
 """Channels of the reader at a half, a quarter and an eighth of the side."""
 _DARK = 1e-3
 """Share of an image's mean below which nothing is seen."""
+_BLACK = 0.02
+"""Share of the brightest image's level that black images count as having: there is nothing but noise to divide by."""
 _STRIP = 2**13
 """Pixels times images that are worked on at once in inference."""
 
@@ -245,7 +247,8 @@ def measure(images: Tensor, mask: Tensor) -> Tensor:
     for image in images.unbind(dim=1):  # one at a time: they may be large, and kept in 16 bits
         shown = image.float() * mask
         found.append(torch.stack([shown.mean(dim=1).sum(dim=(1, 2)) / area, shown.amax(dim=(1, 2, 3))], dim=-1))
-    return torch.stack(found, dim=1).clamp(min=1e-6)
+    levels = torch.stack(found, dim=1)
+    return torch.maximum(levels, (_BLACK * levels.amax(dim=1, keepdim=True)).clamp(min=1e-6))
 
 
 def object_places(mask: Tensor) -> Tensor:

@@ -124,6 +124,18 @@ def test_a_mask_without_pixels_gives_a_map(trained):
         assert torch.isfinite(trained(seen._replace(mask=torch.zeros_like(seen.mask)))).all()
 
 
+def test_a_black_image_among_bright_ones_blows_nothing_up():
+    """Its mean is that of its noise, next to zero: divided by that, training once became NaN."""
+    mask = torch.ones(1, 1, 16, 16)
+    images = torch.rand(1, 5, 3, 16, 16)
+    images[:, 1] = 0.01 * torch.randn(1, 3, 16, 16)
+    images[:, 1] -= images[:, 1].mean()
+    levels = measure(images, mask)
+    read = image_inputs(images, mask, object_places(mask), levels[..., 0])
+    seen, known = pixel_inputs(images[0].flatten(2).permute(2, 0, 1), levels[0], object_places(mask)[0].flatten(1).T)
+    assert max(float(part.abs().max()) for part in (read, seen, known)) < 10.0
+
+
 def test_large_images_are_read_small():
     mask = torch.ones(1, 1, 300, 200)
     images = torch.rand(1, 2, 3, 300, 200)
