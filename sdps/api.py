@@ -32,7 +32,7 @@ from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
 from sdps.methods.flat_things import NOT_FLAT, Flatness, Wish
-from sdps.methods.light_witness import ANY_LIGHT, DIRECT, question_lights, see_directness, see_lights
+from sdps.methods.light_witness import ANY_LIGHT, is_lit_by_lamps, question_lights, see_lights
 from sdps.methods.method import AFTER, FUSE, REFINE, Method
 from sdps.methods.parse import can_fuse, finish, parse, uses_networks
 from sdps.methods.runner import Runner
@@ -98,7 +98,7 @@ def infer(
     findings = tuple(check(photos)) if findings is None else findings
     stop(photos, findings, anyway)
     known = photos.light_directions is not None, photos.intensities is not None
-    method, seen = choose_method(method, photos, photos.mask, lit_by, known[0], models)
+    method, seen = choose_method(method, photos, photos.mask, lit_by, known[0], models, config)
     runner = _runner(method, known, models, config, refine, len(photos), Flatness(flat, flatten))
     forecast = workload(photos, runner, discontinuities=discontinuities)
     if not anyway:
@@ -118,7 +118,7 @@ def plan(
 ) -> Workload:  # fmt: skip
     """Return about what `infer` will take, in seconds and memory; arguments as of `infer`."""
     known = photos.light_directions is not None, photos.intensities is not None
-    method, _ = choose_method(method, photos, photos.mask, lit_by, known[0], models)
+    method, _ = choose_method(method, photos, photos.mask, lit_by, known[0], models, config)
     runner = _runner(method, known, models, config, refine, len(photos))
     return workload(photos, runner, discontinuities=discontinuities)
 
@@ -161,7 +161,7 @@ def estimate(
         InputError: sizes that do not fit, values that are not finite, an empty mask, or a method that is not there or
             wants lights that are not given.
     """
-    method, _ = choose_method(method, images, mask, AUTO, light_directions is not None, models)
+    method, _ = choose_method(method, images, mask, AUTO, light_directions is not None, models, config)
     runner = _runner(method, (light_directions is not None, intensities is not None), models, config)
     if light_directions is not None and intensities is None:
         check_lights(len(images), light_directions)
@@ -281,7 +281,13 @@ def ask_about_lights(
 
 
 def choose_method(
-    method: str, images: ImageSource, mask: np.ndarray, lit_by: str, lit: bool, models: str | Path | None = None
+    method: str,
+    images: ImageSource,
+    mask: np.ndarray,
+    lit_by: str,
+    lit: bool,
+    models: str | Path | None = None,
+    config: InferenceConfig | None = None,
 ) -> tuple[str, tuple[Finding, ...]]:
     """Return the method that `auto` stands for where no lamp lights the images alone, else what was asked for.
 
@@ -290,7 +296,7 @@ def choose_method(
         images, mask: As of `estimate`.
         lit_by: Of `LIT_BY`.
         lit: Light directions are given.
-        models: As of `infer`.
+        models, config: As of `infer`.
 
     Returns:
         The method, and what is to be said of it.
@@ -306,11 +312,14 @@ def choose_method(
     if lit_by == "any":
         find(ANY_LIGHT)
         return chosen, ()
-    directness = see_directness(images, mask, find)
-    if directness is None or directness >= DIRECT:
+    try:
+        find(ANY_LIGHT)
+    except InputError:  # no weights
+        return method, ()
+    if is_lit_by_lamps(images, mask, find, config):
         return method, ()
     text = (
-        "The light does not come from one lamp at a time: the room, or several lamps, light the pictures as well. So "
+        "Next to nothing of the object is in shadow in any picture: not one lamp lit it, but a room or several. So "
         "the normals are found by a network for any light, which finds no lights and no albedo. For better ones darken "
         "the room and use one lamp; if you did, say so with --lit-by lamp."
     )

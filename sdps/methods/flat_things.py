@@ -28,7 +28,7 @@ from sdps.methods.relief_sides import TURN, tell_side
 Wish = Literal["auto", "yes", "no", "turned"]
 SHARE = 0.25
 """Share of the width that the mean slope is taken over, where slopes are flattened."""
-_COVERS = 0.97
+COVERS = 0.97
 """Share of the frame from which on a mask covers it."""
 _THICKEST = 0.2
 """Height, over the longer side, above which what covers the frame is not flat."""
@@ -118,7 +118,7 @@ NOT_FLAT = Flatness("no")
 
 def is_flat(mask: np.ndarray, normals: np.ndarray) -> bool:
     """Return whether a mask (H, W) covers the frame, and normals (H, W, 3) are those of something thin."""
-    if mask.mean() < _COVERS:
+    if mask.mean() < COVERS:
         return False
     small, inside = _reduce(normals, mask)
     small = small - small[inside].mean(axis=0)

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from render.shared.errors import InputError
 from render.shared.imaging.vectors import unit
@@ -13,57 +12,69 @@ from sdps.core.estimate import Estimate
 from sdps.core.intensities import grey, scale_to_mean
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
+from sdps.methods.flat_things import COVERS
 from sdps.methods.given_lights import (
     LightFit,
     carry_intensities,
     compare_lights,
     find_intensities,
+    measure_misfit,
     read_small,
     reduce_images,
 )
 from sdps.methods.method import Method
-from sdps.methods.runner import Runner, load_once
-from sdps.models.anylight import AnyLightNet
-from sdps.models.base import Observations
+from sdps.methods.runner import Runner
+from sdps.models.lcnet import INPUT_SIZE
 from sdps.models.registry import COMBINATIONS
 
 _ASKED = ("sdps-frames", "sdps-plus", "sdps")
 """Combinations whose lighting network is asked, the first whose weights are there."""
 _FEWEST = 3
 ANY_LIGHT = "anylight"
-"""The model that is told nothing of the light, and tells what it was like."""
-DIRECT = 0.5
-"""Directness from which on images count as lit by one lamp each."""
-_LOOKED, _SIDE = 16, 128
-"""Images that are looked at, spread over all, and their longer side: what the network was trained with."""
+"""The model that is told nothing of the light."""
+_LOOKED = 16
+"""Images that are looked at, spread over all."""
+_BRIGHT, _SHADOW = 75.0, 0.1
+"""A pixel is in shadow where it has less than this share of its bright values, a percentile over the images."""
+_IN_SHADOW, _DOUBT, _MISFIT = 0.04, 5.0, 0.1
+"""Share of the object in shadow, mean error to expect of the lights in degrees, and what Lambert's law leaves
+unexplained, from which on the witnesses speak for lamps, and against them (docs/studies/any-light.md)."""
 
 _log = logging.getLogger(__name__)
 
 
-@torch.inference_mode()
-def see_directness(images: ImageSource, mask: np.ndarray, find: Callable[[str], Path]) -> float | None:
-    """Return how far light comes from one direction in each image, the median of some: 1 one lamp, 0 all sides alike.
+def is_lit_by_lamps(
+    images: ImageSource, mask: np.ndarray, find: Callable[[str], Path], config: InferenceConfig | None = None
+) -> bool:
+    """Return whether one lamp at a time lit the images, or nothing speaks against it.
+
+    Three witnesses must agree that none did: next to nothing is in shadow, where a lamp leaves part of any round
+    object; the network that finds lamps expects to be far off; and a matte surface under what it finds does not explain
+    the images. What covers the frame tells nothing: flat things have no shadows under a lamp either.
 
     Args:
-        images: (L, H, W, 3) linear radiance, an array or what reads it a few images at a time.
-        mask: (H, W) bool, not empty.
-        find: Gives the weights file of a name, or raises InputError.
-
-    Returns:
-        None where no weights are there.
+        images, mask, find, config: As for `see_lights`.
     """
-    try:
-        network = load_once(find(ANY_LIGHT)).network
-    except InputError:
-        return None
-    assert isinstance(network, AnyLightNet)
+    if mask.mean() >= COVERS:
+        return True
     numbers = np.unique(np.linspace(0, len(images) - 1, _LOOKED).round().astype(int)).tolist()
-    read, share = read_small(images, mask, numbers, _SIDE)
-    device = next(network.parameters()).device
-    small = torch.from_numpy(read / np.maximum(share, 0.5)[..., None]).permute(0, 3, 1, 2)[None]  # (1, Q, 3, h, w)
-    inside = torch.from_numpy((share > 0.5).astype(np.float32))[None, None]  # (1, 1, h, w)
-    seen = Observations(small.to(device), mask=inside.to(device))
-    return float(network.directness(seen).median())
+    read, share = read_small(images, mask, numbers, INPUT_SIZE)
+    inside = share > (0.5 if (share > 0.5).any() else 0.0)
+    small = np.where(inside[..., None], read / np.maximum(share, 1e-6)[..., None], np.float32(0.0))
+    if measure_shadow(small[:, inside].mean(-1)) >= _IN_SHADOW:
+        return True
+    seen = see_lights(small, inside, find, config)
+    if seen is None or seen.expected_light_error is None or float(seen.expected_light_error.mean()) < _DOUBT:
+        return True
+    strengths = scale_to_mean(grey(seen.intensities.astype(np.float64)))
+    return measure_misfit(reduce_images(small, inside), seen.light_directions.astype(np.float64), strengths) < _MISFIT
+
+
+def measure_shadow(values: np.ndarray) -> float:
+    """Return the share of grey values (L, P) of an object that are in shadow: dark beside the pixel's bright ones."""
+    relative = values / np.maximum(values.mean(axis=1, keepdims=True), 1e-12)
+    bright = np.percentile(relative, _BRIGHT, axis=0)
+    return float((relative < _SHADOW * bright).mean())
 
 
 def see_lights(

@@ -41,7 +41,7 @@ Found = dict[tuple[Hashable, ...], Estimate]
 
 
 @cache
-def load_once(path: Path) -> "TrainedModel":
+def _load(path: Path) -> "TrainedModel":
     """Load a model once, however many methods use it."""
     return load_model(path, default_device())
 
@@ -69,7 +69,7 @@ class Runner:
         self.files = {name: find(name) for name in sorted(method.models())}
 
         def model(name: str) -> "TrainedModel | None":
-            return load_once(self.files[name]) if name in self.files else None
+            return _load(self.files[name]) if name in self.files else None
 
         lighting, normals = (model(getattr(method, place)) for place in _PLACES)
         self.estimator = None

@@ -43,6 +43,8 @@ _SEEN, _KNOWN = 11, 7
 """Values of a pixel under one light, and those it has under all."""
 _DARK = 1e-3
 """Radiance below which nothing is seen; full scale is 1."""
+_LARGEST = 2.0
+"""Logarithm of the largest distance that is expected, beyond any: odd input must not end in infinity."""
 _ERROR_SCALE = 10.0
 """Degrees to expect of a light that count as 1."""
 _NEAREST = 0.04
@@ -149,7 +151,7 @@ class CorrectedNetwork(FusionNetwork):
         back = self.back(torch.cat([self.quarter[-1](quarter), half], dim=1))
         change = self.leave(torch.cat([back, entered], dim=1)).float()
         corrected = functional.normalize(normals + change[:, :3], dim=1)
-        return feature.face(corrected), (change[:, 3:] + LOG_USUAL).exp()
+        return feature.face(corrected), (change[:, 3:] + LOG_USUAL).clamp(max=_LARGEST).exp()
 
     def accumulate(self, so_far: list[Observations] | None, seen: Observations) -> list[Observations]:
         """Keep the images of a scene, in 16 bits."""

@@ -46,6 +46,8 @@ _MAY_CHANGE = {
 }  # fmt: skip
 
 _log = logging.getLogger(__name__)
+_MOST_SKIPPED = 5
+"""Steps in a row whose gradient is not finite, after which training ends."""
 
 
 @dataclass(frozen=True)
@@ -214,6 +216,7 @@ class Trainer:
         self.saved: int | None = None  # step of the checkpoint on disk
         self.on_save: Callable[[], None] | None = None
         self.finished_metrics: dict[str, float] | None = None
+        self.skipped = 0  # steps in a row
         self._earlier_seconds, self._started = 0.0, time.perf_counter()
 
     def seconds(self) -> float:
@@ -259,13 +262,25 @@ class Trainer:
         if config.clip_gradient:
             norm = torch.nn.utils.clip_grad_norm_(self.stage.network.parameters(), config.clip_gradient)
             totals["gradient_norm"] = float(norm)
-        self.optimiser.step()
+        if math.isfinite(totals.get("gradient_norm", 0.0)):
+            self.optimiser.step()
+            self.skipped = 0
+        else:  # of one odd sample; the weights would be lost
+            self._skip_step(totals)
         self.optimiser.zero_grad(set_to_none=True)
         if self.average is not None:
             self.average.update_parameters(self.stage.network)
         self.step += 1
         self.samples += config.batch_scenes
         return totals
+
+    def _skip_step(self, totals: dict[str, float]) -> None:
+        """Leave the weights as they are, and say so; too often in a row is an error."""
+        self.skipped += 1
+        if self.skipped >= _MOST_SKIPPED:
+            raise self._divergence(f"the gradient was not finite in {self.skipped} steps in a row, up to {self.step + 1}")
+        _log.warning("%s: the gradient of step %d is not finite; the step was left out", self.stage.name, self.step + 1)
+        totals["gradient_norm"] = 0.0
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:

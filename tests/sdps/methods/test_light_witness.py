@@ -1,63 +1,90 @@
 """What `auto` does about the light: one lamp at a time, or any."""
 
-import logging
 from pathlib import Path
 
 import numpy as np
 import photo_folders as folders
 import pytest
-import torch
 
 import sdps
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from sdps.api import choose_method
+from sdps.core.estimate import Estimate
 from sdps.data.augment import Augmentation
 from sdps.methods import light_witness, pretrained
-from sdps.methods.light_witness import see_directness
+from sdps.methods.light_witness import is_lit_by_lamps, measure_shadow
 from sdps.models.checkpoint import TrainedModel, save_weights
 from sdps.models.registry import create
 
 SMALL = {"width": 16, "blocks": 1, "heads": 2, "channels": 16, "context": 0}
 
 
-def write_weights(out: Path, directness: float) -> Path:
-    """Write a network that sees light of one directness everywhere; return the folder of runs."""
-    network = create("anylight", **SMALL)
-    with torch.no_grad():
-        network.light.weight.zero_()
-        network.light.bias.zero_()
-        network.light.bias[0], network.light.bias[3] = 1.0, 3.0**0.5 * directness
-    model = TrainedModel("anylight", network, SMALL, {"config": {"augmentation": to_plain(Augmentation())}})
+def write_weights(out: Path) -> Path:
+    """Write a small network for any light; return the folder of runs."""
+    model = TrainedModel(
+        "anylight", create("anylight", **SMALL), SMALL, {"config": {"augmentation": to_plain(Augmentation())}}
+    )
     place = out / "models" / "anylight"
     place.mkdir(parents=True)
     save_weights(place / "anylight.safetensors", model)
     return out
 
 
-@pytest.mark.parametrize("directness", [0.2, 0.9])
-def test_a_network_says_how_direct_the_light_is_of_images_of_any_size(tmp_path: Path, directness: float) -> None:
-    find = pretrained.finder(write_weights(tmp_path, directness))
-    images, mask = np.random.default_rng(0).random((40, 150, 300, 3), np.float32), np.zeros((150, 300), bool)
-    mask[20:130, 10:290] = True
-    assert see_directness(images, mask, find) == pytest.approx(directness, abs=1e-5)
-    mask[:] = False
-    mask[5, 7] = True
-    assert see_directness(images[:3], mask, find) == pytest.approx(directness, abs=1e-5)
+def shade(lights: np.ndarray, ambient: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return images (L, 64, 64, 3) of a white ball, and its mask."""
+    y, x = np.mgrid[1:-1:64j, -1:1:64j]
+    mask = x**2 + y**2 < 0.95
+    normals = np.stack([x, y, np.sqrt(np.clip(1.0 - x**2 - y**2, 0.0, 1.0))], axis=-1)
+    shading = np.clip(np.einsum("hwk,lk->lhw", normals, lights), 0.0, None) + ambient
+    return np.repeat((shading * mask)[..., None], 3, axis=-1).astype(np.float32), mask
 
 
-def test_auto_takes_the_network_for_any_light_where_no_lamp_is_alone(tmp_path: Path) -> None:
-    mixed, lamps = write_weights(tmp_path / "mixed", 0.2), write_weights(tmp_path / "lamps", 0.95)
-    images, mask = np.random.default_rng(0).random((4, 24, 24, 3), np.float32), np.ones((24, 24), bool)
-    chosen, said = choose_method("auto", images, mask, "auto", False, mixed)
-    assert chosen == "anylight" and "one lamp" in said[0].text and "--lit-by lamp" in said[0].text
-    assert choose_method("auto", images, mask, "auto", False, lamps) == ("auto", ())
-    assert choose_method("auto", images, mask, "lamp", False, mixed) == ("auto", ())
-    assert choose_method("auto", images, mask, "any", False, lamps) == ("anylight", ())
-    assert choose_method("auto", images, mask, "auto", True, mixed) == ("auto", ()), "lights are given"
-    assert choose_method("pf14", images, mask, "any", False, mixed) == ("pf14", ()), "a method is named"
+def witness(expected: float, directions: np.ndarray) -> Estimate:
+    lit = np.ones(len(directions), np.float32)
+    return Estimate(np.zeros((0, 0, 3)), directions, lit, expected_light_error=expected * lit)
+
+
+RING = np.array([[np.cos(a), np.sin(a), 1.2] for a in np.linspace(0.0, 5.0, 8)], np.float32)
+RING /= np.linalg.norm(RING, axis=1, keepdims=True)
+
+
+def test_three_witnesses_speak_against_a_lamp(monkeypatch: pytest.MonkeyPatch) -> None:
+    def is_lit(ambient: float, expected: float, found: np.ndarray, whole: bool = False) -> bool:
+        images, mask = shade(RING, ambient)
+        monkeypatch.setattr(light_witness, "see_lights", lambda *_: witness(expected, found))
+        return is_lit_by_lamps(images, np.ones_like(mask) if whole else mask, find=lambda name: Path(name))
+
+    wrong = np.roll(RING, 3, axis=0)
+    assert not is_lit(1.0, 9.0, wrong), "no shadow, the network doubts, and nothing explains the images"
+    assert is_lit(0.0, 9.0, wrong), "part of the ball is in shadow"
+    assert is_lit(1.0, 2.0, wrong), "the network is sure of its lamps"
+    assert is_lit(1.0, 9.0, RING + np.float32([0.0, 0.0, 2.0])), "lamps explain the images"
+    assert is_lit(1.0, 9.0, wrong, whole=True), "what covers the frame may be flat"
+
+
+def test_a_ball_under_lamps_has_a_share_in_shadow_and_one_in_a_room_has_none() -> None:
+    images, mask = shade(RING, 0.0)
+    assert 0.05 < measure_shadow(images[:, mask].mean(-1)) < 0.3
+    images, mask = shade(RING, 0.5)
+    assert measure_shadow(images[:, mask].mean(-1)) == 0.0
+
+
+def test_auto_takes_the_network_for_any_light_where_no_lamp_is_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, (images, mask) = write_weights(tmp_path), shade(RING, 1.0)
+    monkeypatch.setattr("sdps.api.is_lit_by_lamps", lambda *_: False)
+    chosen, said = choose_method("auto", images, mask, "auto", False, out)
+    assert chosen == "anylight" and "shadow" in said[0].text and "--lit-by lamp" in said[0].text
+    assert choose_method("auto", images, mask, "lamp", False, out) == ("auto", ())
+    assert choose_method("auto", images, mask, "auto", True, out) == ("auto", ()), "lights are given"
+    assert choose_method("pf14", images, mask, "any", False, out) == ("pf14", ()), "a method is named"
     with pytest.raises(InputError, match=r"unknown lit_by 'lamps'; did you mean 'lamp'\?"):
-        choose_method("auto", images, mask, "lamps", False, mixed)
+        choose_method("auto", images, mask, "lamps", False, out)
+    monkeypatch.setattr("sdps.api.is_lit_by_lamps", lambda *_: True)
+    assert choose_method("auto", images, mask, "auto", False, out) == ("auto", ())
+    assert choose_method("auto", images, mask, "any", False, out) == ("anylight", ())
 
 
 def test_without_weights_every_light_counts_as_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,16 +99,14 @@ def test_without_weights_every_light_counts_as_lamps(tmp_path: Path, monkeypatch
 
 
 def test_photographs_in_a_lit_room_are_not_taken_for_those_of_a_lamp(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lights = np.array([[0.5, 0.0, 0.8], [0.0, 0.5, 0.8], [-0.5, 0.0, 0.8], [0.0, -0.5, 0.8]])
-    images, mask = folders.matte(lights, size=40)
-    photos = sdps.load(folders.write_folder(tmp_path / "photos", images + 0.2, mask))
-    out = write_weights(tmp_path / "out", 0.3)
+    images, mask = shade(RING, 1.0)
+    photos = sdps.load(folders.write_folder(tmp_path / "photos", 0.4 * images, mask))
+    out = write_weights(tmp_path / "out")
+    monkeypatch.setattr(light_witness, "see_lights", lambda *_: witness(9.0, np.roll(RING, 3, axis=0)))
     found = sdps.infer(photos, models=out, findings=())
     assert found.method == "anylight" and not len(found.light_directions)
-    assert any("one lamp at a time" in finding.text for finding in found.findings)
+    assert any("in shadow" in finding.text for finding in found.findings)
     assert sdps.plan(photos, models=out).method == "anylight"
-    with caplog.at_level(logging.WARNING):
-        assert sdps.infer(photos, models=out, findings=(), lit_by="lamp", refine=False).method != "anylight"
-    assert light_witness.DIRECT < 0.95
+    assert sdps.plan(photos, models=out, lit_by="lamp").method != "anylight"
