@@ -38,7 +38,7 @@ _BRIGHT, _SHADOW = 75.0, 0.1
 """A pixel is in shadow where it has less than this share of its bright values, a percentile over the images."""
 _IN_SHADOW, _DOUBT, _MISFIT = 0.04, 5.0, 0.1
 """Share of the object in shadow, mean error to expect of the lights in degrees, and what Lambert's law leaves
-unexplained, from which on the witnesses speak for lamps, and against them (docs/studies/any-light.md)."""
+unexplained, from which on the witnesses speak for lamps, and against them (docs/studies/stray-light.md)."""
 
 _log = logging.getLogger(__name__)
 

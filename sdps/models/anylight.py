@@ -164,12 +164,6 @@ class AnyLightNet(CorrectedNetwork):
         """Return about how long inference takes: every view is read again from the start."""
         return views * (3.0e-6 * images * pixels + 2.0e-6 * box)
 
-    def directness(self, seen: Observations) -> Tensor:
-        """Return how far each image's light comes from one direction, (B, Q): 1 from a lamp, 0 from all sides alike."""
-        with torch.autocast(seen.images.device.type, enabled=False):
-            found = self.light(self._look(seen)[0].tokens.float().mean(dim=2))
-        return measure_directness(found)
-
     def encode(self, seen: Observations) -> FusedMap:
         """Return the fused map of all of a scene's images."""
         return self._encode(seen)[0]
@@ -263,11 +257,6 @@ def object_places(mask: Tensor) -> Tensor:
     radius = ((high - low).amax(dim=1, keepdim=True) + 1.0) / 2
     placed = (both - (low + high) / 2) / radius
     return torch.nan_to_num(placed, 0.0, 0.0, 0.0).clamp(-2.0, 2.0)
-
-
-def measure_directness(light: Tensor) -> Tensor:
-    """Return the length of the mean direction of light of harmonics (..., 9), at most 1."""
-    return (light[..., 1:4].norm(dim=-1) / (3.0**0.5 * light[..., 0].clamp(min=0.1))).clamp(max=1.0)
 
 
 def shading_loss(found: Tensor, truth: Truth) -> Tensor:

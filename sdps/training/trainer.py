@@ -278,7 +278,7 @@ class Trainer:
         """Leave the weights as they are, and say so; too often in a row is an error."""
         self.skipped += 1
         if self.skipped >= _MOST_SKIPPED:
-            raise self._divergence(f"the gradient was not finite in {self.skipped} steps in a row, up to {self.step + 1}")
+            raise self._divergence(f"the gradient is not finite in {self.skipped} steps in a row, to {self.step + 1}")
         _log.warning("%s: the gradient of step %d is not finite; the step was left out", self.stage.name, self.step + 1)
         totals["gradient_norm"] = 0.0
 

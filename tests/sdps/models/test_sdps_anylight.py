@@ -25,7 +25,6 @@ from sdps.models.anylight import (
     AnyLightNet,
     image_inputs,
     measure,
-    measure_directness,
     object_places,
     pixel_inputs,
 )
@@ -190,18 +189,6 @@ def test_harmonics_are_orthonormal_and_shade_as_lambert_does():
     lamp, normals = functional.normalize(torch.randn(3), dim=0), vectors[:500]
     shown = harmonics(normals) * torch.tensor(IRRADIANCE) @ harmonics(lamp) / 4
     assert (shown - (normals @ lamp).clamp(min=0.0)).abs().mean() < 0.04  # 0.03: of order two
-
-
-def test_directness_tells_a_lamp_from_light_of_all_sides(trained):
-    lamps = functional.normalize(torch.randn(40, 3), dim=-1)
-    harmonic = harmonics(lamps)
-    torch.testing.assert_close(measure_directness(harmonic), torch.ones(40))
-    even = harmonics(functional.normalize(torch.randn(50_000, 3), dim=-1)).mean(0)
-    assert measure_directness(even) < 0.02
-    torch.testing.assert_close(measure_directness((harmonic + even) / 2), torch.full((40,), 0.5), atol=0.01, rtol=0)
-    with torch.no_grad():
-        found = trained.directness(observations(5))
-    assert found.shape == (1, 5) and (found >= 0.0).all() and (found <= 1.0).all()
 
 
 @pytest.mark.parametrize("views", [1, 8])

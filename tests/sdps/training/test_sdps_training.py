@@ -248,6 +248,30 @@ def test_weights_that_are_kept_may_hold_a_share_of_the_start(folder: Path, tmp_p
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
 
 
+def test_a_step_whose_gradient_is_not_finite_is_left_out_and_many_end_training(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, clip, bad = replace(QUICK, clip_gradient=1.0), torch.nn.utils.clip_grad_norm_, {3}
+    calls = count(1)
+
+    def clip_some(parameters, limit):
+        kept = list(parameters)
+        if next(calls) in bad:
+            for parameter in kept:
+                parameter.grad.fill_(torch.nan)
+        return clip(kept, limit)
+
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", clip_some)
+    result = train(NormalStage(config), folder, tmp_path / "one")
+    assert result.steps == 8 and all(torch.isfinite(each).all() for each in load_file(result.weights["nenet"]).values())
+    assert rows(tmp_path / "one")[2]["gradient_norm"] == 0.0
+    bad.update(range(1, 100))
+    with pytest.raises(
+        InputError, match="the gradient is not finite in 5 steps in a row, to 5; nothing was saved before"
+    ):
+        train(NormalStage(config), folder, tmp_path / "all")
+
+
 @pytest.mark.slow
 def test_compiled_networks_take_the_same_steps(folder: Path, tmp_path: Path) -> None:
     if shutil.which("g++") is None:
