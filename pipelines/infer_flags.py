@@ -32,7 +32,8 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mask", default=None, help="picture, bright on the object (default: mask.*, else automatic)")
     parser.add_argument("--lights", default=None, metavar="FILE|folder",
                         help="known light directions: rows x y z, .lp, .csv, .npy, .npz, .mat, lights.json, JSON of "
-                        "Meshroom or RelightLab; folder: the file of lights among the photographs")  # fmt: skip
+                        "Meshroom or RelightLab, HALCON's slants.tup; folder: the file of lights among the "
+                        "photographs")  # fmt: skip
     parser.add_argument("--ball", action="append", default=None, metavar="X,Y,R|auto|FOLDER",
                         help="a chrome or white ball that shows the lights, in place of --lights: its circle in "
                         "pixels of the files, auto to find it, or a folder of pictures of it alone, FOLDER or "
