@@ -172,7 +172,7 @@ def look_through(
             pose, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
             gamma=args.gamma, names=args.images, anyway=args.anyway, scale=scale, focal=args.focal,
             principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance, balls=args.ball,
-            ambient=args.ambient, dark=args.dark, whole_frame=flat.asked,
+            ball_radius=args.ball_radius, ambient=args.ambient, dark=args.dark, whole_frame=flat.asked,
         )  # fmt: skip
 
     photos = read(1.0 if args.scale == AUTO else args.scale)

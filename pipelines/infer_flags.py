@@ -39,6 +39,9 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
                         "pixels of the files, auto to find it, or a folder of pictures of it alone, FOLDER or "
                         "FOLDER:x,y,r; chrome: or white: before it says its kind; two balls give positions "
                         "(repeatable)")  # fmt: skip
+    parser.add_argument("--ball-radius", default=None, metavar="MM[,MM]",
+                        help="real radius of the balls, or of each in turn: gives the size of a pixel and, with "
+                        "--focal, how far from the camera each stands")  # fmt: skip
     parser.add_argument("--intensities", default=None, metavar="FILE|folder|equal",
                         help="known light intensities; equal if all lights are alike (default: those of --lights, else "
                         "found by a network)")  # fmt: skip
