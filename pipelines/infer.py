@@ -125,9 +125,8 @@ def infer_pose(args: argparse.Namespace, pose: "Pose", tell: Callable[[str], obj
     if args.anyway or not any(finding.level == "error" for finding in findings):
         tell(f"{plan(photos, args.method, **options).describe()}\n")
         sys.stdout.flush()
-    more = {"findings": findings, "anyway": args.anyway, "flat": args.flat, "flatten": args.flatten}
     with pose.naming():
-        return infer(photos, args.method, **options, **more), len(findings)
+        return infer(photos, args.method, **options, findings=findings, anyway=args.anyway), len(findings)
 
 
 def rehearse(args: argparse.Namespace, pose: "Pose") -> int:
@@ -164,7 +163,7 @@ def look_through(
     from sdps.photos import check
 
     options = {"models": args.models, "config": inference_config(args), "refine": args.refine,
-               "discontinuities": args.discontinuities}  # fmt: skip
+               "discontinuities": args.discontinuities, "flat": args.flat, "flatten": args.flatten}  # fmt: skip
     flat = Flatness(args.flat, args.flatten)
 
     def read(scale: float) -> "Photographs":

@@ -20,6 +20,7 @@ from sdps.inference.network_speed import time_lights, time_normals
 from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES
 from sdps.methods.fusion.fuse import TILE_PIXELS
 from sdps.methods.on_box import estimate_bytes
+from sdps.methods.relief_sides import MOST
 from sdps.methods.runner import Runner
 from sdps.models.base import FusionNetwork, NormalNetwork
 from sdps.models.registry import TRUE_LIGHTS
@@ -53,6 +54,7 @@ class Size:
         frame: Of a picture, once reduced.
         file: Of a picture in its file.
         pictures: How many.
+        flat: It may be a flat thing, of which pictures are looked at once more.
     """
 
     pixels: float
@@ -60,11 +62,12 @@ class Size:
     frame: float
     file: float
     pictures: int
+    flat: bool = False
 
     def reduced(self, scale: float) -> "Size":
         """Return what is left at a scale, relative to this one."""
         less = scale**2
-        return Size(less * self.pixels, less * self.box, less * self.frame, self.file, self.pictures)
+        return Size(less * self.pixels, less * self.box, less * self.frame, self.file, self.pictures, self.flat)
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,8 @@ def workload(photos: Photographs, runner: Runner, *, discontinuities: bool = Fal
     sides = [int(np.ptp(np.flatnonzero(mask.any(axis=axis)))) + 31 for axis in (1, 0)]
     frame = float(mask.size)
     box = float(min(sides[0], mask.shape[0]) * min(sides[1], mask.shape[1]))
-    size = Size(float(mask.sum()), box, frame, frame / photos.scale**2, len(photos))
+    flat = runner.flat.may_apply(mask, lit=photos.light_directions is not None)
+    size = Size(float(mask.sum()), box, frame, frame / photos.scale**2, len(photos), flat)
     kind = photos.coding.kind
     seconds, gib = _seconds(size, runner, kind, photos.scale < 1, discontinuities), _memory(size, runner)
     smaller = quick = None
@@ -200,6 +204,9 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
         each = 0.6e-6 + 38e-9 * images * (_NEAR_LAMPS if runner.method.lighting != TRUE_LIGHTS else 1.0)
         coarse, fine = 2000 * (1.5e-3 + 2800 * each), 120 * size.pixels * each
         found["refinement"] = (coarse + fine) / threads + 3 * once
+    if size.flat:
+        looked = ceil(images / ceil(images / MOST))
+        found["flat"] = looked * (once / images + 10e-9 * size.frame + 0.1) + 0.4e-6 * size.pixels
     if runner.method.fused:
         found["second look"] = found["normals"] + 5e-6 * size.box
     found["depth"] = (1.2e-6 if size.pixels > LARGE else 5e-6) * size.pixels * (60 if discontinuities else 1)

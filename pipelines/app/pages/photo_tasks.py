@@ -126,6 +126,7 @@ def _foresee(args: argparse.Namespace, pose: "Pose", photos: "Photographs") -> t
     told: list[str] = []
     try:
         options: dict[str, Any] = {"refine": args.refine, "discontinuities": args.discontinuities}
+        options |= {"flat": args.flat, "flatten": args.flatten}
         expected = plan(photos, args.method, **options)
         if args.scale != 1.0 and (args.scale != "auto" or expected.quick is not None):
             photos, _, options = look_through(args, pose, told.append)

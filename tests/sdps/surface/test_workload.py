@@ -78,6 +78,19 @@ def test_networks_count_as_fast_as_they_are_here(photos: Photographs, monkeypatc
     assert all(found[0][name] == found[2][name] for name in found[0] if name not in ("normals", "second look"))
 
 
+def test_flat_things_are_looked_at_once_more(photos: Photographs) -> None:
+    """What fills the frame may be one, unless lights are given or it is said to be none."""
+    whole = larger(photos, 2000, 3000, 100)
+    found = sdps.api.plan(whole).seconds
+    once = 32 * 2000 * 3000 * 27e-9  # decoded and made linear
+    assert once < found["flat"] < 4 * once
+    assert "flat" not in sdps.api.plan(whole, flat="no").seconds
+    assert "flat" not in sdps.api.plan(larger(photos, 2000, 3000, 100, 0.5)).seconds
+    assert "flat" in sdps.api.plan(larger(photos, 2000, 3000, 100, 0.5), flat="yes").seconds
+    lit = replace(whole, light_directions=np.tile([[0.0, 0.0, 1.0]], (100, 1)).astype(np.float32))
+    assert "flat" not in sdps.api.plan(lit).seconds
+
+
 def test_what_cannot_be_held_says_so_with_the_remedy(photos: Photographs) -> None:
     many = larger(photos, 3000, 4000, 60)
     with pytest.raises(InputError, match=r"12\.0 million pixels .* GiB of memory, more than 4; give --scale 0\.\d+"):
