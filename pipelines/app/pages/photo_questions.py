@@ -37,7 +37,7 @@ _SAID = {
     r"--images '!([^']*)'": r"load them again without \1",
     r"(name (?:one|the right one)) with --mask(?: FILE)?": "load one",
     r"--principal COLUMN,ROW": '"Principal point"',
-    r"--flat turned": '"Is it flat?": yes, but hollow',
+    r"--flat turned": 'the answer "yes, but what stands out came out hollow"',
     r"--flat no\b": '"Is it flat?": no',
     r"use --flat\b": 'use "Is it flat?": yes',
     r"--intensities equal": '"How strong the lamps were": all equally strong',

@@ -114,7 +114,7 @@ def _other_tuple(path: Path) -> Path:
     """Return the tuple of tilts beside one of slants, or the other way round."""
     for one, other in (("slant", "tilt"), ("tilt", "slant")):
         if one in path.name.lower():
-            found = re.sub(one, lambda was, new=other: _as_case(was.group(), new), path.name, flags=re.IGNORECASE)
+            found = re.sub(one, partial(_as_case, other), path.name, flags=re.IGNORECASE)
             beside = path.with_name(found)
             if beside.is_file():
                 return beside
@@ -122,8 +122,9 @@ def _other_tuple(path: Path) -> Path:
     raise InputError(f"{path}: a tuple of HALCON's may hold anything; name the two files slants.tup and tilts.tup")
 
 
-def _as_case(was: str, new: str) -> str:
+def _as_case(new: str, found: re.Match[str]) -> str:
     """Return a word in the case of another: slant, Slant or SLANT."""
+    was = found.group()
     return new.upper() if was.isupper() else new.title() if was[0].isupper() else new
 
 

@@ -66,3 +66,9 @@ def test_texts_name_questions_in_place_of_flags() -> None:
     )
     assert say_plainly("left out: a.txt; --images takes what it names") == "left out: a.txt"
     assert say_plainly("p -- q--flat-share") == "p -- q--flat-share"
+
+
+def test_an_answer_that_a_note_names_is_one_of_the_page() -> None:
+    said = say_plainly("look at a place that you know, and use --flat turned if it is inside out.")
+    answer = said.split('"')[1]
+    assert said.endswith('" if it is inside out.') and f">{answer}</option>" in TEMPLATE.read_text()
