@@ -125,9 +125,8 @@ def infer_pose(args: argparse.Namespace, pose: "Pose", tell: Callable[[str], obj
     if args.anyway or not any(finding.level == "error" for finding in findings):
         tell(f"{plan(photos, args.method, **options).describe()}\n")
         sys.stdout.flush()
-    more = {"findings": findings, "anyway": args.anyway, "flat": args.flat, "flatten": args.flatten}
     with pose.naming():
-        return infer(photos, args.method, **options, **more), len(findings)
+        return infer(photos, args.method, **options, findings=findings, anyway=args.anyway), len(findings)
 
 
 def rehearse(args: argparse.Namespace, pose: "Pose") -> int:
@@ -164,7 +163,8 @@ def look_through(
     from sdps.photos import check
 
     options = {"models": args.models, "config": inference_config(args), "refine": args.refine,
-               "discontinuities": args.discontinuities, "lit_by": args.lit_by}  # fmt: skip
+               "discontinuities": args.discontinuities, "flat": args.flat, "flatten": args.flatten,
+               "lit_by": args.lit_by}  # fmt: skip
     flat = Flatness(args.flat, args.flatten)
 
     def read(scale: float) -> "Photographs":
@@ -172,7 +172,7 @@ def look_through(
             pose, mask=args.mask, lights=args.lights, intensities=args.intensities, frame=args.frame,
             gamma=args.gamma, names=args.images, anyway=args.anyway, scale=scale, focal=args.focal,
             principal=args.principal, pixel_size=args.pixel_size, light_distance=args.light_distance, balls=args.ball,
-            ambient=args.ambient, dark=args.dark, whole_frame=flat.asked,
+            ball_radius=args.ball_radius, ambient=args.ambient, dark=args.dark, whole_frame=flat.asked,
         )  # fmt: skip
 
     photos = read(1.0 if args.scale == AUTO else args.scale)

@@ -32,12 +32,16 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mask", default=None, help="picture, bright on the object (default: mask.*, else automatic)")
     parser.add_argument("--lights", default=None, metavar="FILE|folder",
                         help="known light directions: rows x y z, .lp, .csv, .npy, .npz, .mat, lights.json, JSON of "
-                        "Meshroom or RelightLab; folder: the file of lights among the photographs")  # fmt: skip
+                        "Meshroom or RelightLab, HALCON's slants.tup; folder: the file of lights among the "
+                        "photographs")  # fmt: skip
     parser.add_argument("--ball", action="append", default=None, metavar="X,Y,R|auto|FOLDER",
                         help="a chrome or white ball that shows the lights, in place of --lights: its circle in "
                         "pixels of the files, auto to find it, or a folder of pictures of it alone, FOLDER or "
                         "FOLDER:x,y,r; chrome: or white: before it says its kind; two balls give positions "
                         "(repeatable)")  # fmt: skip
+    parser.add_argument("--ball-radius", default=None, metavar="MM[,MM]",
+                        help="real radius of the balls, or of each in turn: gives the size of a pixel and, with "
+                        "--focal, how far from the camera each stands")  # fmt: skip
     parser.add_argument("--intensities", default=None, metavar="FILE|folder|equal",
                         help="known light intensities; equal if all lights are alike (default: those of --lights, else "
                         "found by a network)")  # fmt: skip

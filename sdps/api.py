@@ -114,12 +114,12 @@ def infer(
 def plan(
     photos: Photographs, method: str = AUTO, *, models: str | Path | None = None,
     config: InferenceConfig | None = None, refine: bool | None = None, discontinuities: bool = False,
-    lit_by: str = AUTO,
+    flat: Wish = "auto", flatten: float = 0.0, lit_by: str = AUTO,
 ) -> Workload:  # fmt: skip
     """Return about what `infer` will take, in seconds and memory; arguments as of `infer`."""
     known = photos.light_directions is not None, photos.intensities is not None
     method, _ = choose_method(method, photos, photos.mask, lit_by, known[0], models, config)
-    runner = _runner(method, known, models, config, refine, len(photos))
+    runner = _runner(method, known, models, config, refine, len(photos), Flatness(flat, flatten))
     return workload(photos, runner, discontinuities=discontinuities)
 
 

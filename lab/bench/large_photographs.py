@@ -56,16 +56,18 @@ def photograph_large(folder: Path, config: LargeConfig) -> Path:
     across = np.sin(np.radians(rng.uniform(20.0, 50.0, config.pictures)))
     lights = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), np.sqrt(1.0 - across**2)], axis=1)
     gains = rng.uniform(0.7, 1.0, config.pictures)
+    ground = display(_GROUND + _noise(rng, (_BAND, config.width, 3)))
     try:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         for number in progress_bar(range(config.pictures), desc="photograph", unit="picture"):
             picture = np.concatenate(
-                [_shade(rows, lights[number], gains[number], config, rng) for rows in _bands(config)]
+                [_band(rows, lights[number], gains[number], config, ground, rng) for rows in _bands(config)]
             )
             Image.fromarray(picture).save(folder / f"{number:03d}.jpg", quality=_QUALITY)
         if config.share < 1.0:
-            mask = np.concatenate([_relief(rows, config)[2] for rows in _bands(config)])
+            everywhere = slice(0, config.width)
+            mask = np.concatenate([_relief(rows, everywhere, config)[2] for rows in _bands(config)])
             Image.fromarray(mask.astype(np.uint8) * 255).save(folder / "mask.png")
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another --out") from error
@@ -76,13 +78,36 @@ def _bands(config: LargeConfig) -> list[slice]:
     return [slice(start, min(start + _BAND, config.height)) for start in range(0, config.height, _BAND)]
 
 
-def _relief(rows: slice, config: LargeConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return unit normals (h, W, 3) and albedo (h, W, 3), float32, and the mask (h, W) of some rows."""
+def _noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    return np.float32(_NOISE) * rng.standard_normal(shape, np.float32)
+
+
+def _reach(config: LargeConfig) -> float:
+    """Return the object's radius in pixels."""
+    return float(np.sqrt(config.share * config.height * config.width / np.pi))
+
+
+def _band(
+    rows: slice, light: np.ndarray, gain: float, config: LargeConfig, ground: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:  # (h, W, 3) uint8
+    """Return some rows of a picture: the ground's noise, shifted, and the object where it is."""
+    band = np.roll(ground, rng.integers(config.width), 1)[: rows.stop - rows.start]
+    if config.share >= 1.0:
+        return _shade(rows, slice(0, config.width), light, gain, config, rng)
+    middle, reach = config.width / 2, _reach(config)
+    if rows.stop < config.height / 2 - reach or rows.start > config.height / 2 + reach:
+        return band
+    columns = slice(max(int(middle - reach), 0), min(int(middle + reach) + 1, config.width))
+    band[:, columns] = _shade(rows, columns, light, gain, config, rng)
+    return band
+
+
+def _relief(rows: slice, columns: slice, config: LargeConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return unit normals (h, w, 3) and albedo (h, w, 3), float32, and the mask (h, w) of some rows and columns."""
     half = max(config.height, config.width) / 2
-    x = (np.arange(config.width, dtype=np.float32) - config.width / 2) / half
+    x = (np.arange(columns.start, columns.stop, dtype=np.float32) - config.width / 2) / half
     y = (config.height / 2 - np.arange(rows.start, rows.stop, dtype=np.float32))[:, None] / half
-    area = config.share * config.height * config.width / half**2
-    radius = np.float32(np.sqrt(area / np.pi))
+    radius = np.float32(_reach(config) / half)
     mask = np.ones((len(y), len(x)), bool) if config.share >= 1.0 else x**2 + y**2 < radius**2
     reach = np.float32(1.5) if config.share >= 1.0 else 1.02 * radius
     dome = np.sqrt(np.maximum(reach**2 - x**2 - y**2, 1e-4))
@@ -95,11 +120,11 @@ def _relief(rows: slice, config: LargeConfig) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _shade(
-    rows: slice, light: np.ndarray, gain: float, config: LargeConfig, rng: np.random.Generator
-) -> np.ndarray:  # (h, W, 3) uint8
-    normals, albedo, mask = _relief(rows, config)
+    rows: slice, columns: slice, light: np.ndarray, gain: float, config: LargeConfig, rng: np.random.Generator
+) -> np.ndarray:  # (h, w, 3) uint8
+    normals, albedo, mask = _relief(rows, columns, config)
     half = half_vectors(light)
     shading = np.maximum(normals @ light.astype(np.float32), 0.0)[..., None]
     gloss = np.maximum(normals @ half.astype(np.float32), 0.0)[..., None] ** _SHININESS
     linear = np.where(mask[..., None], gain * (albedo + _GLOSS * gloss) * shading, _GROUND)
-    return display(linear + rng.normal(0.0, _NOISE, linear.shape).astype(np.float32))
+    return display(linear + _noise(rng, linear.shape))

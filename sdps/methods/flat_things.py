@@ -67,6 +67,10 @@ class Flatness:
         """Whether the thing is said to be flat."""
         return self.wish in ("yes", "turned") or self.share > 0.0
 
+    def may_apply(self, mask: np.ndarray, *, lit: bool) -> bool:
+        """Return whether `applies` may say yes, before normals (H, W, 3) of the mask (H, W) are found."""
+        return self.asked or (self.wish == "auto" and not lit and float(mask.mean()) >= COVERS)
+
     def applies(self, mask: np.ndarray, normals: np.ndarray, *, lit: bool) -> bool:
         """Return whether the mean plane of what was found is to face the camera.
 

@@ -26,7 +26,8 @@ from sdps.refinement.transport import trace_shadows
 
 TURN = np.array([-1.0, -1.0, 1.0])
 """Brings normals and lights of one side to those of the other."""
-_MOST = 32  # pictures that are looked at
+MOST = 32
+"""Pictures that are looked at."""
 _SIDE, _CELLS = 384, 8  # pixels of the longer side for shadows, and cells for the pictures' trend
 _LIT = 0.2  # n . l from which on a pixel should be bright
 _DARK, _BRIGHT = 0.25, 0.75  # of what it should be
@@ -67,7 +68,7 @@ def tell_side(images: ImageSource, mask: np.ndarray, found: Estimate) -> Evidenc
         mask: (H, W) bool.
         found: Normals whose mean plane faces the camera, and lights.
     """
-    chosen = slice(None, None, -(-len(images) // _MOST))
+    chosen = slice(None, None, -(-len(images) // MOST))
     lights = found.light_directions[chosen].astype(np.float64)
     size = _reduced(mask, _SIDE)
     small = [reduce_image(np.asarray(images[k : k + 1])[0].mean(-1), size) for k in range(len(images))[chosen]]

@@ -13,7 +13,8 @@ import numpy as np
 from render.shared.errors import InputError
 from render.shared.imaging.reducing import check_scale, smaller_shape
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture
-from sdps.photos.analysis.balls.ball_flags import Said, WantedBall, read_balls
+from sdps.photos.analysis.balls.ball_depths import measure_pixel
+from sdps.photos.analysis.balls.ball_flags import Said, WantedBall, measure_balls, read_balls
 from sdps.photos.analysis.balls.ball_known import know_lights
 from sdps.photos.analysis.balls.ball_scene import FoundBall, Scene, cover_balls, match_pictures, see_balls
 from sdps.photos.faults import Faults
@@ -149,7 +150,8 @@ def load(
     intensities: str | Path | None = None, frame: str = "y-up", gamma: str | float = "auto",
     names: Sequence[str] | None = None, anyway: bool = False, scale: float = 1.0, focal: str | float | None = None,
     principal: str | Sequence[float] | None = None, pixel_size: float | None = None,
-    light_distance: str | float | None = None, balls: Said | Iterable[Said] | None = None, every: int | None = None,
+    light_distance: str | float | None = None, balls: Said | Iterable[Said] | None = None,
+    ball_radius: str | float | Sequence[float] | None = None, every: int | None = None,
     ambient: str | Path | None = None, dark: str | Path | None = None, whole_frame: bool = False,
 ) -> Photographs:  # fmt: skip
     """Look through a folder of photographs of a static object under one distant light each (docs/guides/capture.md).
@@ -172,6 +174,7 @@ def load(
             box), `400mm`, `40cm`, `0.4m` (with `pixel_size`), or `far`. None or `auto`: as the positions in the lights
             file say, else not known; `each`: not known, and not the same for all lamps.
         balls: Balls that show the lights, in place of `lights` (`sdps.photos.analysis.balls.ball_flags.read_balls`).
+        ball_radius: Their real radii, mm, one for all or for each: tells `pixel_size` and, with `focal`, their depths.
         ambient: A picture without the lamp, subtracted at the photographs' exposure; None: those named so; `none`.
         dark: A picture with the lens covered, subtracted as well; None and `none` as for `ambient`.
         every: Of a film, take every n-th frame; None: so that about 60 are taken.
@@ -181,7 +184,8 @@ def load(
         InputError: a folder that cannot be used: the file, what is wrong with it, and the remedy.
     """
     wanted, distance = read_wanted(focal, principal, pixel_size), read_distance(light_distance)
-    pose, scale, shown_by = only_pose(folder, every), check_scale(scale), read_balls(balls, lights)
+    pose, scale = only_pose(folder, every), check_scale(scale)
+    shown_by = measure_balls(read_balls(balls, lights), ball_radius)
     with pose.naming():
         faults = Faults(anyway)
         listing, seen = _look(pose, names, mask, gamma, faults, scale, (ambient, dark))
@@ -263,6 +267,8 @@ def _ask_balls(
         photos = replace(photos, mask=left.mask, notes=notes)
     names = " and ".join(ball.text for ball in balls)
     capture = Capture.of(photos.mask, photos.camera)
+    pixel_size, notes = measure_pixel(rays, capture, photos.pixel_size)
+    photos = replace(photos, pixel_size=pixel_size, notes=(*photos.notes, *notes))
     lit = know_lights(rays, names, photos.files, capture, known, distance, _measure(photos, seen))
     files = tuple(np.asarray(photos.files, object)[lit.kept])
     balls = [ball.take(lit.kept) for ball in balls]

@@ -1,13 +1,11 @@
 """What an inference will take, in minutes and memory, before it begins; a rough model of every stage.
 
-Seconds are those of one core of a server (AMD EPYC, AVX-512), times how fast a convolution is here. Files, disks and
-what else runs on the machine may double them.
+Seconds are those of one core of a server (AMD EPYC, AVX-512); networks are timed here (`sdps.inference.network_speed`).
+Files, disks and what else runs on the machine may double them.
 """
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from math import ceil
 from typing import cast
 
@@ -18,9 +16,11 @@ from render.shared.errors import InputError
 from sdps.classical import registry as classical
 from sdps.core.integration import LARGE
 from sdps.inference.estimator import AGAIN_SHARE
+from sdps.inference.network_speed import time_lights, time_normals
 from sdps.inference.tiles import PIXEL_BYTES, TILE_BYTES
 from sdps.methods.fusion.fuse import TILE_PIXELS
 from sdps.methods.on_box import estimate_bytes
+from sdps.methods.relief_sides import MOST
 from sdps.methods.runner import Runner
 from sdps.models.base import FusionNetwork, NormalNetwork
 from sdps.models.registry import TRUE_LIGHTS
@@ -36,8 +36,6 @@ _LEAST = 0.25
 _SCALES = (0.5, 0.4, 0.3, 0.25, 0.2, 0.15, 0.1, 0.05)
 _GIB = 2.0**30
 _BASE = 0.45  # GiB: python, torch, weights, kernels
-_CONVOLUTION = 0.0103
-"""Seconds of the convolution where the networks' `inference_seconds` were measured."""
 _NEAR_LAMPS = 1.3
 """How many times as long refinement takes where it looks for near lamps: half of the first steps do."""
 _FILES = ("depth.npy", "mask.png", "mesh.glb", "mesh.obj", "mesh.ply", "normal.exr", "normal.npy", "normal.png",
@@ -56,6 +54,7 @@ class Size:
         frame: Of a picture, once reduced.
         file: Of a picture in its file.
         pictures: How many.
+        flat: It may be a flat thing, of which pictures are looked at once more.
     """
 
     pixels: float
@@ -63,11 +62,12 @@ class Size:
     frame: float
     file: float
     pictures: int
+    flat: bool = False
 
     def reduced(self, scale: float) -> "Size":
         """Return what is left at a scale, relative to this one."""
         less = scale**2
-        return Size(less * self.pixels, less * self.box, less * self.frame, self.file, self.pictures)
+        return Size(less * self.pixels, less * self.box, less * self.frame, self.file, self.pictures, self.flat)
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,8 @@ def workload(photos: Photographs, runner: Runner, *, discontinuities: bool = Fal
     sides = [int(np.ptp(np.flatnonzero(mask.any(axis=axis)))) + 31 for axis in (1, 0)]
     frame = float(mask.size)
     box = float(min(sides[0], mask.shape[0]) * min(sides[1], mask.shape[1]))
-    size = Size(float(mask.sum()), box, frame, frame / photos.scale**2, len(photos))
+    flat = runner.flat.may_apply(mask, lit=photos.light_directions is not None)
+    size = Size(float(mask.sum()), box, frame, frame / photos.scale**2, len(photos), flat)
     kind = photos.coding.kind
     seconds, gib = _seconds(size, runner, kind, photos.scale < 1, discontinuities), _memory(size, runner)
     smaller = quick = None
@@ -188,21 +189,24 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
     threads, images = max(1, torch.get_num_threads()), size.pictures
     once = images * (size.file * (_DECODED.get(kind, _DECODED_ELSE) + 30e-9 * reduces) + 15e-9 * size.frame)
     found = {"reading": 2 * once + 70e-9 * images * size.frame}
-    estimator, slower = runner.estimator, _slower(runner)
+    estimator = runner.estimator
     if estimator is not None and estimator.lighting is not None:
         views = runner.config.light_views or 1
-        found["lights"] = 2 * once + images * (40e-9 * size.box + 4e-3 * views * slower)
+        found["lights"] = 2 * once + images * (40e-9 * size.box + views * time_lights(estimator))
     normals = runner.method.normals
     if normals in classical.METHODS:
         found["normals"] = 8e-7 * size.pixels * images + 1e-5 * size.pixels
     elif estimator is not None and estimator.normals is not None:
         views = runner.config.normal_views or 1
         seconds = _normal_network(runner).inference_seconds(images, size.pixels, size.box, views)
-        found["normals"] = slower * seconds + once * _tile_count(size, runner)
+        found["normals"] = time_normals(estimator, images) * seconds + once * _tile_count(size, runner)
     if runner.method.refined:
         each = 0.6e-6 + 38e-9 * images * (_NEAR_LAMPS if runner.method.lighting != TRUE_LIGHTS else 1.0)
         coarse, fine = 2000 * (1.5e-3 + 2800 * each), 120 * size.pixels * each
         found["refinement"] = (coarse + fine) / threads + 3 * once
+    if size.flat:
+        looked = ceil(images / ceil(images / MOST))
+        found["flat"] = looked * (once / images + 10e-9 * size.frame + 0.1) + 0.4e-6 * size.pixels
     if runner.method.fused:
         found["second look"] = found["normals"] + 5e-6 * size.box
     found["depth"] = (1.2e-6 if size.pixels > LARGE else 5e-6) * size.pixels * (60 if discontinuities else 1)
@@ -255,27 +259,6 @@ def _memory(size: Size, runner: Runner) -> float:
 
 def _step(size: Size) -> int:
     return max(1, ceil((size.pixels / MOST_VERTICES) ** 0.5))
-
-
-@cache
-def _convolution(precision: str, device: str) -> float:
-    """Return the seconds of a convolution here: the median of a few, after kernels were made."""
-    layer = torch.nn.Conv2d(64, 64, 3, padding=1).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    images, took = torch.zeros(1, 64, 256, 256, device=device).to(memory_format=torch.channels_last), []
-    with torch.inference_mode(), torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16"):
-        for _ in range(6):
-            began = time.perf_counter()
-            float(layer(images)[0, 0, 0, 0])
-            took.append(time.perf_counter() - began)
-    return float(np.median(took[1:]))
-
-
-def _slower(runner: Runner) -> float:
-    """Return how many times as long networks take here as where they were measured."""
-    if runner.estimator is None:
-        return 1.0
-    chosen = runner.estimator.arithmetic
-    return _convolution(chosen.precision, chosen.device) / _CONVOLUTION
 
 
 def _count(pixels: float) -> str:

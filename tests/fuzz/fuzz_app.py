@@ -17,6 +17,7 @@ from urllib.parse import quote_from_bytes, unquote, unquote_to_bytes
 import data_folders
 import numpy as np
 import photo_folders
+import sdps_scenes
 
 from render.shared.errors import InputError
 
@@ -24,10 +25,23 @@ HOST = "127.0.0.1:7870"
 _MESH = b"OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
 _POSE = {"yaw": 10.0, "pitch": 0.0, "roll": -5.5, "bounces": 1, "size": 128}
 _PHOTOS = {"gamma": "linear", "lights": True, "frame": "y-up", "anyway": True}
+_BALLS = _PHOTOS | {"lights": False, "ball_radius": 5}
+_ANSWERS = _PHOTOS | {
+    "scale": "1", "flat": "auto", "flatten": "0", "intensities": "", "light_distance": "5", "focal": "50",
+    "principal": "12,12", "pixel_size": 0.5, "every": "", "pose": "", "ambient": "none", "dark": "none",
+    "balls": [], "ball_alone": None, "ball_radius": "",
+}  # fmt: skip
+_RUN = "least-squares-run"
 _REQUESTS: dict[str, tuple[str, str, Any]] = {
     "check": ("POST", "/photographs/sets/SET/start/check", _PHOTOS),
     "infer": ("POST", "/photographs/sets/SET/start/infer",
               _PHOTOS | {"method": "least-squares", "refine": False, "discontinuities": False}),
+    "answers": ("POST", "/photographs/sets/SET/start/check", _ANSWERS),
+    "balls": ("POST", "/photographs/sets/SET/start/check", _BALLS | {"balls": ["white:36,12,10.2"]}),
+    "alone": ("POST", "/photographs/sets/SET/start/check", _BALLS | {"ball_alone": 1}),
+    "ball": ("PUT", "/photographs/sets/SET/ball/1/7.pgm", "P2 4 4 9 " + "1 5 " * 8),
+    "export": ("POST", "/photographs/sets/SET/start/export", {"run": 1, "name": "lp"}),
+    "relightable": ("POST", "/photographs/sets/SET/start/export", {"run": "1", "name": "ptm"}),
     "upload": ("PUT", "/photographs/sets/SET/uploads/lights.txt", "0 0 1\n0.5 0 0.8\n"),
     "mask": ("PUT", "/photographs/sets/SET/mask", ""),
     "file": ("GET", "/photographs/sets/SET/files/photos/1.png", ""),
@@ -56,7 +70,15 @@ _REQUESTS: dict[str, tuple[str, str, Any]] = {
 
 def requests(folder: Path) -> None:
     """Write a file for every kind of request."""
-    _photographs(folder / "photos")
+    from pipelines.app.pages import photo_tasks
+
+    _photographs(folder / "photos", ball=True)
+    _ball(folder / "ball")
+    place = folder / "made"
+    shutil.copytree(folder / "photos", place / "photos")
+    photo_tasks.infer(str(place), 1, **_PHOTOS, method="least-squares")
+    (place / "runs" / "1").rename(folder / _RUN)
+    shutil.rmtree(place)
     room(folder)
     for name, (method, path, body) in _REQUESTS.items():
         headers = {"host": HOST, "origin": f"http://{HOST}", "content-type": "application/json"}
@@ -106,11 +128,26 @@ def room(folder: Path) -> None:
     (folder / "report" / "x" / "a.png").write_bytes(b"")
 
 
-def _photographs(folder: Path, suffix: str = ".png", bits: int = 8) -> None:
+def _photographs(folder: Path, suffix: str = ".png", bits: int = 8, ball: bool = False) -> None:
+    """Write photographs of hills, on request with a white ball to their right, and their lights."""
     lights = data_folders.light_directions(6).astype(float)
     images, mask = photo_folders.matte(lights, size=24)
-    photo_folders.write_folder(folder, images[:, 14:38, 14:38], mask[14:38, 14:38], suffix=suffix, bits=bits)
+    images, mask = images[:, 14:38, 14:38], mask[14:38, 14:38]
+    if ball:
+        images, mask = np.concatenate([images, _shade_ball(lights)], axis=2), np.pad(mask, ((0, 0), (0, 24)))
+    photo_folders.write_folder(folder, images, mask, suffix=suffix, bits=bits)
     (folder / "light_directions.txt").write_text("".join("{} {} {}\n".format(*row) for row in lights))
+
+
+def _ball(folder: Path) -> None:
+    """Write photographs of a white ball alone."""
+    photo_folders.write_folder(folder, _shade_ball(data_folders.light_directions(6).astype(float)), bits=8)
+
+
+def _shade_ball(lights: np.ndarray) -> np.ndarray:  # (L, 24, 24, 3)
+    normals, mask = sdps_scenes.sphere_normals(24)
+    shading = 0.8 * np.maximum(np.einsum("hwc,lc->lhw", normals, lights), 0.0) * mask
+    return np.repeat(shading[..., None] + 0.004, 3, axis=-1)
 
 
 # --- how it is read -----------------------------------------------------------------------------------------------
@@ -133,7 +170,7 @@ def read_request(folder: Path, path: Path) -> None:
 
 
 def read_upload(folder: Path, path: Path) -> None:
-    """Upload a file, and let the checks or the studio read it."""
+    """Upload a file, also as the picture of a ball alone, and let the checks or the studio read it."""
     with Page(folder) as page:
         alone = path.suffix in (".off", ".yaml", ".zip")
         beside = "whole" if path.stem in ("mask", "light_directions") else path.suffix[1:]
@@ -147,6 +184,7 @@ def read_upload(folder: Path, path: Path) -> None:
         page.send("PUT", f"/photographs/sets/SET/uploads/{path.name}", path.read_bytes())
         if path.name == "mask.png":
             page.send("PUT", "/photographs/sets/SET/mask", path.read_bytes())
+        page.send("PUT", f"/photographs/sets/SET/ball/1/{path.name}", path.read_bytes())
         asked = _PHOTOS | {"lights": path.suffix in (".txt", ".zip")}
         page.send("POST", "/photographs/sets/SET/start/check", json.dumps(asked).encode())
 
@@ -192,14 +230,14 @@ class Page:
         self.set = self.session.make_place()
         place = self.session.folder / self.set
         shutil.copytree(source, place / "photos") if source else (place / "photos").mkdir()
+        if (self.root.parent / "ball").is_dir():
+            shutil.copytree(self.root.parent / "ball", place / "ball-1")
         self.app.state.jobs.number = 1
         studio = self.session.folder / "studio-"
         studio.mkdir(exist_ok=True)
         (studio / "scene.zip").write_bytes(b"")
-        view = place / "runs" / "1" / "view"
-        view.mkdir(parents=True)
-        (view / "view.json").write_text("{}")
-        np.save(view / "observed.npy", np.zeros((4, 4, 6)))
+        if (self.root.parent / _RUN).is_dir():
+            shutil.copytree(self.root.parent / _RUN, place / "runs" / "1")
 
     def send(self, method: str, target: str, body: bytes = b"", headers: dict[str, str] | None = None) -> None:
         """Send a request; what it is refused with goes to standard error, as a command's line.
@@ -250,13 +288,15 @@ class AtOnce:
 
     def submit(self, owner: str, task: str, **arguments: Any) -> int:
         """Run a job; its refusal goes to standard error."""
-        from pipelines.app.pages import photo_tasks, studio_tasks
+        from pipelines.app.pages import photo_tasks, run_exports, studio_tasks
         from render.materials import library
         from render.shapes.files.mesh_file import load_mesh
 
         try:
             if task in ("check", "infer"):
                 json.dumps(getattr(photo_tasks, task)(**arguments))
+            elif task == "export":
+                json.dumps(run_exports.export(**arguments))
             elif task == "shard":
                 studio_tasks.prepare_shard(**arguments)
             elif task == "preset":

@@ -122,6 +122,8 @@ def light_files(folder: Path) -> None:
     rows = [(name, *vector) for name, vector in zip(names, np.round(vectors, 5).tolist(), strict=True)]
     (folder / "paths.lp").write_text("6\n" + "".join("C:\\rti\\{} {} {} {}\n".format(*row) for row in rows))
     (folder / "angles.csv").write_text("file;azimuth;elevation\n" + "".join(f"{name};30,5;45\n" for name in names))
+    for name, row in (("slants", [10, 20, 30, 40, 50, 60]), ("tilts", [0, 60, 120, 180, 240, 300])):
+        (folder / f"{name}.tup").write_text("006\n" + "".join(f"2 {value:.16e}\n" for value in row))
     np.save(folder / "lights.npy", vectors.T)
     np.savez(folder / "lights.npz", L=vectors, light_intensities=np.ones(6), images=np.zeros((6, 4, 4)))
     for name, packed in (("plain.mat", False), ("packed.mat", True)):

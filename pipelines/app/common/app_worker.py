@@ -52,6 +52,9 @@ def serve(pipe: Connection) -> None:
             answer = ("failed", str(error))
         except MemoryError:
             answer = ("failed", "there is not enough memory; try fewer or smaller pictures")
+        except OSError as error:  # a name that is too long, a disk that is full
+            traceback.print_exc()
+            answer = ("failed", str(InputError(f"{error.strerror or error}; look whether the disk is full")))
         except Exception as error:  # a bug: traceback in the terminal, one line on the page
             traceback.print_exc()
             answer = ("failed", f"unexpected error ({type(error).__name__}); the terminal shows its traceback")

@@ -24,9 +24,9 @@ _CHOICES = {
 }
 _TEXTS = {"method": "auto", "frame": "y-up", "light_distance": "auto", "focal": "", "principal": "", "ambient": "",
           "dark": "", "pose": ""}  # fmt: skip
-_NUMBERS = {"pixel_size": float, "every": int, "ball_alone": int}
+_NUMBERS = {"pixel_size": float, "every": int, "ball_alone": int, "ball_radius": float}
 _TICKED = ("lights", "refine", "anyway", "discontinuities")
-_LONGEST = 80
+_LONGEST, _MOST = 80, 10**9
 _MOST_BALLS, _BALL = 8, re.compile(r"(?:chrome:|white:)?(?:auto|-?[0-9.]{1,20}(?:,-?[0-9.]{1,20}){2})")
 _SAID = {
     r"run `sdps infer --refine` again": 'find the surface again with "Refine"',
@@ -38,7 +38,7 @@ _SAID = {
     r"--images '!([^']*)'": r"load them again without \1",
     r"(name (?:one|the right one)) with --mask(?: FILE)?": "load one",
     r"--principal COLUMN,ROW": '"Principal point"',
-    r"--flat turned": '"Is it flat?": yes, but hollow',
+    r"--flat turned": 'the answer "yes, but what stands out came out hollow"',
     r"--flat no\b": '"Is it flat?": no',
     r"use --flat\b": 'use "Is it flat?": yes',
     r"--lit-by lamp": '"How was it lit?": by one lamp at a time',
@@ -50,6 +50,7 @@ _LABELS = {
     "principal": "Principal point",
     "pixel-size": "Size of a pixel", "light-distance": "How far away the lamps stood", "lights": "Use the lights file",
     "frame": "Axes of the lights file", "intensities": "How strong the lamps were", "ball": "Balls", "mask": "Mask",
+    "ball-radius": "Radius of the balls",
     "ambient": "Picture with the lamp off", "dark": "Picture with the lens covered", "every": "Every so many frames",
     "anyway": "Continue even if a check fails",
 }  # fmt: skip
@@ -72,8 +73,10 @@ def read_answers(asked: dict[str, Any]) -> dict[str, Any]:
         given = asked.get(name)
         try:
             found[name] = None if given in (None, "") else kind(given)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"{_LABELS.get(name.replace('_', '-'), name)}: must be a number") from error
+        except (TypeError, ValueError, OverflowError):
+            found[name] = _MOST
+        if found[name] is not None and not abs(found[name]) < _MOST:
+            raise InputError(f"{_LABELS.get(name.replace('_', '-'), name)}: must be a number under a thousand million")
     return found | {name: asked.get(name) is True for name in _TICKED} | {"balls": _read_balls(asked.get("balls"))}
 
 
@@ -124,6 +127,7 @@ def make_arguments(place: Path, pose: "Pose", answers: dict[str, Any]) -> argpar
     args.refine, args.flatten = None if answers["refine"] else False, float(answers["flatten"])
     alone = [str(place / BALL.format(answers["ball_alone"]))] if answers["ball_alone"] else []
     args.ball = [*answers["balls"], *alone] or None
+    args.ball_radius = answers["ball_radius"] if args.ball else None  # the answer stays when the balls are gone
     for name in ("ambient", "dark"):
         said = answers[name]
         setattr(args, name, (said or None) if said in ("", "none") else pose.folder / Path(said).name)

@@ -125,8 +125,8 @@ def _foresee(args: argparse.Namespace, pose: "Pose", photos: "Photographs") -> t
 
     told: list[str] = []
     try:
-        options: dict[str, Any] = {"refine": args.refine, "discontinuities": args.discontinuities,
-                                   "lit_by": args.lit_by}  # fmt: skip
+        options: dict[str, Any] = {"refine": args.refine, "discontinuities": args.discontinuities}
+        options |= {"flat": args.flat, "flatten": args.flatten, "lit_by": args.lit_by}
         expected = plan(photos, args.method, **options)
         if args.scale != 1.0 and (args.scale != "auto" or expected.quick is not None):
             photos, _, options = look_through(args, pose, told.append)

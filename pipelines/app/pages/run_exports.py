@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipelines.app.common.archives import pack
 from pipelines.app.pages.photo_questions import find_poses, make_arguments, speak_plainly
+from render.shared.errors import InputError
 from render.shared.files import read_json
 from render.shared.progress import stage
 
@@ -47,7 +48,10 @@ def export(place: str, number: int, name: str) -> dict[str, Any]:
     from sdps.surface.exports.registry import EXPORTS, split_names, write_exports
     from sdps.surface.exports.saved_result import read_result
 
-    (name,) = split_names(name)
+    names = split_names(name)
+    if len(names) > 1:
+        raise InputError(f"export {', '.join(names)}: one at a time; ask for each")
+    (name,) = names
     run = Path(place) / "runs" / str(number)
     made = run / _EXPORTS / name
     stage("export")

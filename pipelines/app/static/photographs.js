@@ -83,7 +83,7 @@ const ANSWERED = ["method", "gamma", "frame", "scale", "flat", "flatten", "ambie
 // Return the answers to all questions of the page, as the server reads them.
 const options = () => ({
   ...Object.fromEntries([...TICKED.map((id) => [id, $(id).checked]), ...ANSWERED.map((id) => [id, $(id).value])]),
-  lit_by: $("lit-by").value, pixel_size: $("pixel-size").value, light_distance: $("light-distance").value || $("distance").value, balls: balls.values(), ball_alone: state.alone || "",
+  lit_by: $("lit-by").value, pixel_size: $("pixel-size").value, ball_radius: $("ball-radius").value, light_distance: $("light-distance").value || $("distance").value, balls: balls.values(), ball_alone: state.alone || "",
 });
 
 async function check(more = {}, box = $("load-status")) {

@@ -22,7 +22,7 @@ from sdps.photos.light_files.light_reading import read_table
 from sdps.photos.light_files.light_table import INTENSITIES, LIGHTS, Near, Table
 
 SUFFIXES = (".txt", ".lp", ".csv", ".tsv", ".dat", ".npy", ".npz", ".mat", ".json", ".relight", ".dome", ".yaml",
-            ".yml")  # fmt: skip
+            ".yml", ".tup")  # fmt: skip
 """Of files in a folder of photographs that may be lights; a file that is named may have any."""
 
 _USUAL = ("lights.json", "light_directions.txt")
@@ -68,7 +68,8 @@ def read_lights(
     Args:
         path: Text with rows `x y z`, `x y z i`, `x y z r g b`, each with the picture's name or number before it or in
             the pictures' order, or the same transposed; angles in degrees under a heading `azimuth elevation` or
-            `slant tilt`; .npy, .npz, .mat; lights.json, or JSON of Meshroom or RelightLab (docs/guides/capture.md).
+            `slant tilt`; .npy, .npz, .mat; HALCON's slants.tup beside tilts.tup; lights.json, or JSON of Meshroom or
+            RelightLab (docs/guides/capture.md).
         files: Names of the pictures, (L,).
         frame: Axes of the file: y-up, y-down, x-left, z-away, xy-swapped, several joined by commas. With Meshroom's
             JSON, how it differs from Meshroom's axes.
@@ -143,7 +144,8 @@ def _may_be_lights(path: Path) -> bool:
     name = path.name.lower()
     if path.suffix.lower() not in SUFFIXES or not path.is_file() or name.startswith("."):
         return False
-    return name.endswith((".lp", ".relight", ".dome")) or bool(re.match(r"light(?!s?_?intens)", name))
+    slants = name.endswith(".tup") and "slant" in name  # its tilts are read with it
+    return slants or name.endswith((".lp", ".relight", ".dome")) or bool(re.match(r"light(?!s?_?intens)", name))
 
 
 def write_lights(

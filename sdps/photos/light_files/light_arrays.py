@@ -1,4 +1,4 @@
-"""Light files that are arrays: NumPy's .npy and .npz, and MATLAB's .mat. Nothing in them is executed.
+"""Light files that are arrays: NumPy's .npy and .npz, MATLAB's .mat, HALCON's .tup. Nothing in them is executed.
 
 A file may hold much else, such as the pictures: headers are read first, and only what is needed is decoded.
 """
@@ -25,6 +25,7 @@ _NAMED = re.compile(r"(l|s|(l|light)?_?(dirs?|directions?|vectors?)|lights?(_?(d
                     r"|lights?_?pos(itions?)?|sources?)", re.IGNORECASE)  # fmt: skip
 _STRENGTHS = re.compile(r"intens|strength|bright|power|gain", re.IGNORECASE)
 _MOST = 1 << 20  # numbers in a table of lights
+_ELEMENT = re.compile(r"[12] +([+-]?\d{1,20}(?:\.\d{1,40})?(?:e[+-]\d{1,2})?)")
 _MATLAB = {"double", "single", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"}
 
 
@@ -79,6 +80,64 @@ def read_mat(path: Path, count: int, want: Want) -> Table:
         entries = {name: _Entry(_squeeze(shape), partial(_variable, path, name)) for name, shape in numbers}
         others = [f"{name} ({kind})" for name, _, kind in there if kind not in _MATLAB]
         return _choose_array(path, entries, count, want, others)
+
+
+def read_tuples(path: Path, text: str, want: Want, partner: Callable[[Path], str]) -> Table:
+    """Read what HALCON's `write_tuple` writes: the number of elements, then lines `kind value`, 1 integer, 2 real.
+
+    A tuple of slants is read with the tuple of tilts beside it, and the other way round; degrees, as HALCON's
+    photometric_stereo wants them. The form is that of files people keep (Base_H_Cam.tup of We-sson/HanGao on GitHub).
+
+    Args:
+        path: The file.
+        text: Its content.
+        want: Directions, or intensities alone: then it is one tuple of them.
+        partner: Reads the text of the other file.
+
+    Raises:
+        InputError: another form, a tuple alone, or two of different length.
+    """
+    values = _elements(path, text)
+    if not want.lights:
+        return Table(values[:, None])
+    other = _other_tuple(path)
+    pair = {"slant": values, "tilt": _elements(other, partner(other))}
+    if "tilt" in path.name.lower():
+        pair = {"slant": pair["tilt"], "tilt": values}
+    if len(pair["slant"]) != len(pair["tilt"]):
+        raise InputError(f"{path}: has {len(values)} numbers, {other.name} another number; write both again")
+    note = f"{path.name} was read with {other.name}"
+    return Table(np.stack([pair["slant"], pair["tilt"]], axis=1), columns=tuple(pair), notes=(note,))
+
+
+def _other_tuple(path: Path) -> Path:
+    """Return the tuple of tilts beside one of slants, or the other way round."""
+    for one, other in (("slant", "tilt"), ("tilt", "slant")):
+        if one in path.name.lower():
+            found = re.sub(one, partial(_as_case, other), path.name, flags=re.IGNORECASE)
+            beside = path.with_name(found)
+            if beside.is_file():
+                return beside
+            raise InputError(f"{path}: needs the {other}s as well; write_tuple ({other.title()}s, '{found}') beside it")
+    raise InputError(f"{path}: a tuple of HALCON's may hold anything; name the two files slants.tup and tilts.tup")
+
+
+def _as_case(new: str, found: re.Match[str]) -> str:
+    """Return a word in the case of another: slant, Slant or SLANT."""
+    was = found.group()
+    return new.upper() if was.isupper() else new.title() if was[0].isupper() else new
+
+
+def _elements(path: Path, text: str) -> np.ndarray:
+    """Return the numbers of a tuple, (N,) float64."""
+    count, *lines = (line.strip() for line in text.rstrip().split("\n"))
+    if not lines or not count.isdecimal() or count.lstrip("0") != str(len(lines)):
+        raise InputError(f"{path}: not a tuple of HALCON's, whose first line counts the others; write_tuple it again")
+    rows = [_ELEMENT.fullmatch(line) for line in lines]
+    bad = next((number for number, row in enumerate(rows, 2) if row is None), None)
+    if bad is not None:
+        raise InputError(f"{path}: line {bad} is not a number as write_tuple writes it (2 3.5e+01); write it again")
+    return np.array([float(row[1]) for row in rows if row], np.float64)
 
 
 def _numpy_entry(handle: IO[bytes]) -> _Entry | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import parse_json, read_bytes
-from sdps.photos.light_files.light_arrays import read_mat, read_npy, read_npz
+from sdps.photos.light_files.light_arrays import read_mat, read_npy, read_npz, read_tuples
 from sdps.photos.light_files.light_json import YAML, read_json_table
 from sdps.photos.light_files.light_positions import take_header
 from sdps.photos.light_files.light_table import Table, Want
@@ -53,6 +53,8 @@ def read_table(path: Path, files: Sequence[str], want: Want) -> tuple[Table, boo
     if head.startswith(b"MATLAB 5.0") or path.suffix.lower() == ".mat":
         return read_mat(path, count, want), False
     text = _text(path)
+    if path.suffix.lower() == ".tup":
+        return read_tuples(path, text, want, _text), False
     if want.lights and (path.suffix.lower() in (".json", ".relight", ".dome", *YAML) or _is_json(text)):
         return read_json_table(path, text, files)
     text, near = take_header(path, text) if want.lights else (text, None)

@@ -26,6 +26,8 @@ _FLAT = "orthographic"
 _EQUIVALENT, _WIDTH, _HEIGHT = 41989, 40962, 40963  # FocalLengthIn35mmFilm, PixelXDimension, PixelYDimension
 _NAMES = {"FocalLengthIn35mmFilm": _EQUIVALENT, "PixelXDimension": _WIDTH, "PixelYDimension": _HEIGHT}  # of tifffile
 _UNITS = ("mm", "px")
+_FARTHEST = 1e7  # pixels of a principal point from the picture: beyond, products overflow
+_LONGEST = 1e5  # the same; what is seen differs from a parallel view by less than a hundredth of a pixel
 _SHORTEST = 0.2  # focal length over the longer side, 7 mm equivalent: no lens without distortion sees wider
 _ALIKE = 0.01  # relative difference of side ratios of one picture at two sizes
 
@@ -106,6 +108,11 @@ class Wanted:
                 f"--focal: {focal:.4g} pixels are too few for a picture of {full[1]}x{full[0]}, which would see more "
                 "than 130 degrees; a number alone counts pixels, write 28mm for a 35 mm equivalent"
             )
+        if _LONGEST * max(full) < focal < np.inf:
+            raise InputError(
+                f"--focal: {focal:.4g} pixels are too many for a picture of {full[1]}x{full[0]}; for a camera that is "
+                "so far away write orthographic"
+            )
         if not np.isfinite(focal):
             unused = ["--principal does nothing without a focal length; give --focal"] if self.principal else []
             notes, camera = [*notes, *unused], ORTHOGRAPHIC
@@ -156,8 +163,8 @@ def read_wanted(
             is not two numbers.
     """
     number, unit = _read_focal(focal)
-    if pixel_size is not None and not 0.0 < pixel_size < np.inf:
-        raise InputError(f"--pixel-size {pixel_size:g}: must be above 0, in millimetres per pixel")
+    if pixel_size is not None and not 1e-6 < pixel_size < 1e6:
+        raise InputError(f"--pixel-size {pixel_size:g}: must be above 0 and under a million, in millimetres per pixel")
     return Wanted(number, unit, None if principal is None else _read_principal(principal), pixel_size)
 
 
@@ -186,7 +193,7 @@ def _read_principal(principal: str | Iterable[float]) -> tuple[float, float]:
         column, row = (float(part) for part in parts)
     except (TypeError, ValueError):
         column = row = np.nan
-    if not np.isfinite([column, row]).all():
+    if not (np.abs([column, row]) < _FARTHEST).all():
         said = principal if isinstance(principal, str) else ",".join(map(str, parts))
         raise InputError(f"--principal {said}: must be two numbers, COLUMN,ROW in pixels, such as 2016,1512")
     return column, row

@@ -53,7 +53,8 @@ def test_any_ordinary_camera_fits(photos: Photographs, method: str, height: int,
 
 
 def test_long_ones_propose_a_scale(photos: Photographs, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workloads, "_convolution", lambda *_: 0.0103)
+    monkeypatch.setattr(workloads, "time_normals", lambda *_: 1.0)
+    monkeypatch.setattr(workloads, "time_lights", lambda *_: 0.004)
     found = sdps.api.plan(larger(photos, 4000, 6000, 9))
     assert found.total > 600 and found.smaller is not None
     scale, seconds, gib = found.smaller
@@ -62,6 +63,32 @@ def test_long_ones_propose_a_scale(photos: Photographs, monkeypatch: pytest.Monk
     assert sdps.api.plan(photos).smaller is None
     slow = sdps.api.plan(larger(photos, 4000, 6000, 9), discontinuities=True)
     assert slow.seconds["depth"] > 10 * found.seconds["depth"]
+
+
+def test_networks_count_as_fast_as_they_are_here(photos: Photographs, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A processor on which the network takes 1.5 times as long makes its part 1.5 times as long, and no other."""
+    monkeypatch.setattr(workloads, "time_lights", lambda *_: 0.004)
+    found = []
+    for slower in (1.0, 1.5, 2.0):
+        monkeypatch.setattr(workloads, "time_normals", lambda *_, slower=slower: slower)
+        found.append(sdps.api.plan(larger(photos, 600, 800, 96)).seconds)
+    network = found[2]["normals"] - found[0]["normals"]  # without reading the pictures
+    assert found[1]["normals"] - found[0]["normals"] == pytest.approx(network / 2)
+    assert 0.9 < network / (2.1e-6 * 96 * 480_000) < 1.2
+    assert all(found[0][name] == found[2][name] for name in found[0] if name not in ("normals", "second look"))
+
+
+def test_flat_things_are_looked_at_once_more(photos: Photographs) -> None:
+    """What fills the frame may be one, unless lights are given or it is said to be none."""
+    whole = larger(photos, 2000, 3000, 100)
+    found = sdps.api.plan(whole).seconds
+    once = 32 * 2000 * 3000 * 27e-9  # decoded and made linear
+    assert once < found["flat"] < 4 * once
+    assert "flat" not in sdps.api.plan(whole, flat="no").seconds
+    assert "flat" not in sdps.api.plan(larger(photos, 2000, 3000, 100, 0.5)).seconds
+    assert "flat" in sdps.api.plan(larger(photos, 2000, 3000, 100, 0.5), flat="yes").seconds
+    lit = replace(whole, light_directions=np.tile([[0.0, 0.0, 1.0]], (100, 1)).astype(np.float32))
+    assert "flat" not in sdps.api.plan(lit).seconds
 
 
 def test_what_cannot_be_held_says_so_with_the_remedy(photos: Photographs) -> None:

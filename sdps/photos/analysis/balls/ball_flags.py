@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from render.shared.errors import InputError, unknown
 from sdps.photos.analysis.balls.ball_spheres import Circle
 
-FLAG = "--ball"
+FLAG, RADIUS_FLAG = "--ball", "--ball-radius"
 AUTO = "auto"
 CHROME, WHITE = "chrome", "white"
 
@@ -31,11 +31,13 @@ class WantedBall:
         circle: Its outline in pixels of the files; None: to be found.
         kind: `chrome` or `white`; empty: as the pictures tell.
         folder: Where it is photographed alone under the same lights; None: in the pictures of the object.
+        millimetres: Its real radius; None: not known.
     """
 
     circle: Circle | None = None
     kind: str = ""
     folder: Path | None = None
+    millimetres: float | None = None
 
 
 def read_balls(said: Said | Iterable[Said] | None, lights: str | Path | None = None) -> tuple[WantedBall, ...]:
@@ -54,6 +56,37 @@ def read_balls(said: Said | Iterable[Said] | None, lights: str | Path | None = N
     if every and lights is not None:
         raise InputError(f"{FLAG}: the lights are those of --lights {lights}; keep one of the two")
     return tuple(map(_read, every))
+
+
+def measure_balls(balls: Sequence[WantedBall], said: str | float | Sequence[float] | None) -> tuple[WantedBall, ...]:
+    """Return balls with their real radii.
+
+    Args:
+        balls: Of `read_balls`.
+        said: Millimetres: one number for all, or one for each, joined by commas in a text; None: not known.
+
+    Raises:
+        InputError: no balls, another number of radii, or one that is not above 0.
+    """
+    if said is None:
+        return tuple(balls)
+    words = said.split(",") if isinstance(said, str) else np.ravel(said).tolist()
+    try:
+        radii = [float(word) for word in words]
+    except (TypeError, ValueError):
+        radii = [-1.0]
+    if not radii or not all(0.0 < radius < np.inf for radius in radii):
+        raise InputError(
+            f"{RADIUS_FLAG} {said}: must be millimetres above 0; one number, or one for each ball: 10,12.5"
+        )
+    if not balls:
+        raise InputError(f"{RADIUS_FLAG} {said}: no ball is given; add {FLAG} auto, or {FLAG} x,y,radius")
+    if len(radii) not in (1, len(balls)):
+        raise InputError(
+            f"{RADIUS_FLAG} {said}: {len(radii)} radii for {len(balls)} of {FLAG}; give one, or one for each"
+        )
+    every = radii * len(balls) if len(radii) == 1 else radii
+    return tuple(replace(ball, millimetres=radius) for ball, radius in zip(balls, every, strict=True))
 
 
 def _read(said: Said) -> WantedBall:

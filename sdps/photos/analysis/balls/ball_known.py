@@ -55,7 +55,7 @@ def know_lights(
     distant, reach = distance.distance == np.inf, None
     if distance.distance is not None and not distant:
         reach = float(by.radii(np.array([distance.distance]), distance.unit, DISTANCE)[0]) / 2.0
-    found, depths = join_balls(rays, capture, distant, reach)
+    found, depths = join_balls(rays, capture, distant, reach, by.pixel_size)
     kept = found.kept
     if kept.mean() < _ENOUGH:
         bad = [name for name, good in zip(files, kept.tolist(), strict=True) if not good]
@@ -68,13 +68,13 @@ def know_lights(
         known, directions=found.directions[kept].astype(np.float32), intensities=strengths, name=names,
         distances=None if found.distances is None else found.distances[kept],
         unit="" if found.distances is None else "objects",
-        notes=(*_describe(found, names, known, strengths, depths), *_doubt_circles(rays)),
+        notes=(*_describe(found, names, known, strengths, _say_depths(rays, depths), by), *_doubt_circles(rays)),
     )  # fmt: skip
     return LightsOfBalls(lights, kept, _name_left(files, found))
 
 
 def _describe(
-    found: BallLights, names: str, known: KnownLights, strengths: np.ndarray | None, depths: np.ndarray | None
+    found: BallLights, names: str, known: KnownLights, strengths: np.ndarray | None, where: str, by: Yardstick
 ) -> tuple[str, ...]:
     """Say where the lights are from."""
     notes = [f"lights are those that {names} shows" if " and " not in names else f"lights are those that {names} show"]
@@ -83,17 +83,28 @@ def _describe(
         notes.append(f"the balls' rays agree to {found.apart:.1f} degrees{doubt if found.apart > _APART else ''}")
     if found.distances is not None and np.isfinite(found.distances).any():
         near = found.distances[np.isfinite(found.distances)]
-        where = "the balls' middles are taken to stand as far from the camera as the object's"
-        if depths is not None:
-            parts = " and ".join(f"{depth:.3g}" for depth in depths)
-            where = f"the balls are taken for ones of one size, {parts} times as far from the camera as the object"
+        each = "" if by.pixel_size is None else 2.0 * by.radius * by.pixel_size
+        metric = "" if not each else f" ({near.min() * each:.3g} to {near.max() * each:.3g} mm)"
         notes.append(
-            f"the lamps stand {near.min():.3g} to {near.max():.3g} object sizes from its middle, where the balls' rays "
-            f"meet ({where})"
+            f"the lamps stand {near.min():.3g} to {near.max():.3g} object sizes{metric} from its middle, where the "
+            f"balls' rays meet ({where})"
         )
+    elif where.startswith("by"):
+        notes.append(where)
     if strengths is None:
         notes.append(f"a chrome ball gives no intensities; a network finds them (--intensities {EQUAL} if all are)")
     return (*notes, *(note for note in known.notes if note not in KnownLights.notes))
+
+
+def _say_depths(rays: Sequence[BallRays], depths: np.ndarray | None) -> str:
+    """Say how far from the camera the balls stand."""
+    if depths is None:
+        return "the balls' middles are taken to stand as far from the camera as the object's"
+    parts = " and ".join(f"{depth:.3g}" for depth in depths)
+    if all(ray.millimetres is not None for ray in rays):
+        one = "ball stands" if len(rays) == 1 else "balls stand"
+        return f"by their radii the {one} {parts} times as far from the camera as the object"
+    return f"the balls are taken for ones of one size, {parts} times as far from the camera as the object"
 
 
 def _doubt_circles(rays: Sequence[BallRays]) -> list[str]:

@@ -33,6 +33,7 @@ class BallRays:
         intensities: (L, 3) of a white ball, relative; None of a chrome one.
         faults: (L,) why a picture shows none; empty where it does.
         highlights: (L, 2) column and row of the highlight on a chrome ball, else NaN.
+        millimetres: The ball's real radius; None: not known.
     """
 
     kind: str
@@ -42,6 +43,7 @@ class BallRays:
     intensities: np.ndarray | None
     faults: tuple[str, ...]
     highlights: np.ndarray
+    millimetres: float | None = None
 
     def take(self, order: Sequence[int]) -> "BallRays":
         """Return it for some pictures, in another order."""

@@ -37,6 +37,7 @@ class FoundBall:
         highlights: (L, 2) column and row of the highlight on a chrome ball, in pixels of the files, else NaN.
         seen: (h, w, 3) float32, linear radiance of its window, the highest of all pictures.
         window: Column and row of the middle of the window's first pixel, and its pixels' side, in pixels of the files.
+        millimetres: Its real radius, where the user says it.
     """
 
     kind: str
@@ -46,6 +47,7 @@ class FoundBall:
     highlights: np.ndarray
     seen: np.ndarray
     window: tuple[float, float, float]
+    millimetres: float | None = None
 
     def take(self, kept: np.ndarray) -> "FoundBall":
         """Return it for the pictures of (L,) bool."""
@@ -59,6 +61,7 @@ class FoundBall:
             "circle": [round(value, 2) for value in self.circle],
             "circle_by": "found" if self.found else "given",
             "lights_by": "highlight" if lit else "shading",
+            **({} if self.millimetres is None else {"radius_mm": self.millimetres}),
             **({} if self.folder is None else {"folder": str(self.folder)}),
             **({"highlights": {name: np.round(place, 2).tolist() for name, place in lit}} if lit else {}),
         }
@@ -106,7 +109,10 @@ class Scene:
         x, y, left, top = ((float(side) + 0.5) / scale - 0.5 for side in (*view.sphere.circle[:2], *first))
         circle, step = Circle(x, y, view.sphere.circle.radius / scale), float(view.rows[1, 0] - view.rows[0, 0]) / scale
         highlights = (rays.highlights + 0.5) / scale - 0.5
-        return FoundBall(rays.kind, circle, found, folder, highlights, view.colours.max(0), (left, top, step))
+        window = left, top, step
+        return FoundBall(
+            rays.kind, circle, found, folder, highlights, view.colours.max(0), window, rays.millimetres
+        )  # fmt: skip
 
 
 def see_balls(scene: Scene, wanted: Sequence[WantedBall], alone: bool = False) -> list[tuple[BallRays, bool]]:
@@ -134,12 +140,13 @@ def see_balls(scene: Scene, wanted: Sequence[WantedBall], alone: bool = False) -
                 f"{FLAG} {AUTO}: no ball is found in the pictures; give its circle with {FLAG} x,y,radius (pixels of "
                 "the files), or photograph it alone under the same lights"
             )
-        found += [(one, True) for one in seen]
+        found += [(replace(one, millimetres=ball.millimetres), True) for one in seen]
     views = view_balls(scene.pictures, [sphere for sphere, _ in given], scene.saturation) if given else []
     traced = [(trace_rays(settle(view), ball.kind), ball) for view, (_, ball) in zip(views, given, strict=True)]
     for rays, ball in traced:
         _check_share(scene, rays, ball)
-    return [(rays, ball.circle is None) for rays, ball in traced] + found
+    every = [(replace(rays, millimetres=ball.millimetres), ball.circle is None) for rays, ball in traced]
+    return every + found
 
 
 def cover_balls(spheres: Sequence[Sphere], shape: tuple[int, int]) -> np.ndarray:  # (H, W) bool

@@ -27,18 +27,23 @@ def test_answers_become_flags(tmp_path: Path) -> None:
     asked = {
         "focal": "28", "principal": "30,20", "pixel_size": "0.12", "light_distance": "400mm", "intensities": "equal",
         "ambient": "../../etc/off.png", "dark": "none", "flatten": "0.25", "scale": "auto", "lights": True,
-        "balls": ["white:auto"],
+        "balls": ["white:auto"], "ball_radius": "12.5",
     }  # fmt: skip
     made = make_arguments(tmp_path, Pose("a", tmp_path, tmp_path / "in"), read_answers(asked))
     assert (made.focal, made.principal, made.pixel_size) == ("28mm", "30,20", 0.12)
     assert (made.light_distance, made.intensities, made.lights) == ("400mm", "equal", "folder")
     assert (made.ambient, made.dark) == (tmp_path / "in" / "off.png", "none")
     assert (made.flatten, made.scale, made.ball, made.refine) == (0.25, "auto", ["white:auto"], False)
+    assert made.ball_radius == 12.5
+    gone = make_arguments(tmp_path, Pose("a", tmp_path, tmp_path), read_answers(asked | {"balls": []}))
+    assert gone.ball_radius is None  # which needs a ball
 
 
 @pytest.mark.parametrize(
     ("asked", "said"),
     [({"every": "x"}, "Every so many frames: must be a number"), ({"pixel_size": [1]}, "Size of a pixel: must be"),
+     ({"ball_radius": "big"}, "Radius of the balls: must be a number"),
+     ({"ball_alone": 1e308}, "ball_alone: must be a number"), ({"pixel_size": "inf"}, "Size of a pixel: must be"),
      ({"every": "9" * 5000}, "must be a number"), ({"flatten": "2"}, "flatten: must be one of 0, 0.1")],
 )  # fmt: skip
 def test_answers_that_are_none_end_in_one_line(asked: dict, said: str) -> None:
@@ -61,3 +66,9 @@ def test_texts_name_questions_in_place_of_flags() -> None:
     )
     assert say_plainly("left out: a.txt; --images takes what it names") == "left out: a.txt"
     assert say_plainly("p -- q--flat-share") == "p -- q--flat-share"
+
+
+def test_an_answer_that_a_note_names_is_one_of_the_page() -> None:
+    said = say_plainly("look at a place that you know, and use --flat turned if it is inside out.")
+    answer = said.split('"')[1]
+    assert said.endswith('" if it is inside out.') and f">{answer}</option>" in TEMPLATE.read_text()

@@ -54,6 +54,7 @@ def test_one_file_is_a_file_and_several_are_a_zip(place: Path) -> None:
         ("gltf", 'nothing was refined, so how it shines is not known; find the surface again with "Refine"'),
         ("meshroom", 'the camera was taken for orthographic; find the surface again with "Focal length"'),
         ("../lp", "unknown export"),
+        ("lp,height", "export lp, height: one at a time; ask for each"),
     ],
 )
 def test_what_is_missing_is_said_in_one_line_and_nothing_stays(place: Path, name: str, said: str) -> None:

@@ -10,7 +10,7 @@ import pytest
 from render.shared.errors import InputError
 from sdps import photos
 from sdps.core.geometry import Capture
-from sdps.photos.light_files import read_lights
+from sdps.photos.light_files import find_lights, read_intensities, read_lights
 
 AROUND = np.radians([20.0, 95.0, 165.0, 240.0, 310.0])
 UP = np.radians([35.0, 60.0, 45.0, 30.0, 70.0])
@@ -208,6 +208,40 @@ def test_halcon_s_tuples(tmp_path: Path, text: str) -> None:
     if not text.lower().startswith(("slant", "tilt", "*")):
         text = "slant tilt\n" + text
     np.testing.assert_allclose(read(tmp_path / "l.txt", text.format(s=slants, t=tilts)).directions, LIGHTS, atol=1e-5)
+
+
+def write_tuple(path: Path, values: np.ndarray, kind: int = 2) -> Path:
+    rows = "".join(f"{kind} {value:.16e}\n" if kind == 2 else f"{kind} {round(value)}\n" for value in values)
+    path.write_text(f"{len(values):03d}\n{rows}")
+    return path
+
+
+@pytest.mark.parametrize(("slants", "tilts"), [("slants.tup", "tilts.tup"), ("DomeSlant.TUP", "DomeTilt.TUP")])
+def test_halcon_s_files_of_tuples(tmp_path: Path, slants: str, tilts: str) -> None:
+    """Either file brings the other; whole numbers have another kind."""
+    one = write_tuple(tmp_path / slants, np.degrees(np.pi / 2 - UP))
+    other = write_tuple(tmp_path / tilts, np.degrees(AROUND), kind=1)
+    for path in (one, other):
+        found = read_lights(path, FILES)
+        np.testing.assert_allclose(found.directions, LIGHTS, atol=1e-6)
+        assert any(f"{path.name} was read with " in note for note in found.notes)
+    assert find_lights(tmp_path) == one
+
+
+def test_halcon_s_tuples_of_another_form_say_so(tmp_path: Path) -> None:
+    path = write_tuple(tmp_path / "slants.tup", np.degrees(np.pi / 2 - UP))
+    whole = path.read_text()
+    assert "needs the tilts as well; write_tuple (Tilts, 'tilts.tup') beside it" in says(path, whole)
+    write_tuple(tmp_path / "tilts.tup", np.degrees(AROUND)[:4])
+    assert "has 5 numbers, tilts.tup another number" in says(path, whole)
+    assert "line 3 is not a number as write_tuple writes it" in says(
+        path, whole.replace("\n2 ", "\n4 ", 2).replace("\n4 ", "\n2 ", 1)
+    )
+    assert "whose first line counts the others" in says(path, whole.replace("005", "006"))
+    assert "whose first line counts the others" in says(path, "")
+    assert "name the two files slants.tup and tilts.tup" in says(tmp_path / "lights.tup", whole)
+    bright = write_tuple(tmp_path / "strengths.tup", np.arange(1.0, 6.0))
+    np.testing.assert_allclose(read_intensities(bright, FILES), np.arange(1.0, 6.0))
 
 
 @pytest.mark.parametrize("heading", ["Slant Tilt", "Slants, Tilts", "slant [deg];tilt [deg]", "image,slant,tilt"])

@@ -139,6 +139,9 @@ def test_a_principal_point_alone_does_nothing(tmp_path: Path) -> None:
         ({"pixel_size": 0.0}, "--pixel-size 0: must be above 0"),
         ({"pixel_size": -1.0}, "--pixel-size -1: must be above 0"),
         ({"pixel_size": float("nan")}, "--pixel-size nan: must be above 0"),
+        ({"pixel_size": 1e308}, r"--pixel-size 1e\+308: must be above 0 and under a million"),
+        ({"focal": "1e308"}, r"--focal: 1e\+308 pixels are too many for a picture of 400x300; .* write orthographic"),
+        ({"principal": "1e308,5"}, "--principal 1e308,5: must be two numbers"),
     ],
 )
 def test_what_is_refused(flags: dict, message: str) -> None:

@@ -10,7 +10,7 @@ from ball_scenes import FOCAL, GAINS, LIGHTS, OBJECT, SHAPE, flag, hit, paint, w
 from render.shared.errors import InputError
 from sdps.core.geometry import Camera, Capture
 from sdps.photos import load
-from sdps.photos.analysis.balls.ball_flags import read_balls
+from sdps.photos.analysis.balls.ball_flags import measure_balls, read_balls
 from sdps.photos.analysis.balls.ball_spheres import Circle, Sphere
 from sdps.photos.picture_file import decode
 
@@ -105,6 +105,78 @@ def test_balls_of_different_sizes_at_one_depth_stay_there(tmp_path, size):
     off = lamps - capture.centre
     assert angles(photos.light_directions, off).mean() < 1.0
     np.testing.assert_allclose(capture.radius / photos.light_nearness, np.linalg.norm(off, axis=1), rtol=0.08)
+
+
+@pytest.mark.parametrize("sizes", [(29.0, 29.0), (22.0, 34.0)])
+def test_known_radii_tell_depths_and_millimetres(tmp_path, sizes):
+    """Balls of any sizes, one in front of the object's middle and one behind it; a pixel is 0.4 mm."""
+    balls = [(85.0, 45.0, sizes[0], 60.0), (85.0, -45.0, sizes[1], -60.0)]
+    lamps = 300.0 * LIGHTS + [OBJECT[0], 0.0, 0.0]
+    images = [paint(lamp, 1.0, FOCAL, chrome=balls) for lamp in lamps]
+    said = [flag(ball, FOCAL) for ball in balls]
+    radius = ",".join(str(0.4 * size) for size in sizes)
+    photos = load(
+        write(tmp_path / "in", images, hit(OBJECT, FOCAL)[3]), balls=said, focal=f"{FOCAL}px", ball_radius=radius
+    )
+    capture = Capture.of(photos.mask, photos.camera)
+    off = lamps - capture.centre
+    assert angles(photos.light_directions, off).max() < 1.0
+    np.testing.assert_allclose(capture.radius / photos.light_nearness, np.linalg.norm(off, axis=1), rtol=0.05)
+    assert photos.pixel_size == pytest.approx(0.4, rel=0.02)
+    assert any(
+        "by their radii the balls stand 0.88" in note and " mm) from its middle" in note for note in photos.notes
+    )
+    assert [ball.tell(photos.files)["radius_mm"] for ball in photos.balls] == [0.4 * size for size in sizes]
+
+
+def test_a_known_radius_tells_the_depth_of_one_ball_and_the_scale(tmp_path):
+    """A ball well in front of the object, lamps whose distance is known: it is taken for the object's depth, but for
+    its radius.
+    """
+    ball = (60.0, 40.0, 24.0, 110.0)
+    lamps = 300.0 * LIGHTS + [OBJECT[0], 0.0, 0.0]
+    images = [paint(lamp, 1.0, FOCAL, chrome=[ball]) for lamp in lamps]
+    folder = write(tmp_path / "in", images, hit(OBJECT, FOCAL)[3])
+    known = {"balls": flag(ball, FOCAL), "focal": f"{FOCAL}px"}
+    level = load(folder, **known, light_distance="120mm", ball_radius=0.4 * 24.0 * FOCAL / (FOCAL - 110.0))
+    photos = load(folder, **known, light_distance="120mm", ball_radius=0.4 * 24.0, pixel_size=0.4)
+    off = lamps - Capture.of(photos.mask, photos.camera).centre
+    assert level.pixel_size == pytest.approx(0.4, rel=0.02)  # a ball of that size at the object's depth looks alike
+    assert angles(photos.light_directions, off).mean() < 0.5 * angles(level.light_directions, off).mean()
+    assert angles(photos.light_directions, off).max() < 1.5
+    assert any("by their radii the ball stands 0.79 times as far" in note for note in photos.notes)
+
+
+def test_an_orthographic_camera_has_the_scale_of_a_ball(tmp_path):
+    balls = [(85.0, 45.0, 28.0), (85.0, -45.0, 20.0)]
+    folder = write(tmp_path / "in", [paint(lamp, 1.0, chrome=balls) for lamp in 300.0 * LIGHTS])
+    said = {"balls": [flag(ball) for ball in balls], "focal": "orthographic"}
+    photos = load(folder, **said, ball_radius="14,10")
+    assert photos.pixel_size == pytest.approx(0.5, rel=0.02)
+    doubtful = load(folder, **said, ball_radius=14.0)
+    assert any("by the balls' radii a pixel is 0." in note for note in doubtful.notes)
+
+
+@pytest.mark.parametrize(
+    ("said", "radius", "means"),
+    [
+        (["99,99,9"], "ten", r"--ball-radius ten: must be millimetres above 0"),
+        (["99,99,9"], 0.0, r"--ball-radius 0\.0: must be"),
+        (["99,99,9"], "nan", r"--ball-radius nan: must be"),
+        (["99,99,9"], "1,2", r"2 radii for 1 of --ball; give one, or one for each"),
+        (None, 10.0, r"no ball is given; add --ball auto"),
+    ],
+)
+def test_radii_that_cannot_be(said, radius, means):
+    with pytest.raises(InputError, match=means):
+        measure_balls(read_balls(said), radius)
+
+
+def test_a_radius_that_puts_a_ball_far_away_is_refused(tmp_path):
+    ball = (85.0, 45.0, 24.0)
+    folder = write(tmp_path / "in", [paint(lamp, 1.0, FOCAL, chrome=[ball]) for lamp in LIGHTS])
+    with pytest.raises(InputError, match=r"ball 1 would stand 10 times as far from the camera as the object; correct"):
+        load(folder, balls=flag(ball, FOCAL), focal=f"{FOCAL}px", ball_radius=96.0, pixel_size=0.4)
 
 
 def test_pictures_without_a_good_highlight_are_left_out(tmp_path):
