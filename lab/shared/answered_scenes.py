@@ -66,10 +66,10 @@ def answer(
     runner: Runner, images: np.ndarray, mask: np.ndarray, lights: np.ndarray | None, gains: np.ndarray | None,
     saturation: float = np.inf, rig: Rig = UNKNOWN,
 ) -> tuple[RefinedEstimate, Evidence | None]:  # fmt: skip
-    """Return what a method that ends in `+refine` finds, and the evidence that is joined; None: refinement is blind."""
+    """Return what a method that ends in `+refine` finds, and the evidence that is joined, None where it is void."""
     found = runner.estimate(images, mask, lights, gains, saturation=saturation, rig=rig)
     assert isinstance(found, RefinedEstimate)
-    if found.trust.blind:
+    if found.trust.void:
         return found, None
     found = choose(found.start, found.refined, found.trust._replace(doubt=""))
     return found, runner.ask_again(images, mask, found, lit=lights is not None, rig=rig)
