@@ -22,8 +22,8 @@ FEWEST_IMAGES = 8
 _PLANE = 0.08
 """Lights are taken to lie in one plane with the object if they leave it by less, root mean square."""
 _TURNED = 2.0
-"""Lights are taken to have gone astray if they moved by so many times what the network expects them to be off: of 48
-rendered scenes one moved by 2.4 times that, to where they were worse, and the others by at most 1.5 times."""
+"""Lights went astray if they moved by so many times what the network expects them to be off: of 46 rendered scenes
+those of two mirrors moved by 2.4 and 2.6 times that, to where they were worse, others by at most 1.5."""
 _FLAT = 0.1
 """An object is taken to be flat if its normals spread by less, root mean square."""
 _WINDOW = 5  # pixels that a residual is averaged over
@@ -178,7 +178,7 @@ def _count_images(images: int) -> str:
 def _find_turn(lights: np.ndarray, start: Estimate) -> str:
     """Return that refined lights (L, 3) moved further than the network's can be off, if they did.
 
-    Wrong lights and wrong normals explain the photographs of a metal about as well as right ones; the network has seen
+    Wrong lights and wrong normals explain the photographs of a mirror about as well as right ones; the network has seen
     many, and knows how far off its lights are. Given lights do not move.
     """
     if start.expected_light_error is None:
