@@ -34,10 +34,11 @@ _EXPECTED = 0.05
 
 
 def train(scenes: Sequence[Answered], epochs: int, width: int, seed: int) -> FusionNet:
-    """Return a network that has seen every scene so many times, turned and cut at random."""
+    """Return a network that has seen every scene that has evidence so many times, turned and cut at
+    random."""
     torch.manual_seed(seed)
     rng, network = np.random.default_rng(seed), FusionNet(width=width)
-    given = [(prepare(scene.evidence), _truth(scene)) for scene in scenes]
+    given = [(prepare(scene.evidence), _truth(scene)) for scene in scenes if scene.evidence is not None]
     steps = epochs * math.ceil(len(given) / _BATCH)
     adam = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)
     plan = torch.optim.lr_scheduler.OneCycleLR(adam, _RATE, total_steps=steps, pct_start=_WARM)
@@ -94,7 +95,7 @@ def group(scenes: Sequence[Answered]) -> dict[str, list[Answered]]:
     groups = {"learned from": [scene for scene in scenes if not scene.held_out], "held out": held_out}
     for low, high in ((4, 7), (8, 15), (16, 31), (32, 48)):
         name = f"held out, {low} to {high} images"
-        groups[name] = [scene for scene in held_out if low <= scene.evidence.images <= high]
+        groups[name] = [scene for scene in held_out if low <= scene.images <= high]
     return groups
 
 

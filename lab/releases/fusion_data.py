@@ -84,7 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         shown = Photographs(folder, spec)
         runner, lights, gains = (lit, shown.placed.directions, shown.gains) if shown.lit else (unlit, None, None)
         answered = answer(runner, shown.images, shown.mask, lights, gains, _SATURATED, shown.rig)
-        keep(path, answered, shown.normals, shown.placed.directions, held_out=spec.split == "val")
+        held_out = spec.split == "val"
+        keep(path, answered, shown.normals, shown.placed.directions, held_out=held_out, lit=shown.lit)
     return 0
 
 

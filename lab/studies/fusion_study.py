@@ -49,7 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             narrow = not args.merltest and number % 2 == 1
             scene = Scene(folder, spec, narrow, images, args.merltest is not None)
             given = (scene.lights, scene.gains) if args.lights else (None, None)
-            keep(file, answer(runner, scene.images, scene.mask, *given), scene.normals, scene.lights, held_out=True)
+            answered = answer(runner, scene.images, scene.mask, *given)
+            keep(file, answered, scene.normals, scene.lights, held_out=True, lit=args.lights)
         groups[f"{images or 'all'} images"] = read_all(place)
     for line in tabulate(groups, load_fusion(args.weights)):
         sys.stdout.write(line)

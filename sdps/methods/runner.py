@@ -211,7 +211,7 @@ class Runner:
             rig=rig, nearness=estimate.nearness,
         )  # fmt: skip
         expected = trust(refined, mask, estimate, given=lit, level=estimate.tilt is not None)
-        if not self.method.fused or expected.blind:
+        if not self.method.fused or expected.void:
             return choose(estimate, refined, expected)
         # What is doubted of the normals, joining weighs pixel by pixel; refined lights are better even then.
         from sdps.methods.fusion.fuse import fuse

@@ -5,12 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from sdps_scenes import write_data
 
 from lab.releases import fusion
 from lab.releases.fusion_data import Photographs
 from lab.shared.answered_scenes import Answered, keep, measure, read, read_all, tabulate
+from render.shared.errors import InputError
 from sdps.core.estimate import Estimate
+from sdps.core.metrics import angle_degrees
 from sdps.methods.fusion.evidence import Evidence, find_place
 from sdps.methods.fusion.network import FusionNet
 from sdps.refinement.trust import RefinedEstimate
@@ -36,7 +39,16 @@ def answered(seed: int, held_out: bool = False) -> Answered:
         mask=mask, network=normals, refined=wrong, start=normals, images=32.0, spread=0.5, nearness=0.0, turned=2.0,
         lit=0.0, **flat,
     )  # fmt: skip
-    return Answered(name=str(seed), evidence=evidence, truth=normals, held_out=held_out, lights=(3.0, 2.0))
+    return Answered(
+        name=str(seed), evidence=evidence, truth=normals, held_out=held_out, lights=(3.0, 2.0), start=normals,
+        told=flat["told_first"], images=32, lit=False,
+    )  # fmt: skip
+
+
+def found(scene: Answered, lights: np.ndarray, start: np.ndarray) -> RefinedEstimate:
+    """Return what keeps of a scene need: its answer is the start, normals (h, w, 3) under lights (L, 3)."""
+    begun = Estimate(start, lights, np.ones(len(lights), np.float32), expected_error=scene.told)
+    return RefinedEstimate(**vars(begun), refined=begun, start=begun, trust=None)  # type: ignore[arg-type]
 
 
 def test_fusion_learns_whom_to_believe(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,16 +63,16 @@ def test_fusion_learns_whom_to_believe(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "held out" in "".join(tabulate(fusion.group([*scenes, other]), FusionNet().eval()))
 
 
+UP = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (4, 1))
+
+
 def test_an_answered_scene_is_read_back(tmp_path: Path) -> None:
     scene = answered(3)
     mask, box = scene.evidence.mask, find_place(scene.evidence.mask)
-    lights = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (4, 1))
-    start = Estimate(scene.truth, lights, np.ones(4, np.float32))
-    found = RefinedEstimate(scene.truth, lights, np.ones(4, np.float32), refined=start, start=start, trust=None)  # type: ignore[arg-type]
-    keep(tmp_path / "a.npz", (found, scene.evidence.part(*box)), scene.truth, lights, held_out=True)
-    keep(tmp_path / "b.npz", (found, None), scene.truth, lights, held_out=False)
+    answer = found(scene, UP, scene.truth), scene.evidence.part(*box)
+    keep(tmp_path / "a.npz", answer, scene.truth, UP, held_out=True, lit=False)
     (back,) = read_all(tmp_path)
-    assert back.held_out and back.name == "a" and read(tmp_path / "b.npz") is None
+    assert back.held_out and not back.lit and back.name == "a" and back.images == 32
     assert back.lights == pytest.approx((0.0, 0.0), abs=0.1)
     np.testing.assert_array_equal(back.evidence.mask, mask[box])
     np.testing.assert_allclose(back.truth, scene.truth[box], atol=1e-3)
@@ -68,12 +80,41 @@ def test_an_answered_scene_is_read_back(tmp_path: Path) -> None:
     assert back.evidence.numbers == scene.evidence.numbers
 
 
+def test_a_scene_without_evidence_stays_in_the_table_as_the_networks_answer(tmp_path: Path) -> None:
+    scene = answered(3)
+    answer = found(scene, UP, scene.evidence.refined), None  # the network is wrong here
+    keep(tmp_path / "a.npz", answer, scene.truth, UP, held_out=True, lit=False)
+    (back,) = read_all(tmp_path)
+    network = FusionNet().eval()
+    off = float(angle_degrees(scene.evidence.refined, scene.truth)[scene.evidence.mask].mean())
+    assert back.evidence is None and off > 1.0
+    assert measure(back, network) == pytest.approx([off] * 5 + [3.0], abs=0.05)
+    table = "".join(tabulate({"all": [back, scene]}, network)).splitlines()
+    (line,) = [each.split() for each in table if "all" in each]
+    assert line[1] == "2"
+    assert float(line[2]) == pytest.approx(off / 2, abs=0.05)  # the other scene's first look is the truth
+    assert list(fusion.group([back]))[-1].startswith("held out, 32") and fusion.group([back])["held out"] == [back]
+
+
+def test_a_scene_without_evidence_teaches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fusion, "_SIDE", 24)
+    scenes = [answered(seed) for seed in range(2)]
+    alone, beside = (fusion.train(some, 2, 8, 0) for some in (scenes, [*scenes, replace(answered(7), evidence=None)]))
+    for one, two in zip(alone.parameters(), beside.parameters(), strict=True):
+        assert torch.equal(one, two)
+
+
+def test_a_file_without_an_answer_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", held_out=np.asarray(True))
+    with pytest.raises(InputError, match=r"a\.npz: holds no answer.*delete it"):
+        read(tmp_path / "a.npz")
+
+
 def test_what_half_floats_do_not_hold_is_kept_as_their_largest(tmp_path: Path) -> None:
-    scene, lights = answered(3), np.tile(np.array([0.0, 0.0, 1.0], np.float32), (4, 1))
+    scene = answered(3)
     glossy = replace(scene.evidence, gloss=scene.evidence.gloss * np.float32(1e6))
-    start = Estimate(scene.truth, lights, np.ones(4, np.float32))
-    found = RefinedEstimate(scene.truth, lights, np.ones(4, np.float32), refined=start, start=start, trust=None)  # type: ignore[arg-type]
-    keep(tmp_path / "a.npz", (found, glossy.part(*find_place(glossy.mask))), scene.truth, lights, held_out=True)
+    answer = found(scene, UP, scene.truth), glossy.part(*find_place(glossy.mask))
+    keep(tmp_path / "a.npz", answer, scene.truth, UP, held_out=True, lit=False)
     (back,) = read_all(tmp_path)
     assert np.isfinite(back.evidence.gloss).all() and back.evidence.gloss.max() == 65504.0
 

@@ -7,6 +7,7 @@ import pytest
 
 from sdps.api import _runner
 from sdps.core.estimate import Estimate
+from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
 from sdps.methods.parse import parse
 from sdps.methods.runner import Runner
@@ -99,6 +100,19 @@ def test_what_cannot_be_trusted_is_doubted(normals: str, lights: np.ndarray, res
     start = tilted(flat_or_not, 1.0) * mask[..., None]
     said = trust(found(residual, lights), mask, begun(start, lights)).doubt
     assert doubt in said and "\n" not in said
+
+
+@pytest.mark.parametrize(("told", "astray"), [(9.0, True), (11.0, False), (None, False)])
+def test_lights_that_turn_further_than_the_network_expects_are_not_believed(told: float | None, astray: bool) -> None:
+    normals, mask = dome()
+    lights = around()
+    turned = tilted(lights, 20.0)
+    moved = float(angle_degrees(turned, lights).mean())
+    errors = {} if told is None else {"expected_light_error": np.full(COUNT, told * moved / 20.0, np.float32)}
+    said = trust(found(0.015, turned), mask, begun(tilted(normals, 3.0) * mask[..., None], lights, **errors))
+    assert said.void == astray and bool(said.doubt) == astray
+    if astray:
+        assert f"turned the lights by {moved:.0f} degrees" in said.doubt and "\n" not in said.doubt
 
 
 @pytest.mark.parametrize("count", [FEWEST_IMAGES - 1, FEWEST_IMAGES], ids=["doubted", "trusted"])

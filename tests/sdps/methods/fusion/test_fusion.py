@@ -1,6 +1,7 @@
 """Joining what a network and refinement found: at first the plain mean; in tiles as in one piece."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,9 @@ from sdps.methods.fusion.network import REACH, FusionNet, describe, prepare, pre
 from sdps.methods.parse import parse
 from sdps.methods.pretrained import require
 from sdps.methods.runner import Runner
-from sdps.refinement.refine import FEWEST, RefineConfig
+from sdps.refinement.image_model import Refined
+from sdps.refinement.refine import FEWEST, RefineConfig, refine
+from sdps.refinement.trust import RefinedEstimate
 
 
 def sphere(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -122,12 +125,34 @@ def test_fused_methods_are_asked_for_by_name() -> None:
     assert not _runner("lcnet+psfcn", (False, False), None, None, None, images=40).method.fused
 
 
-@pytest.mark.parametrize("lit", [False, True], ids=["nothing given", "lights given"])
-def test_the_fused_answer_lies_between_both_witnesses(lit: bool) -> None:
+def photographs() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return images (12, 40, 40, 3) of a matte ball, its mask and its lights (12, 3)."""
     normals, mask = sphere(40, 40)
     turns = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
     lights = np.stack([0.6 * np.cos(turns), 0.6 * np.sin(turns), np.full(12, 0.8)], axis=1).astype(np.float32)
-    images = np.maximum(np.einsum("hwc,lc->lhw", normals, lights), 0.0)[..., None].repeat(3, axis=-1).astype(np.float32)
+    images = np.maximum(np.einsum("hwc,lc->lhw", normals, lights), 0.0)[..., None].repeat(3, axis=-1)
+    return images.astype(np.float32), mask, lights
+
+
+def test_lights_that_went_astray_leave_the_networks_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    images, mask, _ = photographs()
+
+    def stray(*given: Any, **more: Any) -> Refined:
+        found = refine(*given, **more)
+        return replace(found, light_directions=found.light_directions[:, [1, 2, 0]])
+
+    monkeypatch.setattr("sdps.refinement.refine.refine", stray)
+    quick = RefineConfig(coarse_pixels=400, iterations=2, iterations_before=1, fine_iterations=1)
+    runner = Runner(parse("sdps-frames+fuse", require), require, refining=quick)
+    found = runner.estimate(images, mask, None, None)
+    assert isinstance(found, RefinedEstimate) and not isinstance(found, fusing.FusedEstimate)
+    assert found.normals is found.start.normals and found.light_directions is found.start.light_directions
+    assert "turned the lights" in found.trust.doubt
+
+
+@pytest.mark.parametrize("lit", [False, True], ids=["nothing given", "lights given"])
+def test_the_fused_answer_lies_between_both_witnesses(lit: bool) -> None:
+    images, mask, lights = photographs()
     quick = RefineConfig(coarse_pixels=400, iterations=20, iterations_before=10, fine_iterations=5)
     runner = Runner(parse("frames+fuse" if lit else "sdps-frames+fuse", require), require, refining=quick)
     given = (lights, np.ones(12, np.float32)) if lit else (None, None)
