@@ -39,7 +39,7 @@ LIGHTS = {
     "surroundings": SceneMix(sparse=True, surrounded=1.0),
 }
 COUNTS = (4, 8, 16)
-METHODS = ("anylight", "sdps-frames", "sdps-frames+fuse", "pf14")
+METHODS = ("anylight", "anylight+refine", "sdps-frames", "sdps-frames+fuse", "pf14")
 _SIDE = 128
 _WIDEST = 50.0
 """Degrees from any direction to the nearest light in scenes that surroundings are mixed from."""

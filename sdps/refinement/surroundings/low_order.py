@@ -39,11 +39,15 @@ TILE_PIXELS = 200_000
 _HALO = 16
 _FLAT = 0.1
 """An object is taken to be flat if its normals spread by less, root mean square."""
-_USUAL_MISFIT, _USUAL_ERROR = 4e-3, 10.0
+_USUAL_IMAGES, _USUAL_MISFIT, _USUAL_ERROR = 16, 4e-3, 10.0
+"""With fewer images, or a larger misfit, photographs count less against the start; with larger errors, more."""
 _LEAST_MISFIT = 2e-4
 """Models that fit even better are not believed more."""
 _ERRORS = 3.0, 40.0
 """Least and largest error of the start, in degrees, that is believed."""
+_GAIN, _FADES = 0.3, 6e-3
+"""Share of the error that is gone where the model fits perfectly, and the misfit at which that is down to 1 / e; from
+`lab.studies.low_order_study`."""
 _LEAST_FACING = 0.01
 _LEAST_RATE = 0.02
 
@@ -167,7 +171,7 @@ class _Solver:
         pixels = self._gather(self.scene, grid.which, places, hidden)
         first = light_fit.fit(pixels, start)
         before = light_fit.measure_misfit(pixels, first)
-        gain = _USUAL_MISFIT / max(before, _LEAST_MISFIT)
+        gain = min(1.0, len(self.chosen) / _USUAL_IMAGES) * _USUAL_MISFIT / max(before, _LEAST_MISFIT)
         sights = _sights(grid.camera, mask)
         moved, found = descend(
             pixels, mask, start, start, first, _weigh(errors), gain, sights, config, config.iterations, free=True
@@ -264,7 +268,7 @@ def descend(
         loss = gain * (basis * towards).sum()
         loss = loss + config.near * (pull * (normals - start).square().sum(dim=1)).mean()
         loss = loss + config.curl * measure_curl(normals, near, sights)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         adam.step()
         with torch.no_grad():
             facing = (moving * sights).sum(dim=1, keepdim=True)
@@ -276,7 +280,7 @@ def descend(
 
 def predict_error(errors: np.ndarray, misfit: float) -> np.ndarray:
     """Return the error to expect after refinement, of that before it and the misfit at the start."""
-    return errors
+    return errors * (1.0 - _GAIN * float(np.exp(-misfit / _FADES)))
 
 
 def find_doubt(normals: np.ndarray, misfit: tuple[float, float]) -> str:
