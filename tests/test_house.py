@@ -24,10 +24,10 @@ FOLDERS = [
     )),
     "render",
     *(f"sdps.{name}" for name in (
-        "core", "data", "data.resident", "models", "training", "publishing", "inference", "refinement",
-        "classical.common", "classical", "methods.fusion", "methods", "photos.light_files", "photos.pictures",
-        "photos.pictures.decoding", "photos.pictures.sources", "photos.analysis.balls", "photos.analysis", "photos",
-        "surface", "surface.gloss", "surface.exports",
+        "core", "data", "data.resident", "models", "training", "publishing", "inference", "refinement.shape",
+        "refinement", "refinement.surroundings", "classical.common", "classical", "methods.fusion", "methods",
+        "photos.light_files", "photos.pictures", "photos.pictures.decoding", "photos.pictures.sources",
+        "photos.analysis.balls", "photos.analysis", "photos", "surface", "surface.gloss", "surface.exports",
     )),
     "sdps",
     *(f"pipelines.{name}" for name in (

@@ -40,7 +40,7 @@ LIGHTS = {
     "surroundings": SceneMix(sparse=True, surrounded=1.0),
 }
 COUNTS = (4, 8, 16)
-METHODS = ("anylight", "sdps-frames", "sdps-frames+fuse", "pf14")
+METHODS = ("anylight", "anylight+refine", "sdps-frames", "sdps-frames+fuse", "pf14")
 _SIDE, _ROWS = 128, "rows.jsonl"
 _WIDEST = 50.0
 """Degrees from any direction to the nearest light in scenes that surroundings are mixed from."""

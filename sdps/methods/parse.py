@@ -48,7 +48,8 @@ def parse(text: str, find: Callable[[str], Path]) -> Method:
         text: A combination (`sdps`), a normal model (`nenet`), a classical method (`pf14`), a lighting model alone
             (`lcnet`), or lights and normals (`lcnet+psfcn`, `true+least-squares`). Calibrated methods alone are given
             the true lights, networks alone what they were trained on; `shipped:` before a name means the pretrained
-            weights. `+refine` at the end refines what was found, `+fuse` joins that with the network's own answer.
+            weights. `+refine` at the end refines what was found, with lamps, or, where a method finds no lights, under
+            light from all around; `+fuse` joins that with the network's own answer.
         find: Gives the weights file of a name, or raises InputError.
 
     Raises:
@@ -90,15 +91,19 @@ def finish(method: Method, last: str, find: Callable[[str], Path]) -> Method:
     if last == REFINE:
         return replace(method, name=f"{method.name}, refined", refined=True, paper="")
     if not can_fuse(method, find):
-        raise InputError(f"method {method.name}+{last}: want a network that tells its errors, as sdps-frames+{last}")
+        raise InputError(
+            f"method {method.name}+{last}: want a network that is given lights and tells its errors, as "
+            f"sdps-frames+{last}"
+        )
     return replace(method, name=f"{method.name}, fused", refined=True, fused=True, paper="")
 
 
 def can_fuse(method: Method, find: Callable[[str], Path]) -> bool:
-    """Return whether the normals are those of a network that tells the errors to expect of them."""
+    """Return whether a network that is given lights finds the normals, and tells the errors to expect of them."""
     if method.normals in (NONE, *CLASSICAL):
         return False
-    return getattr(MODELS[model_of(method.normals, find)].build, "tells_errors", False)
+    build = MODELS[model_of(method.normals, find)].build
+    return getattr(build, "tells_errors", False) and getattr(build, "needs_lights", True)
 
 
 def uses_networks(method: Method) -> bool:

@@ -22,7 +22,7 @@ from sdps.core.estimate import Estimate
 from sdps.core.integration import integrate
 from sdps.core.intensities import grey
 from sdps.inference.image_source import ImageSource
-from sdps.refinement.transport import trace_shadows
+from sdps.refinement.shape.transport import trace_shadows
 
 TURN = np.array([-1.0, -1.0, 1.0])
 """Brings normals and lights of one side to those of the other."""

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from render.records.shards import file_hash
-from render.shared.errors import InputError
 from render.shared.progress import retell
 from sdps.classical import registry as classical
 from sdps.classical.common.near_lamps import settle
@@ -132,7 +131,7 @@ class Runner:
             estimate = self._refine(images, mask, estimate, given, saturation, rig)
         if estimate.tilt is None:
             return estimate
-        trust = getattr(estimate, "trust", None)  # of refined ones, whose intensities move
+        trust = getattr(estimate, "trust", None)  # of those refined with lamps, whose intensities move
         free = trust is not None and not trust.doubt and not are_near(estimate.nearness)
         return self.flat.finish(estimate, mask, given.get("intensities") if free else None, lit=lit)
 
@@ -194,13 +193,13 @@ class Runner:
         rig: Rig,
     ) -> Estimate:  # fmt: skip
         """Refine an estimate, or keep it where refinement cannot be trusted; light directions it was given stay."""
+        if not len(estimate.light_directions):
+            from sdps.refinement.surroundings.outcome import refine_estimate
+
+            return refine_estimate(images, mask, estimate, rig.camera, saturation)
         from sdps.refinement.refine import refine
         from sdps.refinement.trust import choose, trust
 
-        if not len(estimate.light_directions):
-            raise InputError(
-                f"{self.method.name}: refinement needs lights; put a lighting model before it, as in lcnet+"
-            )
         begun = given.get("intensities")
         if begun is None:
             begun = estimate.intensities if len(estimate.intensities) else np.ones(len(images), np.float32)

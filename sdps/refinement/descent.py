@@ -12,8 +12,8 @@ from render.shared.errors import InputError
 from sdps.refinement.fused import data_term
 from sdps.refinement.image_model import DATA_FLOOR, Model, State, build_model
 from sdps.refinement.modes import evaluate_modes, fit_modes
-from sdps.refinement.priors import Neighbours, find_neighbours, measure_curl, measure_drift, measure_roughness
 from sdps.refinement.reflectance import evaluate_factor, measure_angles
+from sdps.refinement.shape.priors import Neighbours, find_neighbours, measure_curl, measure_drift, measure_roughness
 from sdps.refinement.sites import Sites
 
 RATES = {

@@ -40,7 +40,7 @@ def upsample(
     model, mask = build_model(state), scene.mask[tile.outer_rows, tile.outer_columns]
     mean = None if mask.shape == scene.mask.shape else coarse.mean  # the same for all tiles
     problem = build_problem(values, mask, 1, model.log_intensities.exp().numpy(), full, mean)
-    up = _make_interpolator(coarse.mask, mask, grid.stride, (tile.outer_rows.start, tile.outer_columns.start))
+    up = make_interpolator(coarse.mask, mask, grid.stride, (tile.outer_rows.start, tile.outer_columns.start))
     normals = up(state.normals.numpy())
     normals /= normals.norm(dim=1, keepdim=True)
     own = model._replace(normals=normals)
@@ -63,7 +63,7 @@ def upsample(
     return problem, state._replace(log_albedo=estimate_log_albedo(problem, state))
 
 
-def _make_interpolator(
+def make_interpolator(
     coarse: np.ndarray, mask: np.ndarray, stride: int, start: tuple[int, int]
 ) -> Callable[[np.ndarray], Tensor]:
     """Return a function that interpolates values (P, C) of the coarse pixels to all pixels of a part at `start`.

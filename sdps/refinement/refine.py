@@ -23,8 +23,8 @@ from sdps.refinement.fine import collect, upsample
 from sdps.refinement.image_model import Model, Refined, State, build_model
 from sdps.refinement.problems import build_problem, estimate_log_albedo, gather_pixels
 from sdps.refinement.reflectance import LOBES, MODES, SHAPES
+from sdps.refinement.shape.transport import trace
 from sdps.refinement.sites import Grid, Sites
-from sdps.refinement.transport import trace
 
 FEWEST = 4
 """With fewer images nothing is refined."""

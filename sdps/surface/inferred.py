@@ -25,6 +25,7 @@ from sdps.methods import pretrained
 from sdps.methods.fusion.fuse import FusedEstimate
 from sdps.photos import Finding, Photographs, write_lights
 from sdps.photos.response import display
+from sdps.refinement.surroundings.outcome import LowOrderEstimate
 from sdps.refinement.trust import RefinedEstimate
 from sdps.surface.lamp_distance import Origin, describe_lamps, measure_distances
 from sdps.surface.meshing import mesh, step_of, write_mesh
@@ -115,7 +116,11 @@ class Inference:
 
     @cached_property
     def albedo(self) -> np.ndarray | None:  # (H, W, 3)
-        """Lambertian albedo under the lights found, relative; None where no lights were found."""
+        """Lambertian albedo under the lights found, relative; None where no lights were found. Of a method that finds
+        none, that of refinement under low-order light, if it was refined.
+        """
+        if isinstance(self.estimate, LowOrderEstimate):
+            return self.estimate.albedo
         if not len(self.light_directions):
             return None
         known = self.photos, self.photos.mask, self.normals, self.light_directions, self.gains
@@ -124,7 +129,7 @@ class Inference:
     @cached_property
     def residuals(self) -> Residuals | None:
         """How far the photographs are from Lambert's law on what was found; None where no lights were found."""
-        if self.albedo is None:
+        if self.albedo is None or not len(self.light_directions):
             return None
         known = self.photos, self.photos.mask, self.normals, self.light_directions, self.gains
         return residuals(*known, self.albedo, lamps=self.near_lamps)
@@ -216,8 +221,8 @@ class Inference:
             facts["expected_light_error_degrees"] = _by_file(photos, found.expected_light_error, 2)
         if self.expected_error is not None:
             facts["expected_normal_error_degrees"] = round(float(self.expected_error[photos.mask].mean()), 2)
-        if self.refinement is not None:
-            facts["refined"] = _about_refined(self.refinement, photos)
+        if isinstance(found, RefinedEstimate | LowOrderEstimate):
+            facts["refined"] = _about_refined(found, photos)
         if isinstance(self.estimate, FusedEstimate):
             from_network, from_refinement = (round(degrees, 2) for degrees in self.estimate.moved)
             facts["fused"] = {"from_network_degrees": from_network, "from_refinement_degrees": from_refinement}
@@ -265,6 +270,8 @@ class Inference:
             _save_array(folder / "albedo.npy", refined.albedo)
             _save_array(folder / "highlights.npy", refined.strength)
             _save_array(folder / "residual.npy", refined.pixel_residual)
+        elif isinstance(self.estimate, LowOrderEstimate) and self.albedo is not None:
+            _save_array(folder / "albedo.npy", self.albedo)
         if self.expected_error is not None:
             _save_array(folder / "expected-error.npy", self.expected_error)
         size, every = self.photos.pixel_size, step_of(mask)
@@ -324,8 +331,10 @@ def _by_file(photos: Photographs, values: np.ndarray, digits: int) -> dict[str, 
     return dict(zip(photos.files, np.round(np.asarray(values, float), digits).tolist(), strict=True))
 
 
-def _about_refined(found: RefinedEstimate, photos: Photographs) -> dict[str, Any]:
+def _about_refined(found: RefinedEstimate | LowOrderEstimate, photos: Photographs) -> dict[str, Any]:
     """Say how far refinement went, what to expect of it, and which photographs it explains worst; JSON ready."""
+    if isinstance(found, LowOrderEstimate):
+        return _about_low_order(found, photos.mask)
     refined, start, expected = found.refined, found.start, found.trust
     mask, residual = photos.mask, refined.image_residual
     moved = _mean_angle(refined.normals, start.normals, mask)
@@ -345,6 +354,19 @@ def _about_refined(found: RefinedEstimate, photos: Photographs) -> dict[str, Any
         "modes": refined.modes.round(4).tolist(),
         "channels": refined.intensities.mean(axis=0).round(4).tolist(),
         "lobes": {"amplitudes": refined.amplitudes.round(4).tolist(), "sharpness": refined.sharpness.round(1).tolist()},
+    }
+
+
+def _about_low_order(found: LowOrderEstimate, mask: np.ndarray) -> dict[str, Any]:
+    """Say how far refinement under low-order light went; JSON ready."""
+    refined = found.low_order
+    return {
+        "kept": not refined.doubt,
+        "doubt": refined.doubt,
+        "light": "from all around, harmonics up to order two",
+        "normals_moved_degrees": round(_mean_angle(refined.normals, found.start.normals, mask), 2),
+        "expected_normal_error_degrees": round(float(refined.expected[mask].mean()), 2),
+        "misfit": [round(value, 5) for value in refined.misfit],
     }
 
 

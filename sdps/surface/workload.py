@@ -172,7 +172,8 @@ def list_files(runner: Runner) -> tuple[str, ...]:
     lit = method.normals in classical.METHODS or method.lighting or (estimator and estimator.lighting)
     network = None if estimator is None or estimator.normals is None else estimator.normals.network
     names += ["lights.json"] if lit else []
-    names += ["albedo.npy", "highlights.npy", "residual.npy"] if method.refined else []
+    names += ["albedo.npy"] if method.refined else []
+    names += ["highlights.npy", "residual.npy"] if method.refined and lit else []
     names += ["expected-error.npy"] if method.refined or isinstance(network, FusionNetwork) else []
     return tuple(sorted(names))
 

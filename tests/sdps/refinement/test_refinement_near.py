@@ -7,8 +7,8 @@ import torch
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture, Rig, reach
 from sdps.core.metrics import angle_degrees
 from sdps.refinement.image_model import Refined
-from sdps.refinement.priors import find_neighbours, measure_curl
 from sdps.refinement.refine import RefineConfig, refine
+from sdps.refinement.shape.priors import find_neighbours, measure_curl
 from sdps.refinement.sites import Grid
 
 QUICK = RefineConfig(coarse_pixels=700, iterations=500, iterations_before=250, fine_iterations=0)

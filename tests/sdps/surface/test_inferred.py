@@ -12,10 +12,12 @@ import pytest
 import sdps
 from render.shared.config import to_plain
 from render.shared.errors import InputError
-from sdps.core.geometry import FAR
+from sdps.core.estimate import Estimate
+from sdps.core.geometry import FAR, ORTHOGRAPHIC
 from sdps.data.augment import Augmentation
 from sdps.models.checkpoint import TrainedModel, save_weights
 from sdps.models.registry import create
+from sdps.refinement.surroundings.outcome import LowOrderEstimate, refine_estimate
 
 
 def test_a_run_that_is_cut_off_leaves_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,5 +84,36 @@ def test_a_network_that_finds_no_lights_gives_everything_else(tmp_path: Path) ->
     assert {"mesh.ply", "normal.npy", "expected-error.npy"} <= names and "lights.json" not in names
     written = json.loads((tmp_path / "out" / "result.json").read_text())
     assert written["light_directions"] == written["light_intensities"] == "not found"
-    with pytest.raises(InputError, match="refinement needs lights"):
-        sdps.infer(photos, str(weights), refine=True, findings=())
+    with pytest.raises(InputError, match="is given lights"):
+        sdps.infer(photos, f"{weights}+fuse", findings=())
+    refined = sdps.infer(photos, str(weights), refine=True, findings=())
+    assert refined.method.endswith("refined") and refined.residuals is None
+    assert isinstance(refined.estimate, LowOrderEstimate)  # of a network that was never trained: flat, so not kept
+    assert refined.albedo is None and "flat" in refined.summary()["refined"]["doubt"]
+
+
+def test_refinement_without_lights_tells_the_albedo(tmp_path: Path) -> None:
+    lights = np.array([[0.5, 0.0, 0.8], [0.0, 0.5, 0.8], [-0.5, 0.0, 0.8], [0.0, -0.5, 0.8]])
+    images, mask = folders.matte(lights, size=40)
+    photos = sdps.load(folders.write_folder(tmp_path / "photos", images + 0.2, mask))
+    plain = sdps.infer(photos, "pf14", findings=())
+    normals = sdps.estimate(images, mask, "true+least-squares", light_directions=lights).normals
+    start = Estimate(normals, np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+    found = replace(plain, estimate=refine_estimate(images + 0.2, mask, start, ORTHOGRAPHIC))
+    assert found.albedo is not None and found.residuals is None and found.refinement is None
+    names = {path.name for path in found.save(tmp_path / "out")}
+    assert "albedo.npy" in names and not {"lights.json", "highlights.npy", "residual.npy"} & names
+    assert np.array_equal(np.load(tmp_path / "out" / "albedo.npy"), found.albedo)
+    about = json.loads((tmp_path / "out" / "result.json").read_text())["refined"]
+    assert about["kept"] and not about["doubt"] and about["misfit"][1] < about["misfit"][0]
+    assert 0.1 < about["normals_moved_degrees"] < 20.0
+
+
+def test_without_lights_a_doubted_refinement_is_not_kept() -> None:
+    lights = np.array([[0.5, 0.0, 0.8], [0.0, 0.5, 0.8], [-0.5, 0.0, 0.8], [0.0, -0.5, 0.8]])
+    images, mask = folders.matte(lights, size=24)
+    facing = mask[..., None] * np.array([0.0, 0.0, 1.0], np.float32)
+    start = Estimate(facing, np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+    found = refine_estimate(images + 0.2, mask, start, ORTHOGRAPHIC)
+    assert "flat" in found.low_order.doubt and found.albedo is None
+    assert np.array_equal(found.normals, facing) and found.expected_error is None

@@ -7,7 +7,7 @@ import render_support as support
 from sdps.core.geometry import Rig
 from sdps.core.metrics import angle_degrees
 from sdps.refinement.refine import RefineConfig, refine
-from sdps.refinement.transport import Transport, trace
+from sdps.refinement.shape.transport import Transport, trace
 
 ANGLE = 70.0  # of the spherical cavity, from its bottom
 

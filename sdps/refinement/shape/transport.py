@@ -83,9 +83,11 @@ def trace(
     return Transport(_find_lit(field, above, ways), factors)
 
 
-def trace_shadows(heights: np.ndarray, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:
-    """Return which pixels nothing blocks the light of, (P, L) bool, seen without perspective; arguments of `trace`."""
-    field, _, above, ways = _lay(heights, mask, np.ascontiguousarray(normals, np.float32), lights, ORTHOGRAPHIC)
+def trace_shadows(
+    heights: np.ndarray, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, camera: Camera = ORTHOGRAPHIC
+) -> np.ndarray:
+    """Return which pixels nothing blocks the light of, (P, L) bool; arguments of `trace`."""
+    field, _, above, ways = _lay(heights, mask, np.ascontiguousarray(normals, np.float32), lights, camera)
     return _find_lit(field, above, ways)
 
 
