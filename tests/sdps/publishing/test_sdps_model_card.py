@@ -189,6 +189,7 @@ def test_names_break_no_table(tmp_path: Path) -> None:
         ("upsfcn", "does not apply"),
         ("nenet-norm", "pixel's norm"),
         ("frames", "exchange what they show 4 times"),
+        ("anylight", "Nothing is assumed of the light but that it differs"),
     ],
 )
 def test_models_differ(tmp_path: Path, model: str, fact: str) -> None:
