@@ -97,9 +97,9 @@ def infer(
     """
     findings = tuple(check(photos)) if findings is None else findings
     stop(photos, findings, anyway)
-    known = photos.light_directions is not None, photos.intensities is not None
-    method, seen = choose_method(method, photos, photos.mask, lit_by, known[0], models, config)
-    runner = _runner(method, known, models, config, refine, len(photos), Flatness(flat, flatten))
+    known, wished = (photos.light_directions is not None, photos.intensities is not None), Flatness(flat, flatten)
+    method, seen = choose_method(method, photos, photos.mask, lit_by, known[0], models, config, wished)
+    runner = _runner(method, known, models, config, refine, len(photos), wished)
     forecast = workload(photos, runner, discontinuities=discontinuities)
     if not anyway:
         forecast.check()
@@ -117,9 +117,9 @@ def plan(
     flat: Wish = "auto", flatten: float = 0.0, lit_by: str = AUTO,
 ) -> Workload:  # fmt: skip
     """Return about what `infer` will take, in seconds and memory; arguments as of `infer`."""
-    known = photos.light_directions is not None, photos.intensities is not None
-    method, _ = choose_method(method, photos, photos.mask, lit_by, known[0], models, config)
-    runner = _runner(method, known, models, config, refine, len(photos), Flatness(flat, flatten))
+    known, wished = (photos.light_directions is not None, photos.intensities is not None), Flatness(flat, flatten)
+    method, _ = choose_method(method, photos, photos.mask, lit_by, known[0], models, config, wished)
+    runner = _runner(method, known, models, config, refine, len(photos), wished)
     return workload(photos, runner, discontinuities=discontinuities)
 
 
@@ -288,6 +288,7 @@ def choose_method(
     lit: bool,
     models: str | Path | None = None,
     config: InferenceConfig | None = None,
+    flat: Flatness = NOT_FLAT,
 ) -> tuple[str, tuple[Finding, ...]]:
     """Return the method that `auto` stands for where no lamp lights the images alone, else what was asked for.
 
@@ -297,6 +298,8 @@ def choose_method(
         lit_by: Of `LIT_BY`.
         lit: Light directions are given.
         models, config: As of `infer`.
+        flat: What is wished of flat things, which show no shadows under a lamp: one that is said to be flat counts as
+            lit by lamps.
 
     Returns:
         The method, and what is to be said of it.
@@ -316,7 +319,7 @@ def choose_method(
         find(ANY_LIGHT)
     except InputError:  # no weights
         return method, ()
-    if is_lit_by_lamps(images, mask, find, config):
+    if flat.asked or is_lit_by_lamps(images, mask, find, config):
         return method, ()
     text = (
         "Next to nothing of the object is in shadow in any picture: not one lamp lit it, but a room or several. So "

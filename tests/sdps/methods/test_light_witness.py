@@ -13,6 +13,7 @@ from sdps.api import choose_method
 from sdps.core.estimate import Estimate
 from sdps.data.augment import Augmentation
 from sdps.methods import light_witness, pretrained
+from sdps.methods.flat_things import Flatness
 from sdps.methods.light_witness import is_lit_by_lamps, measure_shadow
 from sdps.models.checkpoint import TrainedModel, save_weights
 from sdps.models.registry import create
@@ -82,6 +83,7 @@ def test_auto_takes_the_network_for_any_light_where_no_lamp_is_alone(
     assert choose_method("pf14", images, mask, "any", False, out) == ("pf14", ()), "a method is named"
     with pytest.raises(InputError, match=r"unknown lit_by 'lamps'; did you mean 'lamp'\?"):
         choose_method("auto", images, mask, "lamps", False, out)
+    assert choose_method("auto", images, mask, "auto", False, out, flat=Flatness("yes")) == ("auto", ())
     monkeypatch.setattr("sdps.api.is_lit_by_lamps", lambda *_: True)
     assert choose_method("auto", images, mask, "auto", False, out) == ("auto", ())
     assert choose_method("auto", images, mask, "any", False, out) == ("anylight", ())

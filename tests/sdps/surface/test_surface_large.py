@@ -147,8 +147,9 @@ def test_bands_of_images_are_the_whole_images(monkeypatch) -> None:
     whole = fit_albedo(*arguments)
     left = residuals(*arguments, whole)
     monkeypatch.setattr(relight, "_BAND", 640)  # ten rows
-    np.testing.assert_array_equal(fit_albedo(*arguments), whole)
+    # To rounding: how a product is summed depends on its size on some processors.
+    np.testing.assert_allclose(fit_albedo(*arguments), whole, rtol=3e-7)
     cut = residuals(*arguments, whole)
-    np.testing.assert_array_equal(cut.pixels, left.pixels)
+    np.testing.assert_allclose(cut.pixels, left.pixels, atol=2e-7)
     np.testing.assert_allclose(cut.images, left.images, rtol=1e-6)
     assert cut.overall == pytest.approx(left.overall, rel=1e-6)

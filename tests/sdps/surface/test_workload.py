@@ -34,7 +34,7 @@ def larger(photos: Photographs, height: int, width: int, count: int, share: floa
 
 
 def test_one_line_says_pixels_pictures_minutes_and_memory(photos: Photographs) -> None:
-    line = sdps.api.plan(larger(photos, 3000, 4000, 7, 0.18)).describe()
+    line = sdps.api.plan(larger(photos, 3000, 4000, 7, 0.18), lit_by="lamp").describe()
     assert re.fullmatch(
         r"2\.2 million pixels of object in 7 pictures of 4000x3000: about [\d.]+ (seconds|minutes|hours), up to "
         r"\d\.\d GiB of memory(; --scale 0\.5 would take about .*)?", line,
@@ -85,7 +85,7 @@ def test_flat_things_are_looked_at_once_more(photos: Photographs) -> None:
     once = 32 * 2000 * 3000 * 27e-9  # decoded and made linear
     assert once < found["flat"] < 4 * once
     assert "flat" not in sdps.api.plan(whole, flat="no").seconds
-    assert "flat" not in sdps.api.plan(larger(photos, 2000, 3000, 100, 0.5)).seconds
+    assert "flat" not in sdps.api.plan(larger(photos, 2000, 3000, 100, 0.5), lit_by="lamp").seconds
     assert "flat" in sdps.api.plan(larger(photos, 2000, 3000, 100, 0.5), flat="yes").seconds
     lit = replace(whole, light_directions=np.tile([[0.0, 0.0, 1.0]], (100, 1)).astype(np.float32))
     assert "flat" not in sdps.api.plan(lit).seconds
