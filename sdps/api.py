@@ -19,6 +19,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from tqdm import tqdm
@@ -40,7 +41,7 @@ from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
 from sdps.photos import Finding, Photographs, check, load
 from sdps.photos.faults import ANYWAY
 from sdps.photos.light_files.light_advice import advise
-from sdps.refinement.refine import FEWEST
+from sdps.refinement.problems import FEWEST
 from sdps.refinement.trust import FEWEST_IMAGES
 from sdps.surface.inferred import Inference, check_out
 from sdps.surface.workload import Workload, workload
@@ -55,6 +56,8 @@ _LEARNED = ("sdps-frames", "sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn
 _CALIBRATED = ("frames", "psfcn", "robust-least-squares")
 """Tried in this order; the parts may be trained or shipped one by one."""
 _FALLBACK = "pf14"
+_LAMPS_SEEN: WeakKeyDictionary[Photographs, dict[tuple[str, InferenceConfig | None], bool]] = WeakKeyDictionary()
+"""Of photographs that were looked at, by models and configuration, whether lamps lit them."""
 
 _log = logging.getLogger(__name__)
 
@@ -319,14 +322,25 @@ def choose_method(
         find(ANY_LIGHT)
     except InputError:  # no weights
         return method, ()
-    if flat.asked or is_lit_by_lamps(images, mask, find, config):
+    if flat.asked or _see_lamps(images, mask, models, config):
         return method, ()
     text = (
         "Next to nothing of the object is in shadow in any picture: not one lamp lit it, but a room or several. So "
-        "the normals are found by a network for any light, which finds no lights and no albedo. For better ones darken "
-        "the room and use one lamp; if you did, say so with --lit-by lamp."
+        "the normals are found by a network for any light, which finds no lights. For better ones darken the room and "
+        "use one lamp; if you did, say so with --lit-by lamp."
     )
     return chosen, (Finding("note", text),)
+
+
+def _see_lamps(
+    images: ImageSource, mask: np.ndarray, models: str | Path | None, config: InferenceConfig | None
+) -> bool:
+    """Return `is_lit_by_lamps`, of photographs once: `plan` asks, and so does `infer` after it."""
+    told = _LAMPS_SEEN.setdefault(images, {}) if isinstance(images, Photographs) else {}
+    key = str(models), config
+    if key not in told:
+        told[key] = is_lit_by_lamps(images, mask, _finder(models), config)
+    return told[key]
 
 
 def _estimate(runner: Runner, photos: Photographs, intensities: np.ndarray | None) -> Estimate:

@@ -75,14 +75,16 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _read_large(text: str) -> LargeConfig:
-    """Return the size of large photographs from a flag; argparse refuses what is none."""
+    """Return the size of large photographs from a flag; argparse refuses anything else."""
     width, height, pictures, share = (*text.lower().split("x"), str(LargeConfig.share), "", "")[:4]
     try:
         return LargeConfig(width=int(width), height=int(height), pictures=int(pictures), share=float(share))
     except InputError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size such as 6000x4000x100 or 6000x4000x100x0.1") from error
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a size such as 6000x4000x100 or 6000x4000x100x0.1"
+        ) from error
 
 
 def _large(args: argparse.Namespace, config: LargeConfig) -> int:

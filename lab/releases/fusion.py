@@ -34,8 +34,7 @@ _EXPECTED = 0.05
 
 
 def train(scenes: Sequence[Answered], epochs: int, width: int, seed: int) -> FusionNet:
-    """Return a network that has seen every scene that has evidence so many times, turned and cut at
-    random."""
+    """Return a network that has seen every scene with evidence so many times, turned and cut at random."""
     torch.manual_seed(seed)
     rng, network = np.random.default_rng(seed), FusionNet(width=width)
     given = [(prepare(scene.evidence), _truth(scene)) for scene in scenes if scene.evidence is not None]

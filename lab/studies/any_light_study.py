@@ -77,15 +77,18 @@ def photograph(scene: SceneSpec, store: SceneStore, light: str) -> Batch:
     return make_sample(scene, store.load(scene), options, generator(0, "any-light", light, scene.id))
 
 
+def unpack(scene: SceneSpec, sample: Batch) -> tuple[np.ndarray, np.ndarray, np.ndarray, Camera]:
+    """Return images (L, H, W, 3), mask (H, W) bool, true normals (H, W, 3) and the camera of what `photograph` gave."""
+    mask, truth = sample.mask[0].numpy() > 0.5, sample.normals.numpy().transpose(1, 2, 0)
+    images, lens = np.ascontiguousarray(sample.images.numpy().transpose(0, 2, 3, 1)), scene.view.camera_distance
+    return images, mask, truth, Camera(lens * mask.shape[1] / 2) if lens else Camera()
+
+
 def measure_scene(
     scene: SceneSpec, sample: Batch, light: str, methods: Sequence[str], models: Path | None
 ) -> Iterator[Row]:
     """Yield the errors of methods that see some of a rendered scene's images, and all."""
-    mask = sample.mask[0].numpy() > 0.5
-    images = np.ascontiguousarray(sample.images.numpy().transpose(0, 2, 3, 1))
-    truth = sample.normals.numpy().transpose(1, 2, 0)
-    lens = scene.view.camera_distance
-    camera = Camera(lens * _SIDE / 2) if lens else Camera()
+    images, mask, truth, camera = unpack(scene, sample)
     for count in COUNTS:
         for method in methods:
             error = measure(images[:count], mask, truth, method, camera=camera, models=models)
@@ -131,6 +134,12 @@ def read_rows(folder: Path) -> list[Row]:
     return [Row(**json.loads(line)) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
 
 
+def list_missing(rows: Sequence[Row], light: str, scene: str, images: int, methods: Sequence[str]) -> list[str]:
+    """Return the methods that have no row yet of a scene under a light with so many images."""
+    done = {row.method for row in rows if (row.light, row.scene, row.images) == (light, scene, images)}
+    return [method for method in methods if method not in done]
+
+
 def keep_rows(folder: Path, rows: Sequence[Row]) -> None:
     """Add rows to those of a folder, and say them."""
     with (folder / _ROWS).open("a", encoding="utf-8") as out:
@@ -156,8 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wanted = [(light, scene) for number in range(args.scenes) for light in LIGHTS
               for scene in chosen[light][number : number + 1]]  # fmt: skip
     for light, scene in wanted:
-        done = {row.method for row in rows if (row.light, row.scene, row.images) == (light, scene.id, COUNTS[-1])}
-        if missing := [method for method in args.methods if method not in done]:
+        if missing := list_missing(rows, light, scene.id, COUNTS[-1], args.methods):
             new = list(measure_scene(scene, photograph(scene, store, light), light, missing, args.models))
             rows += new
             keep_rows(args.out, new)

@@ -17,13 +17,12 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from lab.studies.any_light_study import choose, photograph
+from lab.studies.any_light_study import choose, photograph, unpack
 from pipelines.shared.text_tables import render_text
 from render.records.manifest import SceneSpec
 from render.shared.imaging.vectors import unit
 from render.shared.seeds import generator
 from sdps.api import estimate
-from sdps.core.geometry import Camera
 from sdps.core.metrics import angle_degrees
 from sdps.data.scene_store import SceneStore, list_finished
 from sdps.refinement.surroundings.low_order import refine_low_order
@@ -73,9 +72,7 @@ def disturb(normals: np.ndarray, mask: np.ndarray, rng: np.random.Generator, deg
 def measure(scene: SceneSpec, store: SceneStore, light: str, counts: Sequence[int], method: str) -> list[Gain]:
     """Return what refinement gains on a scene; without a method, from disturbed normals."""
     sample, found = photograph(scene, store, light), []
-    mask, normals = sample.mask[0].numpy() > 0.5, sample.normals.numpy().transpose(1, 2, 0)
-    images = np.ascontiguousarray(sample.images.numpy().transpose(0, 2, 3, 1))
-    camera = Camera(scene.view.camera_distance * mask.shape[1] / 2) if scene.view.camera_distance else Camera()
+    images, mask, normals, camera = unpack(scene, sample)
     for count in counts:
         some, expected = images[:count], None
         if method:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.studies.any_light_study import METHODS, Row, keep_rows, measure, read_rows, summarise
+from lab.studies.any_light_study import METHODS, Row, keep_rows, list_missing, measure, read_rows, summarise
 from pipelines.evaluate.benchmarks.diligent import DiligentConfig, diligent_objects
 from pipelines.evaluate.evaluation import TestObject
 from render.shared.seeds import generator
@@ -40,10 +40,16 @@ def mix(images: np.ndarray, count: int, together: int, name: str) -> np.ndarray:
     return found
 
 
-def measure_object(item: TestObject, light: str, methods: Sequence[str], models: Path | None) -> Iterator[Row]:
-    """Yield the errors of methods on an object under a kind of light, for all numbers of images."""
-    loaded = item.load()
-    images = np.asarray(loaded[0 : len(loaded)])
+def read_all(item: TestObject) -> np.ndarray:
+    """Return all images (L, H, W, 3) of an object."""
+    source = item.load()
+    return np.asarray(source[0 : len(source)])
+
+
+def measure_object(
+    item: TestObject, images: np.ndarray, light: str, methods: Sequence[str], models: Path | None
+) -> Iterator[Row]:
+    """Yield the errors of methods on an object, its images (L, H, W, 3) under a kind of light, all numbers of them."""
     assert item.normals is not None
     for count in COUNTS:
         seen = mix(images, min(count, len(images)), MIXED[light], item.name)
@@ -62,10 +68,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     rows = read_rows(args.out)
     for item in diligent_objects(args.data, DiligentConfig(focal=_FOCAL)):
+        images: np.ndarray | None = None
         for light in MIXED:
-            done = {row.method for row in rows if (row.light, row.scene, row.images) == (light, item.name, COUNTS[-1])}
-            if missing := [method for method in args.methods if method not in done]:
-                new = list(measure_object(item, light, missing, args.models))
+            if missing := list_missing(rows, light, item.name, COUNTS[-1], args.methods):
+                images = read_all(item) if images is None else images
+                new = list(measure_object(item, images, light, missing, args.models))
                 rows += new
                 keep_rows(args.out, new)
     sys.stdout.write(summarise(rows, args.methods, MIXED, COUNTS))

@@ -28,7 +28,7 @@ from sdps.methods.relief_sides import TURN, tell_side
 Wish = Literal["auto", "yes", "no", "turned"]
 SHARE = 0.25
 """Share of the width that the mean slope is taken over, where slopes are flattened."""
-COVERS = 0.97
+_COVERS = 0.97
 """Share of the frame from which on a mask covers it."""
 _THICKEST = 0.2
 """Height, over the longer side, above which what covers the frame is not flat."""
@@ -69,7 +69,7 @@ class Flatness:
 
     def may_apply(self, mask: np.ndarray, *, lit: bool) -> bool:
         """Return whether `applies` may say yes, before normals (H, W, 3) of the mask (H, W) are found."""
-        return self.asked or (self.wish == "auto" and not lit and float(mask.mean()) >= COVERS)
+        return self.asked or (self.wish == "auto" and not lit and covers_frame(mask))
 
     def applies(self, mask: np.ndarray, normals: np.ndarray, *, lit: bool) -> bool:
         """Return whether the mean plane of what was found is to face the camera.
@@ -120,9 +120,14 @@ class Flatness:
 NOT_FLAT = Flatness("no")
 
 
+def covers_frame(mask: np.ndarray) -> bool:
+    """Return whether a mask (H, W) covers the frame."""
+    return float(mask.mean()) >= _COVERS
+
+
 def is_flat(mask: np.ndarray, normals: np.ndarray) -> bool:
     """Return whether a mask (H, W) covers the frame, and normals (H, W, 3) are those of something thin."""
-    if mask.mean() < COVERS:
+    if not covers_frame(mask):
         return False
     small, inside = _reduce(normals, mask)
     small = small - small[inside].mean(axis=0)

@@ -12,7 +12,8 @@ from sdps.core.estimate import Estimate
 from sdps.core.intensities import grey, scale_to_mean
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
-from sdps.methods.flat_things import COVERS
+from sdps.inference.stray_light import find_shadow
+from sdps.methods.flat_things import covers_frame
 from sdps.methods.given_lights import (
     LightFit,
     carry_intensities,
@@ -34,8 +35,8 @@ ANY_LIGHT = "anylight"
 """The model that is told nothing of the light."""
 _LOOKED = 16
 """Images that are looked at, spread over all."""
-_BRIGHT, _SHADOW = 75.0, 0.1
-"""A pixel is in shadow where it has less than this share of its bright values, a percentile over the images."""
+_SHADOW = 0.1
+"""A pixel is in shadow where it has less than this share of its bright values."""
 _IN_SHADOW, _DOUBT, _MISFIT = 0.04, 5.0, 0.1
 """Share of the object in shadow, mean error to expect of the lights in degrees, and what Lambert's law leaves
 unexplained, from which on the witnesses speak for lamps, and against them (docs/studies/stray-light.md)."""
@@ -55,26 +56,19 @@ def is_lit_by_lamps(
     Args:
         images, mask, find, config: As for `see_lights`.
     """
-    if mask.mean() >= COVERS:
+    if covers_frame(mask):
         return True
     numbers = np.unique(np.linspace(0, len(images) - 1, _LOOKED).round().astype(int)).tolist()
     read, share = read_small(images, mask, numbers, INPUT_SIZE)
     inside = share > (0.5 if (share > 0.5).any() else 0.0)
     small = np.where(inside[..., None], read / np.maximum(share, 1e-6)[..., None], np.float32(0.0))
-    if measure_shadow(small[:, inside].mean(-1)) >= _IN_SHADOW:
+    if find_shadow(small[:, inside].mean(-1), _SHADOW).mean() >= _IN_SHADOW:
         return True
     seen = see_lights(small, inside, find, config)
     if seen is None or seen.expected_light_error is None or float(seen.expected_light_error.mean()) < _DOUBT:
         return True
     strengths = scale_to_mean(grey(seen.intensities.astype(np.float64)))
     return measure_misfit(reduce_images(small, inside), seen.light_directions.astype(np.float64), strengths) < _MISFIT
-
-
-def measure_shadow(values: np.ndarray) -> float:
-    """Return the share of grey values (L, P) of an object that are in shadow: dark beside the pixel's bright ones."""
-    relative = values / np.maximum(values.mean(axis=1, keepdims=True), 1e-12)
-    bright = np.percentile(relative, _BRIGHT, axis=0)
-    return float((relative < _SHADOW * bright).mean())
 
 
 def see_lights(

@@ -13,11 +13,23 @@ from sdps.refinement.descent import Problem
 from sdps.refinement.image_model import State, build_model, find_shadows
 from sdps.refinement.sites import select_grid
 
+FEWEST = 4
+"""With fewer images nothing is refined."""
 _LIT_SHARE = 0.1
 _LEAST_ALBEDO = 1e-3
 _PART = 4096  # pixels worked on at once where arrays of all images are made
 CACHE_BYTES = 2**30
 """Pixels are kept in memory up to this size; above it, in a temporary file."""
+
+
+def check_start(count: int, mask: np.ndarray, normals: np.ndarray) -> None:
+    """Refuse too few images, and normals (H, W, 3) that are not those of a mask (H, W)."""
+    if count < FEWEST:
+        raise InputError(f"refinement needs at least {FEWEST} images, got {count}")
+    if normals.shape != (*mask.shape, 3):
+        raise InputError(
+            f"refinement: mask {mask.shape} and normals {normals.shape} do not fit; give normals per pixel"
+        )
 
 
 def gather_pixels(scene: ObjectImages, which: np.ndarray) -> np.ndarray:  # (P, 3, L) float32

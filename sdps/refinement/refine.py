@@ -21,13 +21,11 @@ from sdps.inference.tiles import Tile, release_memory, tiles
 from sdps.refinement.descent import Problem, Weights, measure_fit, solve
 from sdps.refinement.fine import collect, upsample
 from sdps.refinement.image_model import Model, Refined, State, build_model
-from sdps.refinement.problems import build_problem, estimate_log_albedo, gather_pixels
+from sdps.refinement.problems import build_problem, check_start, estimate_log_albedo, gather_pixels
 from sdps.refinement.reflectance import LOBES, MODES, SHAPES
 from sdps.refinement.shape.transport import trace
 from sdps.refinement.sites import Grid, Sites
 
-FEWEST = 4
-"""With fewer images nothing is refined."""
 _OF_PIXELS = frozenset({"normals", "log_albedo", "log_strength"})
 _SHARPEST, _BROADEST = 300.0, 10.0
 _START_HEIGHT = -4.0
@@ -151,12 +149,7 @@ def _check(
     count: int, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray
 ) -> np.ndarray:
     """Return the intensities (L, 3), if all sizes fit."""
-    if count < FEWEST:
-        raise InputError(f"refinement needs at least {FEWEST} images, got {count}")
-    if normals.shape != (*mask.shape, 3):
-        raise InputError(
-            f"refinement: mask {mask.shape} and normals {normals.shape} do not fit; give normals per pixel"
-        )
+    check_start(count, mask, normals)
     if lights.shape != (count, 3) or len(intensities) != count:
         raise InputError(f"refinement: {count} images, but {len(lights)} lights and {len(intensities)} intensities")
     return per_channel(intensities)

@@ -190,10 +190,15 @@ def _find_turn(lights: np.ndarray, start: Estimate) -> str:
     return f"it turned the lights by {turned:.0f} degrees, which the network expects to be off by only {expected:.0f}"
 
 
+def are_even(normals: np.ndarray) -> bool:
+    """Return whether normals (P, 3) are those of a flat object: they hardly spread."""
+    return float(np.sqrt(np.square(normals - normals.mean(axis=0)).sum(axis=1).mean())) < _FLAT
+
+
 def _find_blindness(mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, *, tilted: bool = True) -> str:
     """Return why photographs such as these cannot show the shape, or nothing; `tilted`: its tilt is not known."""
     if np.linalg.svd(lights, compute_uv=False)[-1] / np.sqrt(len(lights)) < _PLANE:
         return "the lights lie in one plane with the object, so photographs cannot show its shape"
-    if tilted and np.sqrt(np.square(normals[mask] - normals[mask].mean(axis=0)).sum(axis=1).mean()) < _FLAT:
+    if tilted and are_even(normals[mask]):
         return "the object is flat, so photographs cannot show its tilt apart from the lights' directions"
     return ""

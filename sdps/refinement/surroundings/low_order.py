@@ -23,22 +23,19 @@ from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.inference.tiles import Tile, release_memory, tiles
 from sdps.refinement.fine import make_interpolator
-from sdps.refinement.problems import allocate
+from sdps.refinement.problems import allocate, check_start
 from sdps.refinement.shape.priors import find_neighbours, measure_curl
 from sdps.refinement.sites import Grid
 from sdps.refinement.surroundings import light_fit
 from sdps.refinement.surroundings.hidden import find_hidden
 from sdps.refinement.surroundings.light_fit import Fit, Pixels
+from sdps.refinement.trust import are_even
 
-FEWEST = 4
-"""With fewer images nothing is refined."""
 MOST = 32
 """Of more images, so many are taken, evenly."""
 TILE_PIXELS = 200_000
 """Pixels of a tile and its halo: 0.4 GiB under `MOST` images."""
 _HALO = 16
-_FLAT = 0.1
-"""An object is taken to be flat if its normals spread by less, root mean square."""
 _USUAL_IMAGES, _USUAL_MISFIT, _USUAL_ERROR = 16, 4e-3, 10.0
 """With fewer images, or a larger misfit, photographs count less against the start; with larger errors, more."""
 _LEAST_MISFIT = 2e-4
@@ -285,7 +282,7 @@ def predict_error(errors: np.ndarray, misfit: float) -> np.ndarray:
 
 def find_doubt(normals: np.ndarray, misfit: tuple[float, float]) -> str:
     """Return why the start, normals (P, 3), is to be kept, or nothing."""
-    if np.sqrt(np.square(normals - normals.mean(axis=0)).sum(axis=1).mean()) < _FLAT:
+    if are_even(normals):
         return "the object is flat, so photographs cannot show its tilt apart from the light"
     if not misfit[1] <= misfit[0]:
         return f"refinement explains the photographs no better: misfit {misfit[1]:.4f}, {misfit[0]:.4f} without it"
@@ -293,12 +290,10 @@ def find_doubt(normals: np.ndarray, misfit: tuple[float, float]) -> str:
 
 
 def _check(count: int, mask: np.ndarray, normals: np.ndarray, expected: np.ndarray) -> None:
-    if count < FEWEST:
-        raise InputError(f"refinement needs at least {FEWEST} images, got {count}")
-    if normals.shape != (*mask.shape, 3) or expected.shape != mask.shape:
+    check_start(count, mask, normals)
+    if expected.shape != mask.shape:
         raise InputError(
-            f"refinement: mask {mask.shape}, normals {normals.shape} and expected errors {expected.shape} do not fit; "
-            "give both per pixel"
+            f"refinement: mask {mask.shape} and expected errors {expected.shape} do not fit; give one per pixel"
         )
     if not (np.isfinite(normals[mask]).all() and np.isfinite(expected[mask]).all()):
         raise InputError("refinement: normals or expected errors contain NaN or infinity inside the mask")

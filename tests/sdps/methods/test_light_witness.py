@@ -12,9 +12,10 @@ from render.shared.errors import InputError
 from sdps.api import choose_method
 from sdps.core.estimate import Estimate
 from sdps.data.augment import Augmentation
+from sdps.inference.stray_light import find_shadow
 from sdps.methods import light_witness, pretrained
 from sdps.methods.flat_things import Flatness
-from sdps.methods.light_witness import is_lit_by_lamps, measure_shadow
+from sdps.methods.light_witness import is_lit_by_lamps
 from sdps.models.checkpoint import TrainedModel, save_weights
 from sdps.models.registry import create
 
@@ -66,9 +67,9 @@ def test_three_witnesses_speak_against_a_lamp(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_ball_under_lamps_has_a_share_in_shadow_and_one_in_a_room_has_none() -> None:
     images, mask = shade(RING, 0.0)
-    assert 0.05 < measure_shadow(images[:, mask].mean(-1)) < 0.3
+    assert 0.05 < find_shadow(images[:, mask].mean(-1), 0.1).mean() < 0.3
     images, mask = shade(RING, 0.5)
-    assert measure_shadow(images[:, mask].mean(-1)) == 0.0
+    assert find_shadow(images[:, mask].mean(-1), 0.1).mean() == 0.0
 
 
 def test_auto_takes_the_network_for_any_light_where_no_lamp_is_alone(
@@ -112,3 +113,13 @@ def test_photographs_in_a_lit_room_are_not_taken_for_those_of_a_lamp(
     assert any("in shadow" in finding.text for finding in found.findings)
     assert sdps.plan(photos, models=out).method == "anylight"
     assert sdps.plan(photos, models=out, lit_by="lamp").method != "anylight"
+
+
+def test_photographs_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    images, mask = shade(RING, 1.0)
+    photos, asked = sdps.load(folders.write_folder(tmp_path / "photos", 0.4 * images, mask)), []
+    monkeypatch.setattr("sdps.api.is_lit_by_lamps", lambda *_: asked.append(1) or True)
+    out = write_weights(tmp_path / "out")
+    sdps.plan(photos, models=out)
+    sdps.plan(photos, models=out)
+    assert len(asked) == 1

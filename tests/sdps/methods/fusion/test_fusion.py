@@ -20,7 +20,8 @@ from sdps.methods.parse import parse
 from sdps.methods.pretrained import require
 from sdps.methods.runner import Runner
 from sdps.refinement.image_model import Refined
-from sdps.refinement.refine import FEWEST, RefineConfig, refine
+from sdps.refinement.problems import FEWEST
+from sdps.refinement.refine import RefineConfig, refine
 from sdps.refinement.trust import RefinedEstimate
 
 
