@@ -1,6 +1,6 @@
 """What a method returns, learned or classical, and what it is worth."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -88,6 +88,13 @@ class Estimate:
     tilt: float | None = field(default=None, kw_only=True)
     side_by: str = field(default="", kw_only=True)
     turned: bool = field(default=False, kw_only=True)
+
+    def without_lights(self) -> "Estimate":
+        """Return it without its lights: no lamps lit the images, but light from where these say on average."""
+        return replace(
+            self, light_directions=np.zeros((0, 3), np.float32), intensities=np.zeros(0, np.float32),
+            expected_light_error=None, nearness=None, confidence=None,
+        )  # fmt: skip
 
 
 def constant_estimate(count: int, mask: np.ndarray) -> Estimate:

@@ -117,14 +117,12 @@ class NormalCriterion:
         gradient_weight: Weight of `normal_gradient_loss`.
         lighting_weight: Weight of the loss of lights, for networks that learn them too.
         expected_weight: Weight of the loss of the expected error, for networks that predict it.
-        shading_weight: Weight of the loss of each image's shading, for networks that predict it.
     """
 
     kind: Literal["masked", "faithful", "chord"] = "masked"
     gradient_weight: float = 0.0
     lighting_weight: float = 0.1
     expected_weight: float = 0.02
-    shading_weight: float = 0.0
 
     def __call__(self, normals: Tensor, truth: Tensor, mask: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of estimated normals alone, and its named parts.

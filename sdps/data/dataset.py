@@ -20,7 +20,6 @@ from render.records.mirror import describe_packing
 from render.shared.errors import InputError
 from render.shared.imaging.mixing import LightStage, mix, require_enough
 from render.shared.seeds import generator
-from sdps.core.lighting import harmonics
 from sdps.core.symmetry import Symmetry
 from sdps.data.augment import Augmentation, augment
 from sdps.data.sample_geometry import Layout, lay_out, place
@@ -43,7 +42,6 @@ class Batch(NamedTuple):
     nearness: Tensor  # (B, Q) float32, rho of the lamps (`sdps.core.geometry`), 0 of distant ones
     places: Tensor  # (B, 3, S, S) float32, where pixels lie, in the object's radii from its middle; 0 outside the mask
     sights: Tensor  # (B, 3, S, S) float32, towards the camera, z = 1
-    light: Tensor  # (B, Q, 9) float32, spherical harmonics of the light of each image, the first 1
 
     def to(self, device: torch.device) -> "Batch":
         """Copy every tensor to `device`."""
@@ -172,21 +170,24 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     """
     # A child of the stream, so that the number does not depend on how much the sample draws.
     seed = int(rng.spawn(1)[0].integers(2**63))
-    images, directions, chosen, weights = _draw_images(scene, stored.images, options, rng)
-    normals, mask, lamps = stored.normals, stored.mask, scene.light_directions()
+    images, chosen, weights = _draw_images(scene, stored.images, options, rng)
+    normals, mask, directions = stored.normals, stored.mask, scene.light_directions()[chosen]
     layout = lay_out(scene, stored.depth, mask, chosen)
     if options.augmentation.symmetries:
         symmetry = Symmetry(int(rng.integers(4)), bool(rng.integers(2)))
         images, normals, mask = symmetry.images(images, 1), symmetry.images(normals, 0), symmetry.images(mask, 0)
         normals, directions, layout = symmetry.vectors(normals), symmetry.vectors(directions), layout.turn(symmetry)
-        lamps = symmetry.vectors(lamps)
     if options.rescale and min(mask.shape) > options.size:
         images, normals, mask, layout = _rescale(images, normals, mask, layout, options, rng)
     images, normals, mask, layout = resize(images, normals, mask, layout, options.size)
     placed = place(layout, mask, directions)
-    if layout.positions is not None:
+    if weights is not None:
+        placed = placed.mix(weights)
+    elif layout.positions is not None:
         images = images / placed.irradiance[:, None, None, None]
     images, intensities = augment(images, mask, options.augmentation, rng)
+    if weights is not None:
+        intensities = intensities * placed.irradiance
     corner = _crop_corner(mask, options.crop, options.min_object, rng) if options.crop else (0, 0)
     return Batch(
         images=_channels_first(images),
@@ -199,14 +200,7 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
         nearness=torch.from_numpy(placed.nearness),
         places=_channels_first(placed.places),
         sights=_channels_first(placed.sights),
-        light=torch.from_numpy(_light(lamps, weights, placed.directions)),
     )
-
-
-def _light(lamps: np.ndarray, weights: np.ndarray | None, directions: np.ndarray) -> np.ndarray:  # (Q, 9) float32
-    """Return the harmonics of the light of images that have shares (Q, L) of lamps (L, 3), or one lamp each (Q, 3)."""
-    light = harmonics(directions) if weights is None else weights @ harmonics(lamps)
-    return (light / light[:, :1]).astype(np.float32)
 
 
 def _channels_first(pictures: np.ndarray) -> Tensor:  # (..., 3, H, W) float32
@@ -216,33 +210,21 @@ def _channels_first(pictures: np.ndarray) -> Tensor:  # (..., 3, H, W) float32
 
 def _draw_images(
     scene: SceneSpec, images: np.ndarray | PackedImages, options: SampleOptions, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Return images (Q, H, W, 3) float32, directions (Q, 3), and which of a scene they are, or their mixtures.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return images (Q, H, W, 3) float32, and which lights of the scene are meant: one each, without shares of them.
 
-    That is the share of each light of the scene in them, (Q, L); one of the two is None.
+    Images of mixed light have shares (Q, L) of all lights.
     """
-    directions = scene.light_directions()
+    directions, mixed = scene.light_directions(), options.augmentation.mixed
     if len(images) != len(directions):
         raise InputError(f"scene {scene.id}: {len(images)} images for {len(directions)} lights; render it again")
-    if options.augmentation.mixed is not None:
-        mixed, towards, weights = _mix(scene, images, options, rng)
-        return mixed, towards, None, weights
-    chosen = choose_images(directions, options, rng)
-    return images[chosen].astype(np.float32), directions[chosen], chosen, None
-
-
-def _mix(
-    scene: SceneSpec, images: np.ndarray | PackedImages, options: SampleOptions, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return images (Q, H, W, 3) float32 under mixed light, the directions (Q, 3) it comes from on average, and the
-    share of each light in it, (Q, L).
-    """
-    assert options.augmentation.mixed is not None
-    mixed = options.augmentation.mixed
-    stage = LightStage(scene.light_directions(), f"scene {scene.id}", sparse=mixed.sparse)
+    if mixed is None:
+        chosen = choose_images(directions, options, rng)
+        return images[chosen].astype(np.float32), chosen, None
+    stage = LightStage(directions, f"scene {scene.id}", sparse=mixed.sparse)
     weights, _ = mixed.draw(stage, options.images, rng)
     packed = PackedImages.of(images)
-    return PackedImages(mix(packed.values, weights), packed.kept)[:], stage.mean_directions(weights), weights.mean(-1)
+    return PackedImages(mix(packed.values, weights), packed.kept)[:], np.arange(len(directions)), weights.mean(-1)
 
 
 def choose_images(directions: np.ndarray, options: SampleOptions, rng: np.random.Generator) -> np.ndarray:  # (Q,)

@@ -13,6 +13,9 @@ from render.records.manifest import SceneSpec
 from render.records.view_geometry import image_points, incident
 from sdps.core.symmetry import Symmetry
 
+_FAINTEST = 0.05
+"""Irradiance, over pi, of a lamp that stands for light from everywhere, at least."""
+
 
 class Layout(NamedTuple):
     """Pixels of a sample, and its lamps; camera frame, half image widths of the scene.
@@ -60,14 +63,27 @@ class Placed(NamedTuple):
     nearness: np.ndarray
     irradiance: np.ndarray
 
+    def mix(self, weights: np.ndarray) -> "Placed":
+        """Return the lamps that stand for mixed light: of L lamps, each image has shares (Q, L).
 
-def lay_out(scene: SceneSpec, depth: np.ndarray, mask: np.ndarray, chosen: np.ndarray | None) -> Layout:
-    """Return the layout of a scene's pixels (H, W), and of the lamps `chosen`; None: light that is mixed."""
-    positions = None if chosen is None else scene.light_positions()
+        What faces all lamps is lit by their vectors' sum as by a lamp of that direction and irradiance. How near it is
+        is the mean of its parts.
+        """
+        strengths = (weights * self.irradiance).astype(np.float64)
+        vectors = strengths @ self.directions
+        lengths = np.linalg.norm(vectors, axis=1).clip(_FAINTEST)
+        nearness = strengths @ self.nearness / strengths.sum(axis=1)
+        mixed = (vectors / lengths[:, None], nearness, lengths)
+        return Placed(self.places, self.sights, *(part.astype(np.float32) for part in mixed))
+
+
+def lay_out(scene: SceneSpec, depth: np.ndarray, mask: np.ndarray, chosen: np.ndarray) -> Layout:
+    """Return the layout of a scene's pixels (H, W), and of the lamps `chosen`."""
+    positions = scene.light_positions()
     return Layout(
         image=image_points(mask.shape), depth=np.where(mask, depth, 0.0).astype(np.float64),
         camera=scene.view.camera_distance or np.inf,
-        positions=None if positions is None or chosen is None else positions[chosen].astype(np.float64),
+        positions=None if positions is None else positions[chosen].astype(np.float64),
         reference=np.array([*scene.view.offset, 0.0]),
     )  # fmt: skip
 

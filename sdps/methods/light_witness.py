@@ -32,7 +32,7 @@ _ASKED = ("sdps-frames", "sdps-plus", "sdps")
 """Combinations whose lighting network is asked, the first whose weights are there."""
 _FEWEST = 3
 ANY_LIGHT = "anylight"
-"""The model that is told nothing of the light."""
+"""The combination that assumes nothing of the light."""
 _LOOKED = 16
 """Images that are looked at, spread over all."""
 _SHADOW = 0.1

@@ -92,18 +92,19 @@ def finish(method: Method, last: str, find: Callable[[str], Path]) -> Method:
         return replace(method, name=f"{method.name}, refined", refined=True, paper="")
     if not can_fuse(method, find):
         raise InputError(
-            f"method {method.name}+{last}: want a network that is given lights and tells its errors, as "
+            f"method {method.name}+{last}: want a network that is given lamps and tells its errors, as "
             f"sdps-frames+{last}"
         )
     return replace(method, name=f"{method.name}, fused", refined=True, fused=True, paper="")
 
 
 def can_fuse(method: Method, find: Callable[[str], Path]) -> bool:
-    """Return whether a network that is given lights finds the normals, and tells the errors to expect of them."""
+    """Return whether a network that is given lamps finds the normals, and tells the errors to expect of them."""
     if method.normals in (NONE, *CLASSICAL):
         return False
-    build = MODELS[model_of(method.normals, find)].build
-    return getattr(build, "tells_errors", False) and getattr(build, "needs_lights", True)
+    model = MODELS[model_of(method.normals, find)]
+    told = getattr(model.build, "tells_errors", False) and getattr(model.build, "needs_lights", True)
+    return told and not model.any_light
 
 
 def uses_networks(method: Method) -> bool:

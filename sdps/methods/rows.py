@@ -50,7 +50,7 @@ def lighting_methods(
         ways: Those of `normal_methods`: where only some shipped ones are wanted, their lights are.
         shipped: Shipped ways that are wanted.
     """
-    names = [name for name, item in MODELS.items() if item.role == "lighting"]
+    names = [name for name, item in MODELS.items() if item.role == "lighting" and not item.any_light]
     names += [name for name in own if name not in names]
     trained = [name for name in names if pretrained.trained_file(out, name).is_file()]
     methods = [Method(name=name, lighting=name, paper=MODELS[name].paper if name in MODELS else "") for name in trained]
@@ -108,7 +108,7 @@ def _every_row() -> list[Method]:
     """Return the tables' rows, and after them the combinations that average over views."""
     rows = [join(lighting, normals, paper=paper) for lighting, normals, paper in NORMAL_ROWS]
     for name, pair in COMBINATIONS.items():
-        if pair.light_views or pair.normal_views:
+        if (pair.light_views or pair.normal_views) and not MODELS[pair.normals].any_light:
             rows.append(join(pair.lighting, pair.normals, combination=name))
     return rows
 

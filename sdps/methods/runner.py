@@ -24,7 +24,7 @@ from sdps.inference.inference_config import InferenceConfig
 from sdps.methods.flat_things import NOT_FLAT, Flatness
 from sdps.methods.method import CONSTANT, NONE, VIEWS, Method
 from sdps.methods.on_box import Box
-from sdps.models.registry import TRUE_LIGHTS
+from sdps.models.registry import MODELS, TRUE_LIGHTS
 
 if TYPE_CHECKING:
     from sdps.methods.fusion.evidence import Evidence
@@ -55,6 +55,9 @@ class Runner:
         refining: How it is refined, if it is.
         flat: What is done with flat things.
 
+    Attributes:
+        any_light: It sees images under any light, and tells no lights.
+
     Raises:
         InputError: weights that are missing, damaged, or of another role.
     """
@@ -76,6 +79,8 @@ class Runner:
             self.estimator = Estimator(
                 lighting=lighting, normals=normals, device=default_device(), **self.config.options()
             )
+        found = normals is not None and method.lighting != TRUE_LIGHTS
+        self.any_light = found and MODELS[normals.name].any_light
 
     def identity(self) -> str:
         """Return a digest of what results depend on besides images and code: weights, settings and arithmetic."""
@@ -125,6 +130,8 @@ class Runner:
         if TRUE_LIGHTS in (method.lighting, method.intensities) and intensities is not None:
             given["intensities"] = intensities
         estimate, lit = self._estimate(images, mask, given, found, rig), given.get("lights") is not None
+        if self.any_light:
+            estimate = estimate.without_lights()
         if self.flat.applies(mask, estimate.normals, lit=lit):
             estimate = self.flat.begin(estimate, mask, lit=lit, images=images)
         if method.refined:

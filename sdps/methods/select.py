@@ -24,7 +24,8 @@ def lighting_rows(out: Path | None) -> list[Method]:
     find = finder(out)
 
     def tells_lights(name: str) -> bool:
-        return MODELS[model_of(name, find)].role == "lighting"
+        model = MODELS[model_of(name, find)]
+        return model.role == "lighting" and not model.any_light
 
     names = [name for name in pretrained.list_trained(out) if tells_lights(name)]
     names = sorted(names, key=lambda name: (list(MODELS).index(name) if name in MODELS else len(MODELS), name))

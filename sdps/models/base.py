@@ -160,7 +160,6 @@ class Truth(NamedTuple):
     mask: Tensor  # (B, 1, H, W), 0 or 1
     directions: Tensor  # (B, Q, 3), unit
     intensities: Tensor  # (B, Q)
-    light: Tensor | None = None  # (B, Q, 9), spherical harmonics of each image's light
 
 
 class FusionNetwork(NormalNetwork, ABC):

@@ -97,16 +97,12 @@ class LightAttention(nn.Module):
     def forward(self, tokens: Tensor) -> Tensor:
         """Return tokens (N, Q, C) that have seen each other; their order does not matter."""
         query, key, value = self.ask(self.norm(tokens)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        heard = attend(query, key, value)
+        if torch.is_grad_enabled() and query.device.type == "cpu":  # torch's own is slow backwards in bfloat16 there
+            shares = (query @ key.transpose(-1, -2) * key.shape[-1] ** -0.5).softmax(dim=-1)
+            heard = shares.to(value.dtype) @ value
+        else:
+            heard = functional.scaled_dot_product_attention(query, key, value)
         return tokens + self.answer(heard.transpose(1, 2).flatten(2))
-
-
-def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-    """Return what queries (..., n, C) hear of keys and values (..., K, C)."""
-    if torch.is_grad_enabled() and query.device.type == "cpu":  # torch's own is slow backwards in bfloat16 there
-        shares = (query @ key.transpose(-1, -2) * key.shape[-1] ** -0.5).softmax(dim=-1)
-        return shares.to(value.dtype) @ value
-    return functional.scaled_dot_product_attention(query, key, value)
 
 
 def pool(tokens: Tensor) -> Tensor:

@@ -89,20 +89,46 @@ class StagedNormals(NamedTuple):
     expected: Tensor  # (B, 1, H, W), distance to the true normals
 
 
-class CorrectedNetwork(FusionNetwork):
-    """Normals of pixels alone, corrected by their surroundings: a U-Net sees the fused map. Adds `_build_map`."""
+class FrameNet(FusionNetwork):
+    """Normals pixel by pixel in frames of their own, then corrected by their surroundings.
+
+    Args:
+        width: C, channels of a light of a pixel.
+        blocks: Layers in which the lights of a pixel exchange what they show.
+        frame: `normal` for the frame of the first normal; `camera` leaves directions as they are, to compare.
+        heads: Of the attention across the lights of a pixel, after the last `attending` of the blocks; 0 for none.
+        attending: Layers of attention.
+        context: Channels of `Surroundings` at an eighth of the resolution, a multiple of 4; 0 for none.
+    """
+
+    added = ("attend", "surroundings")
 
     needs_mask = True
     kept_bytes = 6
+    equivariant = True
     sees_places = True
     tells_errors = True
-    shared = ("feature", "enter", "smaller", "quarter", "surroundings", "back", "leave")
-    """Parts that networks of all kinds have: training of one may start from another's."""
 
-    def _build_map(self, context: int) -> None:
-        """Add the layers from pixels' features of 128 channels to normals and errors; `context` as in `FrameNet`."""
+    def __init__(
+        self, *, width: int = 64, blocks: int = 4, frame: str = "normal", heads: int = 0, attending: int = 2,
+        context: int = 0,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        if blocks < 1 or width < 1:
+            raise InputError(f"width and blocks must be at least 1, got {width} and {blocks}")
+        if heads < 0 or (heads and (width % heads or not 0 <= attending <= blocks)):
+            raise InputError(f"heads must divide width, and attending be 0 to blocks, got {heads} and {attending}")
         if context < 0 or context % 4:
             raise InputError(f"context must be a multiple of 4, or 0, got {context}")
+        if frame not in FRAMES:
+            raise unknown("frame", str(frame), FRAMES)
+        self.frame = frame
+        self.seen, self.known = nn.Linear(_SEEN, width), nn.Linear(_KNOWN, width)
+        self.exchange = nn.Sequential(*(Exchange(width) for _ in range(blocks)))
+        self.attend = nn.ModuleList(LightAttention(width, heads) for _ in range(attending if heads else 0))
+        self.fuse = nn.Sequential(
+            nn.Linear(2 * width + _KNOWN, 128), nn.LeakyReLU(SLOPE), nn.Linear(128, 128), nn.LeakyReLU(SLOPE)
+        )
         self.offset, self.feature = nn.Linear(128, 3), nn.Linear(128, _MAP)
         self.enter = nn.Sequential(conv(_MAP + 4, 64), conv(64, 64))
         self.smaller = nn.Sequential(conv(64, 96, stride=2), conv(96, 96))
@@ -123,15 +149,25 @@ class CorrectedNetwork(FusionNetwork):
 
     def loss(self, seen: Observations, truth: Truth, criterion: NormalCriterion) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the losses of the normals at both stages plus, weighted, that of the expected error."""
-        return staged_loss(self.predict_stages(seen), truth, criterion)
+        stages = self.predict_stages(seen)
+        loss, terms = criterion(stages.normals, truth.normals, truth.mask)
+        terms["pixel_loss"], _ = criterion(stages.alone, truth.normals, truth.mask)
+        terms["expected_loss"] = expected_error_loss(stages.expected, stages.normals, truth.normals, truth.mask)
+        return loss + terms["pixel_loss"] + criterion.expected_weight * terms["expected_loss"], terms
 
-    def to_map(self, found: Tensor, inside: Tensor, placement: Placement | None) -> FusedMap:
-        """Return what was found of the object's pixels, (N, 3 + 32), in its place; `inside` (B, H, W) bool."""
-        places = found.new_zeros(*inside.shape, 3 + _MAP)
-        places[inside] = found
-        places = places.permute(0, 3, 1, 2)
-        sights = None if placement is None else placement.sights
-        return FusedMap(places[:, :3], places[:, 3:], inside[:, None].float(), sights)
+    def inference_seconds(self, images: int, pixels: float, box: float, views: int) -> float:
+        """Return about how long inference takes: views are turned after the images are fused."""
+        return 2.1e-6 * images * pixels + 2.0e-6 * views * box
+
+    def encode(self, seen: Observations) -> FusedMap:
+        """Return the fused map of all of a scene's images; without gradients a few pixels at a time."""
+        inside, pixels = object_pixels(seen)
+        count = max(1, len(pixels.values) if torch.is_grad_enabled() else _STRIP // seen.images.shape[1])
+        found = [
+            self._per_pixel(Pixels(*(part.float() for part in some)))
+            for some in zip(*(each.split(count) for each in pixels), strict=True)
+        ]
+        return self._to_map(torch.cat(found), inside, seen.placement)
 
     def regress(self, feature: FusedMap) -> Tensor:
         return self.correct(feature)[0]
@@ -153,74 +189,15 @@ class CorrectedNetwork(FusionNetwork):
         corrected = functional.normalize(normals + change[:, :3], dim=1)
         return feature.face(corrected), (change[:, 3:] + LOG_USUAL).clamp(max=_LARGEST).exp()
 
-    def accumulate(self, so_far: list[Observations] | None, seen: Observations) -> list[Observations]:
-        """Keep the images of a scene, in 16 bits."""
-        return [*(so_far or []), seen._replace(images=seen.images.half())]
-
-
-def staged_loss(stages: StagedNormals, truth: Truth, criterion: NormalCriterion) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the losses of the normals at both stages plus, weighted, that of the expected error."""
-    loss, terms = criterion(stages.normals, truth.normals, truth.mask)
-    terms["pixel_loss"], _ = criterion(stages.alone, truth.normals, truth.mask)
-    terms["expected_loss"] = expected_error_loss(stages.expected, stages.normals, truth.normals, truth.mask)
-    return loss + terms["pixel_loss"] + criterion.expected_weight * terms["expected_loss"], terms
-
-
-class FrameNet(CorrectedNetwork):
-    """Normals pixel by pixel in frames of their own, then corrected by their surroundings.
-
-    Args:
-        width: C, channels of a light of a pixel.
-        blocks: Layers in which the lights of a pixel exchange what they show.
-        frame: `normal` for the frame of the first normal; `camera` leaves directions as they are, to compare.
-        heads: Of the attention across the lights of a pixel, after the last `attending` of the blocks; 0 for none.
-        attending: Layers of attention.
-        context: Channels of `Surroundings` at an eighth of the resolution, a multiple of 4; 0 for none.
-    """
-
-    added = ("attend", "surroundings")
-
-    equivariant = True
-
-    def __init__(
-        self, *, width: int = 64, blocks: int = 4, frame: str = "normal", heads: int = 0, attending: int = 2,
-        context: int = 0,
-    ) -> None:  # fmt: skip
-        super().__init__()
-        if blocks < 1 or width < 1:
-            raise InputError(f"width and blocks must be at least 1, got {width} and {blocks}")
-        if heads < 0 or (heads and (width % heads or not 0 <= attending <= blocks)):
-            raise InputError(f"heads must divide width, and attending be 0 to blocks, got {heads} and {attending}")
-        if frame not in FRAMES:
-            raise unknown("frame", str(frame), FRAMES)
-        self.frame = frame
-        self.seen, self.known = nn.Linear(_SEEN, width), nn.Linear(_KNOWN, width)
-        self.exchange = nn.Sequential(*(Exchange(width) for _ in range(blocks)))
-        self.attend = nn.ModuleList(LightAttention(width, heads) for _ in range(attending if heads else 0))
-        self.fuse = nn.Sequential(
-            nn.Linear(2 * width + _KNOWN, 128), nn.LeakyReLU(SLOPE), nn.Linear(128, 128), nn.LeakyReLU(SLOPE)
-        )
-        self._build_map(context)
-
-    def inference_seconds(self, images: int, pixels: float, box: float, views: int) -> float:
-        """Return about how long inference takes: views are turned after the images are fused."""
-        return 2.1e-6 * images * pixels + 2.0e-6 * views * box
-
-    def encode(self, seen: Observations) -> FusedMap:
-        """Return the fused map of all of a scene's images; without gradients a few pixels at a time."""
-        inside, pixels = object_pixels(seen)
-        count = max(1, len(pixels.values) if torch.is_grad_enabled() else _STRIP // seen.images.shape[1])
-        found = [
-            self._per_pixel(Pixels(*(part.float() for part in some)))
-            for some in zip(*(each.split(count) for each in pixels), strict=True)
-        ]
-        return self.to_map(torch.cat(found), inside, seen.placement)
-
     def turn(self, feature: FusedMap, symmetry: Symmetry) -> FusedMap:
         """Return the fused map of the turned scene: its pixels see their lights in frames that turn with them."""
         normals, fused, mask, *sights = (symmetry.images(each) for each in feature if each is not None)
         normals, *sights = (symmetry.vectors(each, dim=1) for each in (normals, *sights))
         return FusedMap(normals, fused, mask, *sights)
+
+    def accumulate(self, so_far: list[Observations] | None, seen: Observations) -> list[Observations]:
+        """Keep the images of a scene, in 16 bits."""
+        return [*(so_far or []), seen._replace(images=seen.images.half())]
 
     def aggregate(self, accumulated: list[Observations]) -> FusedMap:
         """Return the fused map of all of a scene's images, which are never copied as a whole."""
@@ -266,6 +243,14 @@ class FrameNet(CorrectedNetwork):
             local = functional.normalize(start + self.offset(fused.float()), dim=-1)
             normals = (local[:, None] @ axes)[:, 0]
             return torch.cat([normals, self.feature(fused.float())], dim=1)
+
+    def _to_map(self, found: Tensor, inside: Tensor, placement: Placement | None) -> FusedMap:
+        """Return what was found of the object's pixels, (N, 3 + 32), in its place; `inside` (B, H, W) bool."""
+        places = found.new_zeros(*inside.shape, found.shape[1])
+        places[inside] = found
+        places = places.permute(0, 3, 1, 2)
+        sights = None if placement is None else placement.sights
+        return FusedMap(places[:, :3], places[:, 3:], inside[:, None].float(), sights)
 
 
 def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,7 +14,6 @@ from torch import nn
 
 from render.shared.config import read_yaml
 from render.shared.errors import InputError, unknown
-from sdps.models.anylight import AnyLightNet
 from sdps.models.cnnps import CNNPS
 from sdps.models.frames import FrameNet
 from sdps.models.lcnet import LCNet
@@ -39,6 +38,7 @@ class ModelEntry:
         summary: One line.
         paper: Row of the paper's tables, if any.
         lights: Lighting model whose lights it is trained on, `true`, or empty for models that see none.
+        any_light: Trained on any light that differs between the images; lights are where it comes from on average.
         recipe: Training settings where they differ from the role's, as published.
         reconstruction: What the paper leaves open and is decided here.
     """
@@ -50,6 +50,7 @@ class ModelEntry:
     options: Mapping[str, Any] = field(default_factory=dict)
     paper: str = ""
     lights: str = ""
+    any_light: bool = False
     recipe: Mapping[str, Any] = field(default_factory=dict)
     reconstruction: str = ""
 
@@ -94,7 +95,7 @@ def _entries() -> tuple[dict[str, ModelEntry], dict[str, Combination]]:
 
 NETWORKS: dict[str, type[nn.Module]] = {
     kind.__name__: kind
-    for kind in (LCNet, LCNetReg, LCNetSoft, LightSetNet, NENet, FrameNet, AnyLightNet, UPSFCN, UPSFCNLight, CNNPS)
+    for kind in (LCNet, LCNetReg, LCNetSoft, LightSetNet, NENet, FrameNet, UPSFCN, UPSFCNLight, CNNPS)
 }
 MODELS, COMBINATIONS = _entries()
 

@@ -94,12 +94,24 @@ def _compose(model: TrainedModel, weights: Path, data: str | Path | None, shippe
         config=config,
         settings=[(f"`{name}`", _value(value)) for name, value in _flat(config)],
         data=composition,
+        missing=", ".join(_missing(model)),
         data_card=card and "composition" not in dict(composition),
         scores=[(name, f"{value:.4g}", *_definition(name), _best(rows, name)) for name, value in scores.items()],
         pretrained=shipped is not None,
         data_terms="".join(_LICENCES.findall(card)).strip(),
         **_repeat(weights, model),
     )
+
+
+def _missing(model: TrainedModel) -> Iterable[str]:
+    """Yield what the images in training did not show; networks that may be told of near lamps learned from them."""
+    network, seen = model.network, model.augmentation()
+    if not (getattr(network, "sees_places", False) or getattr(network, "near", None) is not None):
+        yield from ("near lights", "perspective")
+    if seen.sensor is None:
+        yield from ("ambient light", "the optics of real cameras")
+    if seen.mixed is None:
+        yield "several lights at once"
 
 
 def _scores(metadata: Mapping[str, Any], *, lights_given: bool) -> dict[str, float]:

@@ -26,6 +26,7 @@ from sdps.models.base import FusionNetwork, NormalNetwork
 from sdps.models.registry import TRUE_LIGHTS
 from sdps.photos import Photographs
 from sdps.refinement import refine
+from sdps.refinement.surroundings.low_order import MOST as MOST_ANY
 from sdps.surface.meshing import MOST_VERTICES
 
 LIMIT = 4.0
@@ -169,7 +170,7 @@ def workload(photos: Photographs, runner: Runner, *, discontinuities: bool = Fal
 def list_files(runner: Runner) -> tuple[str, ...]:
     """Return the names of the files that `Inference.save` writes of a method, sorted."""
     method, estimator, names = runner.method, runner.estimator, [*_FILES]
-    lit = method.normals in classical.METHODS or method.lighting or (estimator and estimator.lighting)
+    lit = (method.normals in classical.METHODS or method.lighting) and not runner.any_light
     network = None if estimator is None or estimator.normals is None else estimator.normals.network
     names += ["lights.json"] if lit else []
     names += ["albedo.npy"] if method.refined else []
@@ -202,9 +203,7 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
         seconds = _normal_network(runner).inference_seconds(images, size.pixels, size.box, views)
         found["normals"] = time_normals(estimator, images) * seconds + once * _tile_count(size, runner)
     if runner.method.refined:
-        each = 0.6e-6 + 38e-9 * images * (_NEAR_LAMPS if runner.method.lighting != TRUE_LIGHTS else 1.0)
-        coarse, fine = 2000 * (1.5e-3 + 2800 * each), 120 * size.pixels * each
-        found["refinement"] = (coarse + fine) / threads + 3 * once
+        found["refinement"] = _refine_seconds(size, runner) / threads + 3 * once
     if size.flat:
         looked = ceil(images / ceil(images / MOST))
         found["flat"] = looked * (once / images + 10e-9 * size.frame + 0.1) + 0.4e-6 * size.pixels
@@ -217,6 +216,13 @@ def _seconds(size: Size, runner: Runner, kind: str, reduces: bool, discontinuiti
     found["files"] = 7e-6 * size.pixels / _step(size) ** 2 + 0.8e-6 * size.frame
     found["page"] = 3.0 + 7e-6 * min(size.box, 2e6)
     return found
+
+
+def _refine_seconds(size: Size, runner: Runner) -> float:
+    if runner.any_light:
+        return 1.0 + size.pixels * (24e-6 + 1.4e-6 * min(size.pictures, MOST_ANY))
+    each = 0.6e-6 + 38e-9 * size.pictures * (_NEAR_LAMPS if runner.method.lighting != TRUE_LIGHTS else 1.0)
+    return 2000 * (1.5e-3 + 2800 * each) + 120 * size.pixels * each
 
 
 def _normal_network(runner: Runner) -> NormalNetwork:

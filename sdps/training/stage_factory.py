@@ -8,7 +8,6 @@ from torch import nn
 from render.shared.errors import InputError
 from sdps.models import registry
 from sdps.models.checkpoint import TrainedModel
-from sdps.models.frames import CorrectedNetwork
 from sdps.training.pixel_stage import PixelStage
 from sdps.training.stages import LightingStage, NormalStage, Stage
 from sdps.training.training_config import LightingTraining, NormalTraining, TrainingConfig
@@ -40,17 +39,13 @@ def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping
 
 
 def _take_weights(network: nn.Module, first: nn.Module) -> None:
-    """Copy the weights of a network into one of its kind; of another kind, only those of the parts that both have.
+    """Copy the weights of a network into one of its kind.
 
     Raises:
         RuntimeError: sizes differ, or parts are missing.
     """
-    weights, added = first.state_dict(), getattr(network, "added", ())  # earlier kinds lack these: they stay random
-    if type(first) is not type(network) and isinstance(first, CorrectedNetwork):
-        shared = getattr(network, "shared", ())
-        weights = {key: value for key, value in weights.items() if key.partition(".")[0] in shared}
-        added = {key.partition(".")[0] for key in network.state_dict()} - set(shared)
-    loaded = network.load_state_dict(weights, strict=False)
+    added = getattr(network, "added", ())  # earlier kinds lack these: they stay random
+    loaded = network.load_state_dict(first.state_dict(), strict=False)
     if loaded.unexpected_keys or any(key.partition(".")[0] not in added for key in loaded.missing_keys):
         raise RuntimeError(f"missing {loaded.missing_keys}, not known {loaded.unexpected_keys}")
 

@@ -83,6 +83,11 @@ class Stage(ABC):
         alone = replace(options.augmentation, mixed=replace(mixed, single=1.0, surrounded=0.0))
         return {"": options, "_single": replace(options, augmentation=alone)}
 
+    def draw_count(self, batch: Batch) -> Batch:
+        """Return a batch with as many images as `fewest_images` lets be drawn; on a device they were drawn so."""
+        few = self.config.fewest_images
+        return leave_out(batch, few) if few and not self.config.resident else batch
+
     @abstractmethod
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the scalar to minimise, and named scalars to log."""
@@ -103,6 +108,7 @@ class LightingStage(Stage):
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the network's own loss."""
+        batch = self.draw_count(batch)
         terms = self.network.loss(self.network(batch.images, batch.mask), true_lights(batch))
         return terms["total"], {f"{name}_loss": value for name, value in terms.items() if name != "total"}
 
@@ -189,15 +195,14 @@ class NormalStage(Stage):
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the network's own loss on the crops, as configured."""
-        if self.config.fewest_images and not self.config.resident:  # on a device they were drawn so
-            batch = leave_out(batch, self.config.fewest_images)
+        batch = self.draw_count(batch)
         lights, config = self.training_lights(batch), self.config
         side = config.crop or config.size
         images, mask, normals = (crop(part, batch.corner, side) for part in (batch.images, batch.mask, batch.normals))
         placement = Placement(*(crop(part, batch.corner, side) for part in flatten_some(placed(batch), batch.seed)))
         seen = self.network.observe(images, mask, lights, placement=placement)
-        weights = config.gradient_weight, config.lighting_weight, config.expected_weight, config.shading_weight
-        truth = Truth(normals, mask, batch.directions, batch.intensities, batch.light)
+        weights = config.gradient_weight, config.lighting_weight, config.expected_weight
+        truth = Truth(normals, mask, batch.directions, batch.intensities)
         return self.network.loss(seen, truth, NormalCriterion(config.loss, *weights))
 
     def metrics(self, batch: Batch) -> dict[str, float]:
@@ -257,9 +262,7 @@ def leave_out(batch: Batch, fewest: int) -> Batch:
     """Return a batch with so many images of each scene or more, as its first scene's seed draws."""
     most = batch.images.shape[1]
     count = int(generator(int(batch.seed[0]), "images").integers(min(fewest, most), most, endpoint=True))
-    some = {
-        name: getattr(batch, name)[:, :count] for name in ("images", "directions", "intensities", "nearness", "light")
-    }
+    some = {name: getattr(batch, name)[:, :count] for name in ("images", "directions", "intensities", "nearness")}
     return batch._replace(**some)
 
 

@@ -209,7 +209,6 @@ class NormalTraining(TrainingConfig):
         lighting_weight: Weight of the lighting loss next to the normal loss, for models that learn both.
         gradient_weight: Weight of the error of the normals' steps from pixel to pixel.
         expected_weight: Weight of the errors of the expected error, for models that learn it.
-        shading_weight: Weight of the errors of each image's shading, for models that learn it.
         options: Options of the network over those of its registry entry, for variants of a model.
     """
 
@@ -226,7 +225,6 @@ class NormalTraining(TrainingConfig):
     lighting_weight: float = 0.1
     gradient_weight: float = 0.0
     expected_weight: float = 0.02
-    shading_weight: float = 0.0
     options: dict[str, bool | int | float | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -237,7 +235,7 @@ class NormalTraining(TrainingConfig):
             raise InputError(f"light_blend must be in [0, 10], got {self.light_blend}")
         if not 0.0 <= self.min_object < 1.0:
             raise InputError(f"min_object must be in [0, 1), got {self.min_object}")
-        weights = "lighting_weight", "gradient_weight", "expected_weight", "shading_weight"
+        weights = "lighting_weight", "gradient_weight", "expected_weight"
         check_fields(self, "not negative", "light_error", *weights)
 
 

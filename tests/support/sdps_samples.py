@@ -21,9 +21,8 @@ def rng(seed: int = 0) -> np.random.Generator:
 
 
 def distant_layout(images: Tensor) -> dict[str, Tensor]:
-    """Return the fields of a `Batch` that say where pixels and lamps lie: far, and seen orthographically; no light."""
+    """Return the fields of a `Batch` that say where pixels and lamps lie: far, and seen orthographically."""
     scenes, count, _, *sides = images.shape
     sights = torch.zeros(scenes, 3, *sides)
     sights[:, 2] = 1.0
-    places, light = torch.zeros(scenes, 3, *sides), torch.zeros(scenes, count, 9)
-    return {"nearness": torch.zeros(scenes, count), "places": places, "sights": sights, "light": light}
+    return {"nearness": torch.zeros(scenes, count), "places": torch.zeros(scenes, 3, *sides), "sights": sights}

@@ -161,7 +161,7 @@ def list_methods(lit: bool) -> list[dict[str, str]]:
     for name, about in there.items():
         combined = name in COMBINATIONS
         classical = name in METHODS and METHODS[name].calibrated == lit
-        if (combined and not lit) or classical or name == ("psfcn" if lit else "anylight"):
+        if (combined and not lit) or classical or (lit and name == "psfcn"):
             found.append({"name": name, "about": about})
     return found
 

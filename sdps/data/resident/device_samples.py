@@ -15,7 +15,6 @@ from torch.nn import functional
 
 from render.records.manifest import SceneSpec
 from render.shared.errors import InputError
-from sdps.core.lighting import harmonics
 from sdps.core.symmetry import SYMMETRIES
 from sdps.data.augment import Augmentation
 from sdps.data.dataset import CROP_DRAWS, Batch, SampleOptions, choose_images, resize
@@ -136,7 +135,7 @@ def make_batch(held: Held, numbers: np.ndarray, options: SampleOptions, rng: np.
     return Batch(
         images=images, mask=maps[:, :1], normals=maps[:, 1:4], directions=directions, intensities=intensities,
         corner=corner, seed=torch.from_numpy(rng.integers(2**63, size=len(numbers))), nearness=nearness,
-        places=maps[:, 4:7], sights=maps[:, 7:], light=harmonics(directions),
+        places=maps[:, 4:7], sights=maps[:, 7:],
     )  # fmt: skip
 
 

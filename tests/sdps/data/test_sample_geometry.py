@@ -62,6 +62,20 @@ def test_distant_lamps_stay_what_they_are() -> None:
     assert not found.nearness.any() and (found.irradiance == 1).all()
 
 
+def test_what_faces_all_lamps_of_a_mixture_is_lit_as_by_the_lamp_that_stands_for_them() -> None:
+    found = placed(NEAR)
+    alone = found.mix(np.eye(3))
+    for name in ("directions", "nearness", "irradiance"):
+        np.testing.assert_allclose(getattr(alone, name), getattr(found, name), rtol=1e-6)
+    shares = np.array([[0.2, 0.5, 0.3], [0.0, 0.4, 0.6]])
+    mixed, normal = found.mix(shares), np.array([0.1, 0.2, 0.9747])
+    each = found.irradiance * (found.directions @ normal)  # (3,), by every lamp
+    assert (each > 0.0).all()
+    np.testing.assert_allclose(mixed.irradiance * (mixed.directions @ normal), shares @ each, rtol=1e-6)
+    low, high = found.nearness.min(), found.nearness.max()
+    assert ((low < mixed.nearness) & (mixed.nearness < high)).all()
+
+
 def test_geometry_turns_and_shrinks_with_the_scene() -> None:
     layout = lay_out(FROM_NEARBY, DEPTH, MASK, np.arange(3))
     plain, symmetry = place(layout, MASK, NEAR.light_directions()), Symmetry(1, True)

@@ -363,6 +363,7 @@ def test_mixed_light_is_drawn_again_and_the_same_from_shards_and_cache(tmp_path:
     inside = batch.mask[0] > 0
     assert torch.allclose(batch.images[:, :, inside], expected[inside].expand(5, 3, -1), rtol=0.02)
     assert batch.directions[:, 2].min() > 0.999
+    assert torch.allclose(batch.intensities, torch.tensor(0.5), rtol=0.02), "as a lamp that lights what faces it alike"
     config = replace(config, augmentation=replace(PLAIN, mixed=SceneMix()))
     plain, cached = (SceneDataset(tmp_path, "train", config, cache=cache) for cache in (False, True))
     cached.sample(SampleKey(0, 0, 0))

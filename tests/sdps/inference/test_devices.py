@@ -10,13 +10,14 @@ import pytest
 import torch
 
 from sdps.models.base import Lights
+from sdps.models.frames import FrameNet
 from sdps.models.lcnet import INPUT_SIZE
 from sdps.models.registry import MODELS, create
 from sdps.training.muon import _Muon, is_matrix, orthogonalise
 
 META = torch.device("meta")
-NORMALS = [name for name, item in MODELS.items() if item.role == "normals" and name not in ("frames", "anylight")]
-"""`frames` and `anylight` work on the pixels of the object: how many is a value, which this device has not."""
+NORMALS = [name for name, item in MODELS.items() if item.role == "normals" and item.build is not FrameNet]
+"""`frames` works on the pixels of the object: how many is a value, which this device has not."""
 LIGHTING = [name for name, item in MODELS.items() if item.role == "lighting"]
 
 

@@ -5,32 +5,16 @@ from pathlib import Path
 import numpy as np
 import photo_folders as folders
 import pytest
+from any_light_weights import write_weights
 
 import sdps
-from render.shared.config import to_plain
 from render.shared.errors import InputError
 from sdps.api import choose_method
 from sdps.core.estimate import Estimate
-from sdps.data.augment import Augmentation
 from sdps.inference.stray_light import find_shadow
 from sdps.methods import light_witness, pretrained
 from sdps.methods.flat_things import Flatness
 from sdps.methods.light_witness import is_lit_by_lamps
-from sdps.models.checkpoint import TrainedModel, save_weights
-from sdps.models.registry import create
-
-SMALL = {"width": 16, "blocks": 1, "heads": 2, "channels": 16, "context": 0}
-
-
-def write_weights(out: Path) -> Path:
-    """Write a small network for any light; return the folder of runs."""
-    model = TrainedModel(
-        "anylight", create("anylight", **SMALL), SMALL, {"config": {"augmentation": to_plain(Augmentation())}}
-    )
-    place = out / "models" / "anylight"
-    place.mkdir(parents=True)
-    save_weights(place / "anylight.safetensors", model)
-    return out
 
 
 def shade(lights: np.ndarray, ambient: float) -> tuple[np.ndarray, np.ndarray]:
@@ -109,10 +93,10 @@ def test_photographs_in_a_lit_room_are_not_taken_for_those_of_a_lamp(
     out = write_weights(tmp_path / "out")
     monkeypatch.setattr(light_witness, "see_lights", lambda *_: witness(9.0, RING[[3, 0, 5, 7, 1, 6, 2, 4]]))
     found = sdps.infer(photos, models=out, findings=())
-    assert found.method == "anylight" and not len(found.light_directions)
+    assert found.method == "anylight (lightset-any + frames-any), refined" and not len(found.light_directions)
     assert any("in shadow" in finding.text for finding in found.findings)
-    assert sdps.plan(photos, models=out).method == "anylight"
-    assert sdps.plan(photos, models=out, lit_by="lamp").method != "anylight"
+    assert sdps.plan(photos, models=out).method == found.method
+    assert "anylight" not in sdps.plan(photos, models=out, lit_by="lamp").method
 
 
 def test_photographs_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

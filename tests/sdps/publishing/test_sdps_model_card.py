@@ -189,7 +189,10 @@ def test_names_break_no_table(tmp_path: Path) -> None:
         ("upsfcn", "does not apply"),
         ("nenet-norm", "pixel's norm"),
         ("frames", "exchange what they show 4 times"),
-        ("anylight", "Nothing is assumed of the light but that it differs"),
+        ("frames-any", "Nothing is assumed of the light but that it differs"),
+        ("frames-any", "a fixed camera, light that differs between the images"),
+        ("nenet-norm", "Not among them: near lights, perspective, ambient light, the optics of real cameras, several"),
+        ("frames", "Not among them: ambient light, the optics of real cameras, several lights at once."),
     ],
 )
 def test_models_differ(tmp_path: Path, model: str, fact: str) -> None:

@@ -21,7 +21,6 @@ from render.records.mirror import open_folder
 from render.shared.config import build
 from render.shared.errors import InputError
 from sdps.data.dataset import SampleKey, SceneDataset, collate
-from sdps.methods import pretrained
 from sdps.models.checkpoint import TrainedModel, load_state, load_weights, save_state, save_weights
 from sdps.models.registry import MODELS, create
 from sdps.training import recipes, trainer
@@ -463,19 +462,6 @@ def test_configuration_is_checked(values: dict, message: str) -> None:
         build(LightingTraining, values, "training")
 
 
-def test_anylight_takes_the_layers_after_the_fusion_from_frames() -> None:
-    run = recipes.run("anylight", {}, {"anylight": {"start": "shipped:frames"}})
-    first = load_weights(pretrained.require("shipped:frames"))
-    stage = create_stage("anylight", run.model, run.config, {"start": first})
-    begun, taken = stage.network.state_dict(), first.network.state_dict()
-    shared = [name for name in taken if name.startswith(("feature", "enter", "surroundings", "leave"))]
-    assert len(shared) > 20 and all(torch.equal(begun[name], taken[name]) for name in shared)
-    assert not begun["offset.weight"].any(), "training begins at normals that face the camera"
-    other = TrainedModel("frames", create("frames", context=80), {"context": 80}, first.metadata)
-    with pytest.raises(InputError, match=r"runs.anylight.start: 'frames' has another network"):
-        create_stage("anylight", run.model, run.config, {"start": other})
-
-
 def test_a_run_takes_start_and_lights_of_others(tmp_path: Path) -> None:
     settings = {"runs": {"psfcn-late": {"base": "psfcn", "start": "nenet", "steps": 1}}}
     run = recipes.run("psfcn-late", {}, settings["runs"])
@@ -487,9 +473,9 @@ def test_a_run_takes_start_and_lights_of_others(tmp_path: Path) -> None:
     other = TrainedModel("upsfcn", create("upsfcn"), {}, {"config": {"augmentation": {}}})
     with pytest.raises(InputError, match=r"runs.psfcn-late.start: 'upsfcn' has another network"):
         create_stage("psfcn-late", run.model, run.config, {"start": other})
-    begun = recipes.run("anylight", {}, {"anylight": {"start": "frames"}})
-    with pytest.raises(InputError, match=r"runs.anylight.start: 'nenet' has another network"):
-        create_stage("anylight", begun.model, begun.config, {"start": first})
+    begun = recipes.run("frames", {}, {"frames": {"start": "nenet"}})
+    with pytest.raises(InputError, match=r"runs.frames.start: 'nenet' has another network"):
+        create_stage("frames", begun.model, begun.config, {"start": first})
     run = recipes.run("nenet", {}, {"nenet": {"lights": "shipped:psfcn"}})
     with pytest.raises(InputError, match=r"runs.nenet.lights: 'upsfcn' finds no lights; name a lighting model"):
         create_stage("nenet", "nenet", run.config, {"lighting": other})
