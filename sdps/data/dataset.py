@@ -186,15 +186,14 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     elif layout.positions is not None:
         images = images / placed.irradiance[:, None, None, None]
     images, intensities = augment(images, mask, options.augmentation, rng)
-    if weights is not None:
-        intensities = intensities * placed.irradiance
+    strengths = intensities if weights is None else intensities * placed.irradiance
     corner = _crop_corner(mask, options.crop, options.min_object, rng) if options.crop else (0, 0)
     return Batch(
         images=_channels_first(images),
         mask=torch.from_numpy(mask[None].astype(np.float32)),
         normals=_channels_first(normals),
         directions=torch.from_numpy(placed.directions),
-        intensities=torch.from_numpy(intensities),
+        intensities=torch.from_numpy(strengths),
         corner=torch.tensor(corner),
         seed=torch.tensor(seed),
         nearness=torch.from_numpy(placed.nearness),

@@ -79,8 +79,9 @@ class Runner:
             self.estimator = Estimator(
                 lighting=lighting, normals=normals, device=default_device(), **self.config.options()
             )
-        found = normals is not None and method.lighting != TRUE_LIGHTS
-        self.any_light = found and MODELS[normals.name].any_light
+        self.any_light = False
+        if normals is not None and method.lighting != TRUE_LIGHTS:
+            self.any_light = MODELS[normals.name].any_light
 
     def identity(self) -> str:
         """Return a digest of what results depend on besides images and code: weights, settings and arithmetic."""
