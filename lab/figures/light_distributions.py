@@ -9,8 +9,8 @@ from pipelines.evaluate.evaluation import Result, TestObject
 from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts
-from pipelines.shared.pictures import spread_evenly
 from pipelines.shared.text_tables import number
+from render.shared.seeds import spread_evenly
 
 SCENES = 3  # per shape
 COLUMNS = 3  # methods shown; all are in the table

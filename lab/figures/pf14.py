@@ -15,11 +15,11 @@ from pipelines.evaluate.report.sections import Table
 from pipelines.evaluate.score_tables import Mean
 from pipelines.evaluate.workbench import Workbench
 from pipelines.shared import charts, scenes
-from pipelines.shared.pictures import spread_evenly
 from render.materials import library
 from render.planning import light_sets
 from render.planning.plan import material_pool
 from render.records.manifest import SceneSpec
+from render.shared.seeds import spread_evenly
 from sdps.methods.method import Method
 from sdps.methods.runner import Runner
 

@@ -25,7 +25,7 @@ from render.shared.errors import InputError
 from render.shared.imaging.mixing import LightStage
 from render.shared.imaging.scene_mixing import SceneMix
 from render.shared.imaging.sensor import SensorModel
-from render.shared.seeds import generator
+from render.shared.seeds import generator, spread_evenly
 from sdps.api import estimate
 from sdps.core.geometry import Camera
 from sdps.core.metrics import angle_degrees
@@ -67,7 +67,7 @@ def choose(scenes: Sequence[SceneSpec], light: str, count: int) -> list[SceneSpe
         return (scene.light_positions() is not None) == wanted
 
     fit = [scene for scene in scenes if fits(scene)]
-    return [fit[index] for index in np.linspace(0, len(fit) - 1, min(count, len(fit))).round().astype(int)]
+    return spread_evenly(fit, count)
 
 
 def photograph(scene: SceneSpec, store: SceneStore, light: str) -> Batch:

@@ -17,6 +17,7 @@ import torch
 from matplotlib.figure import Figure
 
 from render.shared.errors import InputError
+from render.shared.seeds import spread_evenly
 from sdps.core.metrics import angle_degrees
 from sdps.data.dataset import Batch, SampleKey, SampleOptions, SceneDataset, collate
 from sdps.methods.pretrained import require
@@ -37,8 +38,8 @@ def errors(data: Path, weights: Path, lighting: Path | None, scenes: int, images
         data, "val", SampleOptions(seed=0, images=images, augmentation=augmentation), skip_missing=True
     )
     found = []
-    for index in np.linspace(0, len(dataset) - 1, min(scenes, len(dataset))).round().astype(int):
-        batch = collate([dataset.sample(SampleKey(int(index), 0, int(index)))])
+    for index in spread_evenly(range(len(dataset)), scenes):
+        batch = collate([dataset.sample(SampleKey(index, 0, index))])
         pair = _of_lights(network, batch) if model.role == "lighting" else _of_normals(network, lights, batch)
         if pair is None:
             raise InputError(f"{weights}: tells no error to expect; name weights of `frames` or `lightset`")

@@ -14,6 +14,7 @@ from render.records.mirror import shard_path
 from render.records.shards import Shard, read_shard
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
+from render.shared.seeds import spread_evenly
 
 MEASURED = 120  # shards read for the histograms, besides those shown
 SIDE = 128  # pixels of a picture's side
@@ -60,9 +61,9 @@ class Sample:
 
 def read_sample(folder: Path, there: Sequence[SceneSpec], count: int) -> Sample:
     """Read the scenes to be shown, and some more for the histograms, one shard at a time."""
-    shown = {there[place].id for place in _spread_evenly(len(there), count)}
-    places = np.union1d(_spread_evenly(len(there), count), _spread_evenly(len(there), MEASURED))
-    staged = set(pictures.spread_evenly(sorted(shown), STAGES))
+    shown = {scene.id for scene in spread_evenly(there, count)}
+    places = sorted({*spread_evenly(range(len(there)), count), *spread_evenly(range(len(there)), MEASURED)})
+    staged = set(spread_evenly(sorted(shown), STAGES))
     sample = Sample()
     for place in progress_bar(places, unit="shard", desc="preview"):
         scene = there[place]
@@ -81,11 +82,6 @@ def read_sample(folder: Path, there: Sequence[SceneSpec], count: int) -> Sample:
     return sample
 
 
-def _spread_evenly(length: int, count: int) -> np.ndarray:
-    """Return up to `count` places spread evenly over `range(length)`."""
-    return np.unique(np.linspace(0, length - 1, min(count, length)).round().astype(int))
-
-
 def _some(values: np.ndarray) -> np.ndarray:
     return values[:: max(1, len(values) // SLANTS)]
 
@@ -98,7 +94,7 @@ def strip(shard: Shard) -> np.ndarray:  # (128, 512, 3) uint8
 
 def stage(scene: SceneSpec, shard: Shard) -> Stage:
     """Lay out the normals of a shard and its images, at most 96 high, under one exposure."""
-    chosen = pictures.spread_evenly(range(len(shard.images)), STAGE_LIGHTS)
+    chosen = spread_evenly(range(len(shard.images)), STAGE_LIGHTS)
     exposure = pictures.auto_exposure(shard.images[chosen], shard.mask)
     shown = [pictures.normal_map(shard.normals, shard.mask)]
     shown += [pictures.tone_map(shard.images[number], exposure) for number in chosen]

@@ -23,13 +23,13 @@ from pipelines.evaluate.score_tables import cell, mean, tables_text, weights_of
 from pipelines.evaluate.workbench import Workbench, build_test_object
 from pipelines.shared import network_flags, presets
 from pipelines.shared.cluster import cluster_config
-from pipelines.shared.pictures import spread_evenly
 from pipelines.shared.presets import Preset, TestConfig
 from pipelines.shared.text_tables import number
 from render.records.manifest import SceneSpec
 from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import write_json
+from render.shared.seeds import spread_evenly
 from sdps.inference.inference_config import inference_config
 from sdps.methods import rows
 from sdps.methods.method import CONSTANT, Method

@@ -7,6 +7,7 @@ import numpy as np
 from pipelines.evaluate.evaluation import Found, TestObject
 from pipelines.evaluate.report.sections import Tile
 from pipelines.shared import pictures
+from render.shared.seeds import spread_evenly
 from sdps.core.metrics import normal_error_map
 
 ERROR_LIMIT = 45.0
@@ -50,7 +51,7 @@ def tiles(item: TestObject, found: Found, shown: Sequence[str], truth: str = "tr
 def _brightest(item: TestObject) -> np.ndarray:  # (H, W, 3)
     """Return the brightest of some images spread over all."""
     images = item.load()
-    candidates = [images[k : k + 1][0] for k in pictures.spread_evenly(range(len(images)), _LIT_CANDIDATES)]
+    candidates = [images[k : k + 1][0] for k in spread_evenly(range(len(images)), _LIT_CANDIDATES)]
     return max(candidates, key=lambda image: float(image[item.mask].mean()))
 
 

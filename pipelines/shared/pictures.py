@@ -15,6 +15,7 @@ from pipelines.shared.charts import light_disc
 from render.records.manifest import SceneSpec
 from render.records.mirror import shard_path
 from render.records.shards import Shard, read_shard
+from render.shared.seeds import spread_evenly
 from sdps.core.intensities import grey
 from sdps.photos.response import display
 
@@ -60,7 +61,7 @@ def preview_strip(shard: Shard, lights: int = 4) -> np.ndarray:  # (H, W * (1 + 
     if shard.weights is not None:
         tiles.append(weight_map(shard.weights, shard.mask))
     exposure = auto_exposure(shard.images, shard.mask)
-    chosen = np.linspace(0, len(shard.images) - 1, max(1, lights + 1 - len(tiles))).round().astype(int)
+    chosen = spread_evenly(range(len(shard.images)), max(1, lights + 1 - len(tiles)))
     tiles += [tone_map(shard.images[number], exposure) for number in chosen]
     return np.concatenate(tiles, axis=1)
 
@@ -109,12 +110,6 @@ def scene_sheet(scenes: Sequence[SceneSpec], folder: Path, count: int = 24) -> I
         strip = preview_strip(read_shard(shard_path(folder, scene), scene), lights=3)
         tiles.append((f"{shape}, {scene.material}"[:60], strip))
     return contact_sheet(tiles, columns=min(3, len(tiles)))
-
-
-def spread_evenly(items: Sequence[T], count: int) -> list[T]:
-    """Return up to `count` items, spread evenly over a sequence from its first to its last."""
-    places = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
-    return [items[place] for place in places]
 
 
 def light_plot(directions: np.ndarray, intensities: np.ndarray, truth: np.ndarray | None = None) -> Figure:

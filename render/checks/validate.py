@@ -15,8 +15,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from render.backend.orphans import end_with_parent
 from render.checks.folder_checks import CHECKSUMS, check_folder, find_duplicates, read_checksums
 from render.checks.known_checks import CHECKS, ERROR, WARNING, Finding, check_shard
@@ -30,6 +28,7 @@ from render.shared.config import to_plain
 from render.shared.errors import InputError
 from render.shared.files import write_json
 from render.shared.progress import progress_bar
+from render.shared.seeds import spread_evenly
 
 REPORT = "validation.json"
 LISTED = 200  # findings per check in the report; their number is always given
@@ -110,7 +109,7 @@ def validate(
     there = [scene for scene in scenes if once.get(scene.id) is scene]
     chosen = there
     if limit is not None and limit < len(there):
-        chosen = [there[place] for place in np.unique(np.linspace(0, len(there) - 1, limit).round().astype(int))]
+        chosen = spread_evenly(there, limit)
     sums = read_checksums(folder)
     findings, statistics, pixels = check_folder(folder, scenes, present, sums), [], defaultdict(list)
     varying = False

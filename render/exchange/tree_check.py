@@ -20,6 +20,7 @@ from render.records.mirror import shard_path
 from render.records.shards import read_shard
 from render.shared.errors import InputError, unknown
 from render.shared.progress import progress_bar
+from render.shared.seeds import spread_evenly
 
 _ANGLE_TOLERANCE = 0.6  # degrees; the greatest error of rounding to 8 bits is 0.39
 
@@ -66,7 +67,7 @@ def check_tree(
         layout.check_lists(root, sources, note)
     report.samples = len(sources)
     if limit is not None and limit < len(sources):
-        sources = [sources[place] for place in np.linspace(0, len(sources) - 1, limit).round().astype(int)]
+        sources = spread_evenly(sources, limit)
     counts, sides = set(), {layout.crop}
     for source in progress_bar(sources, unit="sample", desc=f"check {layout_name}"):
         with _passing_errors(note):

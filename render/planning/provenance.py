@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from render.materials import library
 from render.materials.textures import textured
 from render.planning.plan_counts import IMPORTED, PlanCounts, components
@@ -17,6 +15,7 @@ from render.records.manifest import OWN_MESHES, SceneSpec
 from render.records.mirror import shard_path
 from render.records.shards import read_shard
 from render.shared.errors import InputError
+from render.shared.seeds import spread_evenly
 
 PACKAGES = ("sdps", "mitsuba", "drjit", "OpenEXR", "numpy")
 HEADERS = (*PACKAGES, "commit", "variant", "imported_from", "irradiance", "frame", "normals", "depth", "coverage")
@@ -90,9 +89,9 @@ def headers(folder: Path, there: Sequence[SceneSpec]) -> dict[str, str]:
     Shards that cannot be read are skipped; `sdps data validate` lists them.
     """
     found: dict[str, dict[str, None]] = {key: {} for key in HEADERS}
-    for place in np.unique(np.linspace(0, len(there) - 1, min(READ, len(there))).round().astype(int)):
+    for scene in spread_evenly(there, READ):
         try:
-            header = read_shard(shard_path(folder, there[place]), there[place]).provenance
+            header = read_shard(shard_path(folder, scene), scene).provenance
         except InputError:
             continue
         for key in HEADERS:

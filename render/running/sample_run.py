@@ -4,14 +4,13 @@ import tempfile
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from render.planning import budget
 from render.planning.budget import Pace
 from render.planning.chunks import cut, view_groups
 from render.records.manifest import SceneSpec
 from render.running.supervisor import RunOptions, render_supervised
 from render.shared.errors import InputError
+from render.shared.seeds import spread_evenly
 
 
 @dataclass(frozen=True)
@@ -43,8 +42,7 @@ def render_sample(scenes: list[SceneSpec], options: RunOptions) -> Sample:
 
     workers = options.workers or budget.default_workers(variant.choose().variant)
     groups = list(view_groups(scenes))
-    chosen = np.unique(np.linspace(0, len(groups) - 1, min(len(groups), max(8, 4 * workers))).round().astype(int))
-    views = [groups[index] for index in chosen]
+    views = spread_evenly(groups, max(8, 4 * workers))
     picked = [scene for view in views for scene in view]
     with tempfile.TemporaryDirectory(prefix="sdps-plan-") as folder:
         summary = render_supervised(picked, folder, RunOptions(workers=workers, keep_free=0))

@@ -1,8 +1,14 @@
-"""One random generator per (root seed, scene, stage), so that adding a stage never shifts another."""
+"""One random generator per (root seed, scene, stage), so that adding a stage never shifts another; and what is chosen
+without chance.
+"""
 
 import hashlib
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
+
+T = TypeVar("T")
 
 
 def _word(key: int | str) -> int:
@@ -26,3 +32,9 @@ def generator(root: int, *keys: int | str) -> np.random.Generator:
 def derive_seed(root: int, *keys: int | str) -> int:
     """Return a 31-bit seed of its own for the stage named by `keys`."""
     return int(generator(root, *keys).integers(2**31))
+
+
+def spread_evenly(items: Sequence[T], count: int) -> list[T]:
+    """Return up to `count` items, spread evenly over a sequence from its first to its last."""
+    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[place] for place in places]

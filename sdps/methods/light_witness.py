@@ -8,6 +8,7 @@ import numpy as np
 
 from render.shared.errors import InputError
 from render.shared.imaging.vectors import unit
+from render.shared.seeds import spread_evenly
 from sdps.core.estimate import Estimate
 from sdps.core.intensities import grey, scale_to_mean
 from sdps.inference.image_source import ImageSource
@@ -58,7 +59,7 @@ def is_lit_by_lamps(
     """
     if covers_frame(mask):
         return True
-    numbers = np.unique(np.linspace(0, len(images) - 1, _LOOKED).round().astype(int)).tolist()
+    numbers = spread_evenly(range(len(images)), _LOOKED)
     read, share = read_small(images, mask, numbers, INPUT_SIZE)
     inside = share > (0.5 if (share > 0.5).any() else 0.0)
     small = np.where(inside[..., None], read / np.maximum(share, 1e-6)[..., None], np.float32(0.0))

@@ -13,6 +13,7 @@ from PIL import Image
 
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar, stage
+from render.shared.seeds import spread_evenly
 from sdps.core.intensities import colour_balance
 from sdps.photos.analysis.colours import colour_casts
 from sdps.photos.analysis.fall_off import FallOff, block_means, fall_off
@@ -69,7 +70,7 @@ def measure(photos: Photographs) -> Measures:
     """
     count = len(photos)
     pixels = np.flatnonzero(photos.mask)
-    sample = pixels[np.unique(np.linspace(0, len(pixels) - 1, _PIXELS).round().astype(int))]
+    sample = pixels[spread_evenly(range(len(pixels)), _PIXELS)]
     observations = np.empty((count, len(sample), 3), np.float32)
     levels, peaks, saturated, tops, topped, outside = np.zeros((6, count))
     digests, settings, shifts, blocks = [], [], [], []

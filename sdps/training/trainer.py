@@ -26,6 +26,7 @@ from render.shared.config import to_plain
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
+from render.shared.seeds import spread_evenly
 from sdps.data.dataset import Batch, SampleKey, SampleOptions, SceneDataset, collate
 from sdps.data.interrupts import StopRequest, stop_on_signal
 from sdps.data.resident.resident_scenes import ResidentScenes
@@ -309,9 +310,8 @@ class Trainer:
         config = self.config
         scenes = SceneDataset(self.data, "val", options, cache=config.cache, skip_missing=config.skip_missing)
         rows = []
-        count = min(config.validation_scenes, len(scenes))
-        for index in np.linspace(0, len(scenes) - 1, count).round().astype(int):
-            batch = collate([scenes.sample(SampleKey(int(index), 0, int(index)))])
+        for index in spread_evenly(range(len(scenes)), config.validation_scenes):
+            batch = collate([scenes.sample(SampleKey(index, 0, index))])
             assert isinstance(batch, Batch)  # `sample` raises
             with self.arithmetic.autocast():
                 rows.append(self.stage.metrics(batch.to(self.team.device)))

@@ -19,6 +19,7 @@ from torch.nn.functional import normalize
 from render.shared.config import check_fields
 from render.shared.errors import InputError
 from render.shared.progress import stage
+from render.shared.seeds import spread_evenly
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture
 from sdps.inference.image_source import ImageSource, ObjectImages, survey
 from sdps.inference.tiles import Tile, release_memory, tiles
@@ -123,7 +124,7 @@ def refine_low_order(
     config = config or LowOrderConfig()
     expected = np.full(mask.shape, _USUAL_ERROR, np.float32) if expected is None else expected
     _check(len(images), mask, normals, expected)
-    chosen = np.linspace(0, len(images) - 1, min(len(images), MOST)).round().astype(int)
+    chosen = np.array(spread_evenly(range(len(images)), MOST))
     scene = survey(images, mask, 0)
     start, errors = normals[scene.rows, scene.columns], expected[scene.rows, scene.columns]
     stride = max(1, round(float(np.sqrt(mask.sum() / config.coarse_pixels))))
