@@ -67,21 +67,20 @@ class Runner:
         refining: "RefineConfig | None" = None, flat: Flatness = NOT_FLAT,
     ) -> None:  # fmt: skip
         self.method, self.config = method, _fill_config(config or InferenceConfig(), method)
-        self.refining, self.flat = refining, flat
+        self.refining, self.flat, self.any_light = refining, flat, False
         self.files = {name: find(name) for name in sorted(method.models())}
 
         def model(name: str) -> "TrainedModel | None":
             return _load(self.files[name]) if name in self.files else None
 
         lighting, normals = (model(getattr(method, place)) for place in _PLACES)
+        if normals is not None and MODELS[normals.name].any_light:  # it has learned what a room adds
+            self.config, self.any_light = replace(self.config, stray_light=False), method.lighting != TRUE_LIGHTS
         self.estimator = None
         if lighting is not None or normals is not None:
             self.estimator = Estimator(
                 lighting=lighting, normals=normals, device=default_device(), **self.config.options()
             )
-        self.any_light = False
-        if normals is not None and method.lighting != TRUE_LIGHTS:
-            self.any_light = MODELS[normals.name].any_light
 
     def identity(self) -> str:
         """Return a digest of what results depend on besides images and code: weights, settings and arithmetic."""

@@ -15,6 +15,8 @@ from sdps.inference.stray_light import find_shadow
 from sdps.methods import light_witness, pretrained
 from sdps.methods.flat_things import Flatness
 from sdps.methods.light_witness import is_lit_by_lamps
+from sdps.methods.parse import parse
+from sdps.methods.runner import Runner
 
 
 def shade(lights: np.ndarray, ambient: float) -> tuple[np.ndarray, np.ndarray]:
@@ -97,6 +99,17 @@ def test_photographs_in_a_lit_room_are_not_taken_for_those_of_a_lamp(
     assert any("in shadow" in finding.text for finding in found.findings)
     assert sdps.plan(photos, models=out).method == found.method
     assert "anylight" not in sdps.plan(photos, models=out, lit_by="lamp").method
+
+
+def test_of_any_light_nothing_is_taken_off_the_images_and_no_lights_are_told(tmp_path: Path) -> None:
+    images, mask = shade(RING, 0.02)
+    find = pretrained.finder(write_weights(tmp_path))
+    runner = Runner(parse("anylight", find), find)
+    found = runner.estimate(images, mask, None, None)
+    assert found.stray_light is not None and not found.stray_light.any() and runner.any_light
+    assert found.light_directions.shape == (0, 3) and not len(found.intensities) and found.nearness is None
+    lamps = Runner(parse("true+frames-any", find), find).estimate(images, mask, RING, np.ones(8))
+    assert np.array_equal(lamps.light_directions, RING), "lamps that are given are kept"
 
 
 def test_photographs_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,12 @@ def test_a_card_of_weights_with_nonsense_in_them_is_refused(values: dict, tmp_pa
         render_card(path)
 
 
+def test_validation_tells_how_many_images_it_had(tmp_path: Path) -> None:
+    alike = render_card(write_run(tmp_path / "alike", None, config=replace(CONFIG, images=12)))
+    other = render_card(write_run(tmp_path / "other", None, config=replace(CONFIG, images=12, validation_images=8)))
+    assert "does not see, 12 images of each" in alike and "does not see, 8 images of each" in other
+
+
 def test_errors_of_lights_are_those_of_lights_that_were_found(tmp_path: Path) -> None:
     given = render_card(write_run(tmp_path / "given", None))
     found = render_card(write_run(tmp_path / "found", None, lights="lcnet"))
