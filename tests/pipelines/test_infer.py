@@ -369,6 +369,18 @@ def test_what_does_not_fit_stops_before_it_starts(hills: tuple, tmp_path: Path, 
     assert main(["infer", str(folder), *map(str, flags), "--anyway"]) == 0
 
 
+def test_under_any_light_the_page_tells_what_refinement_did(hills: tuple, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert main(["infer", str(hills[0]), "--lit-by", "any", "--out", str(out)]) == 0
+    page, said = (out / "report.html").read_text(), capsys.readouterr().out
+    assert "No lamps were found." in page and "No lamps were found." in said
+    assert "refinement moved normals" in page and "photographs not explained" not in page
+    written = {path.name for path in out.iterdir()}
+    assert written == {*FILES, "albedo.npy", "expected-error.npy", "relit"} - {"lights.json"}
+    assert main(["export", str(out), "--as", "materials"]) == 2
+    assert "does not tell how it shines; photograph it under one lamp" in capsys.readouterr().err
+
+
 def test_every_stage_tells_how_far_it_is(hills: tuple, tmp_path: Path) -> None:
     folder, _, _ = hills
     told: dict[str, list[float]] = {}

@@ -34,7 +34,9 @@ def name_camera(photos: "Photographs") -> str:
 
 
 def tell_lamps(result: "Inference") -> str:
-    """Return the sentence that says how far away the lamps stood."""
+    """Return the sentence that says how far away the lamps stood, if any were found."""
+    if not len(result.light_directions):
+        return "No lamps were found."
     text: str = result.lamps["text"]
     return f"{text[0].upper()}{text[1:]}."
 
@@ -211,14 +213,18 @@ def _refinement_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     if "refined" not in facts:
         return []
     about = facts["refined"]
-    unexplained = about["unexplained"]
-    return [
+    moved, turned = about["normals_moved_degrees"], about.get("lights_moved_degrees")
+    rows = [
         ("refined", "yes" if about["kept"] else f"no: {about['doubt']}"),
-        ("refinement moved normals, lights", f"{about['normals_moved_degrees']}°, {about['lights_moved_degrees']}°"),
+        ("refinement moved normals", f"{moved}°") if turned is None else
+        ("refinement moved normals, lights", f"{moved}°, {turned}°"),
         ("error of the refined normals to expect", f"{about['expected_normal_error_degrees']}°"),
-        ("photographs not explained", f"{len(unexplained)}{_list_images(unexplained)}"),
-        *_fusion_rows(facts.get("fused")),
-    ]
+    ]  # fmt: skip
+    if turned is None:  # no lamps lit it
+        return rows
+    unexplained = about["unexplained"]
+    listed = ("photographs not explained", f"{len(unexplained)}{_list_images(unexplained)}")
+    return [*rows, listed, *_fusion_rows(facts.get("fused"))]
 
 
 def _fusion_rows(about: dict[str, float] | None) -> list[tuple[str, str]]:

@@ -103,6 +103,11 @@ def read_surface(result: SavedResult) -> Surface:
     """
     facts = result.facts.get("refined")
     albedo, strength = result.albedo, result.highlights
+    if isinstance(facts, dict) and strength is None and "light" in facts:
+        raise InputError(
+            f"{result.folder}: found under light from all around, which does not tell how it shines; photograph it "
+            "under one lamp at a time"
+        )
     if not isinstance(facts, dict) or albedo is None or strength is None:
         raise InputError(
             f"{result.folder}: nothing was refined, so how it shines is not known; run `sdps infer --refine` again"
