@@ -1,7 +1,7 @@
 """What refinement under low-order light gains, by kind of light and number of images.
 
     python -m lab.studies.low_order_study DATA
-    python -m lab.studies.low_order_study DATA --method runs/anylight.safetensors
+    python -m lab.studies.low_order_study DATA --method anylight
 
 Scenes and light are those of `any_light_study`. It starts from true normals that are disturbed (`disturb`), or from
 those of a method, with the errors that it expects.

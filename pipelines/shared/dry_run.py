@@ -46,8 +46,8 @@ def write_rows(rows: dict[str, str]) -> str:
 def _name_lights(photos: "Photographs") -> str:
     """Say what is known of the lights."""
     found = photos.light_directions is None
-    strengths = "to be found" if photos.intensities is None else "given"
-    return f"directions {'to be found' if found else f'from {photos.lights_name}'}; intensities {strengths}"
+    strengths = "not known" if photos.intensities is None else "given"
+    return f"directions {'not known' if found else f'from {photos.lights_name}'}; intensities {strengths}"
 
 
 def _name_size(photos: "Photographs") -> str:
