@@ -316,10 +316,10 @@ def choose_method(
         return method, ()
     find, chosen = _finder(models), method.replace(AUTO, ANY_LIGHT, 1)
     if lit_by == "any":
-        _find_any_light(find)
+        parse(ANY_LIGHT, find)
         return chosen, ()
     try:
-        _find_any_light(find)
+        parse(ANY_LIGHT, find)
     except InputError:  # no weights
         return method, ()
     if flat.asked or _see_lamps(images, mask, models, config):
@@ -330,16 +330,6 @@ def choose_method(
         "use one lamp; if you did, say so with --lit-by lamp."
     )
     return chosen, (Finding("note", text),)
-
-
-def _find_any_light(find: Callable[[str], Path]) -> None:
-    """Look for the weights of the networks for any light.
-
-    Raises:
-        InputError: they are not there.
-    """
-    for name in COMBINATIONS[ANY_LIGHT].members():
-        find(name)
 
 
 def _see_lamps(

@@ -61,8 +61,8 @@ class Sample:
 
 def read_sample(folder: Path, there: Sequence[SceneSpec], count: int) -> Sample:
     """Read the scenes to be shown, and some more for the histograms, one shard at a time."""
-    shown = {scene.id for scene in spread_evenly(there, count)}
-    places = sorted({*spread_evenly(range(len(there)), count), *spread_evenly(range(len(there)), MEASURED)})
+    some, more = (spread_evenly(range(len(there)), most) for most in (count, MEASURED))
+    shown, places = {there[place].id for place in some}, sorted({*some, *more})
     staged = set(spread_evenly(sorted(shown), STAGES))
     sample = Sample()
     for place in progress_bar(places, unit="shard", desc="preview"):

@@ -4,7 +4,6 @@ import base64
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from matplotlib import colormaps
@@ -19,7 +18,6 @@ from render.shared.seeds import spread_evenly
 from sdps.core.intensities import grey
 from sdps.photos.response import display
 
-T = TypeVar("T")
 _PAPER = (255, 255, 255)
 
 

@@ -73,8 +73,10 @@ class Placed(NamedTuple):
         vectors = strengths @ self.directions
         lengths = np.linalg.norm(vectors, axis=1).clip(_FAINTEST)
         nearness = strengths @ self.nearness / strengths.sum(axis=1)
-        mixed = (vectors / lengths[:, None], nearness, lengths)
-        return Placed(self.places, self.sights, *(part.astype(np.float32) for part in mixed))
+        directions, nearness, irradiance = (
+            part.astype(np.float32) for part in (vectors / lengths[:, None], nearness, lengths)
+        )
+        return self._replace(directions=directions, nearness=nearness, irradiance=irradiance)
 
 
 def lay_out(scene: SceneSpec, depth: np.ndarray, mask: np.ndarray, chosen: np.ndarray) -> Layout:

@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from torch.nn import functional
 
 from render.shared.errors import InputError
-from sdps.core.lighting import LightClasses, azimuth_elevation, bin_centre, bin_index, unit_direction
+from sdps.core.lighting import (
+    IRRADIANCE,
+    LightClasses,
+    azimuth_elevation,
+    bin_centre,
+    bin_index,
+    harmonics,
+    unit_direction,
+)
 from sdps.core.metrics import angle_degrees, intensity_error
 
 LIGHTS = Path(__file__).parents[3] / "assets" / "lights"
@@ -32,6 +41,16 @@ def test_axes_of_the_frame(direction: tuple, angles: tuple) -> None:
     # x right is azimuth +90, y up is elevation +90, z to the camera is the origin of both.
     found = azimuth_elevation(np.array(direction, float))
     np.testing.assert_allclose(found, angles, atol=1e-9)
+
+
+def test_harmonics_are_orthonormal_and_shade_as_lambert_does() -> None:
+    torch.manual_seed(7)
+    vectors = functional.normalize(torch.randn(200_000, 3), dim=-1)
+    basis = harmonics(vectors)
+    torch.testing.assert_close(basis.T @ basis / len(basis), torch.eye(9), atol=0.02, rtol=0)
+    lamp, normals = functional.normalize(torch.randn(3), dim=0), vectors[:500]
+    shown = harmonics(normals) * torch.tensor(IRRADIANCE) @ harmonics(lamp) / 4
+    assert (shown - (normals @ lamp).clamp(min=0.0)).abs().mean() < 0.04  # 0.03: of order two
 
 
 def test_azimuth_turns_about_the_vertical_axis() -> None:
