@@ -36,7 +36,7 @@ from sdps.training.distributed import Team, team
 from sdps.training.loggers import JsonlLogger, Logger, Meter, TensorBoardLogger
 from sdps.training.muon import Muon
 from sdps.training.stages import Stage
-from sdps.training.training_config import TrainingConfig
+from sdps.training.training_config import EARLIER_NAMES, TrainingConfig
 
 CHECKPOINT = "checkpoint.pt"
 METRICS = "metrics.jsonl"
@@ -413,6 +413,7 @@ class Trainer:
         defaults = {f"config.{key}": value for key, value in to_plain(type(self.config)()).items()}
         for key, value in self._identity().items():
             was = saved.get(key, defaults.get(key))
+            was = EARLIER_NAMES.get(was, was) if isinstance(was, str) else was
             if isinstance(was, dict) and isinstance(defaults.get(key), dict):
                 was = defaults[key] | was
             if was != value:

@@ -15,6 +15,10 @@ from sdps.core.precision import Precision
 from sdps.data.augment import Augmentation
 from sdps.models.lcnet import EARLY_SIZE, INPUT_SIZE
 
+Schedule = Literal["halving", "cosine", "constant", "warmup-stable-decay", "trapezoid"]
+EARLIER_NAMES = {"trapezoid": "warmup-stable-decay"}
+"""What presets, checkpoints and cards of earlier versions call a schedule."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
@@ -37,9 +41,9 @@ class TrainingConfig:
             many to `images`; 0: always `images`.
         size: Side in pixels to which scenes of another size are resized.
         learning_rate: Peak learning rate.
-        schedule: `halving` (after each of `halve_after`), `cosine` (to zero), `constant`, or `trapezoid`
-            (warm-up-stable-decay): constant until the last share `cooldown` of the budget, then linearly to zero; the
-            budget may be raised until then.
+        schedule: `halving` (after each of `halve_after`), `cosine` (to zero), `constant`, or
+            `warmup-stable-decay`: constant until the last share `cooldown` of the budget, then linearly to zero; the
+            budget may be raised until then. `trapezoid` is an earlier name of it.
         cooldown: See `schedule`.
         halve_after: Epochs after which `halving` halves; scaled with the budget when it is not `epochs`.
         warmup: Share of the budget over which the learning rate rises linearly from zero.
@@ -81,7 +85,7 @@ class TrainingConfig:
     fewest_images: int = 0
     size: int = 128
     learning_rate: float = 5e-4
-    schedule: Literal["halving", "cosine", "constant", "trapezoid"] = "halving"
+    schedule: Schedule = "halving"
     halve_after: tuple[float, ...] = (5.0, 10.0, 15.0)
     cooldown: float = 0.2
     warmup: float = 0.0
@@ -106,6 +110,7 @@ class TrainingConfig:
     augmentation: Augmentation = field(default_factory=Augmentation)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "schedule", EARLIER_NAMES.get(self.schedule, self.schedule))
         for name in ("epochs", "steps", "minutes", "batch_scenes", "accumulate", "images", "validation_images",
                      "learning_rate", "shuffle_window", "log_every", "checkpoint_minutes"):  # fmt: skip
             value = getattr(self, name)
@@ -152,7 +157,7 @@ class TrainingConfig:
         if self.schedule == "cosine":
             annealed = (min(progress, 1.0) - self.warmup) / (1.0 - self.warmup)
             return peak * 0.5 * (1.0 + math.cos(math.pi * annealed))
-        if self.schedule == "trapezoid":
+        if self.schedule == "warmup-stable-decay":
             return peak * min(1.0, max(1.0 - progress, 0.0) / max(self.cooldown, 1e-9))
         return peak
 
@@ -253,7 +258,7 @@ class PixelTraining(NormalTraining):
     batch_scenes: int = 8
     images: int = 64
     learning_rate: float = 1e-3
-    schedule: Literal["halving", "cosine", "constant", "trapezoid"] = "constant"
+    schedule: Schedule = "constant"
     halve_after: tuple[float, ...] = ()
     pixels_per_scene: int = 96
     min_lights: int = 8

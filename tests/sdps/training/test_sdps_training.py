@@ -179,6 +179,15 @@ def test_a_checkpoint_older_than_a_setting_had_its_default(folder: Path, tmp_pat
     assert train(NormalStage(QUICK), folder, tmp_path).steps == 8
 
 
+def test_a_checkpoint_may_call_its_schedule_by_the_earlier_name(folder: Path, tmp_path: Path) -> None:
+    config = replace(QUICK, schedule="warmup-stable-decay", cooldown=0.5)
+    train(NormalStage(config), folder, tmp_path, loggers=[StopAt(2)])
+    state = load_state(tmp_path / CHECKPOINT)
+    state["identity"]["config.schedule"] = "trapezoid"
+    save_state(tmp_path / CHECKPOINT, state)
+    assert train(NormalStage(config), folder, tmp_path).steps == 8
+
+
 def test_minutes_are_counted_across_resumed_runs(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     looks = count()  # a clock that goes on by a tenth of a second whenever it is looked at
     monkeypatch.setattr(trainer, "time", SimpleNamespace(perf_counter=lambda: 0.1 * next(looks)))
@@ -441,6 +450,7 @@ def test_schedules_of_the_paper() -> None:
     trapezoid = LightingTraining(schedule="trapezoid", cooldown=0.2, warmup=0.1)
     rates = [trapezoid.learning_rate_at(progress) for progress in (0.05, 0.5, 0.79, 0.9, 1.0)]
     np.testing.assert_allclose(rates, [2.5e-4, 5e-4, 5e-4, 2.5e-4, 0.0], atol=1e-12)
+    assert trapezoid == LightingTraining(schedule="warmup-stable-decay", cooldown=0.2, warmup=0.1), "an earlier name"
 
 
 @pytest.mark.parametrize(
