@@ -18,11 +18,11 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn import functional
-from tqdm import tqdm
 
 from lab.shared.answered_scenes import Answered, read_all, tabulate
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
+from render.shared.progress import progress_bar
 from sdps.core.losses import expected_error_loss
 from sdps.core.symmetry import SYMMETRIES
 from sdps.methods.fusion.fuse import load_fusion
@@ -41,7 +41,7 @@ def train(scenes: Sequence[Answered], epochs: int, width: int, seed: int) -> Fus
     steps = epochs * math.ceil(len(given) / _BATCH)
     adam = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)
     plan = torch.optim.lr_scheduler.OneCycleLR(adam, _RATE, total_steps=steps, pct_start=_WARM)
-    bar = tqdm(total=steps, disable=None)
+    bar = progress_bar(total=steps, desc="fusion")
     for _ in range(epochs):
         for some in np.array_split(rng.permutation(len(given)), math.ceil(len(given) / _BATCH)):
             inputs, truth = _batch([given[number] for number in some], rng)

@@ -1,6 +1,7 @@
 """Measure how reflectance of real materials leaves the model of refinement: assets/reflectance_modes.yaml.
 
     python -m lab.studies.reflectance_modes
+    python -m lab.studies.reflectance_modes --left pink-felt black-obsidian     # what the whole model does not explain
 
 Spheres of the fitted MERL materials that networks are trained on (the held-out ones are left out), under 100 lights;
 normals and lights are known. The reflectance of refinement without its modes is fitted to each sphere. What is left,
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
+from torch import Tensor
 from tqdm import tqdm
 
 from render.materials.fit.spheres import hemisphere_lights, shading_frame, sphere_normals
@@ -24,12 +26,13 @@ from render.materials.model import Material, evaluate
 from render.shared.files import atomic_path
 from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.image_model import State, build_model
-from sdps.refinement.modes import ASSET, compare_logs
+from sdps.refinement.modes import ASSET, LEAST_RADIANCE, compare_logs
 from sdps.refinement.problems import build_problem
 from sdps.refinement.refine import build_start
-from sdps.refinement.reflectance import MODES, measure_angles, mode_terms
+from sdps.refinement.reflectance import MODES, evaluate_factor, measure_angles, mode_terms, reflect
 
 _SIDE, _LIGHTS, _ITERATIONS = 42, 100, 300
+_GRAZING = 0.2
 _KEPT = 0.9  # share of the materials
 
 
@@ -37,9 +40,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Fit, and write the asset."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ASSET)
+    parser.add_argument("--left", nargs="+", metavar="NAME", help="materials; only say what is left of them")
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     lights = hemisphere_lights(_LIGHTS, np.random.default_rng(0)).astype(np.float32)
+    if args.left:
+        for name in tqdm(args.left, disable=None):
+            sys.stdout.write(f"{name}: {describe_left(load(name), lights)}\n")
+        return 0
     chosen = sorted(set(names()) - set(held_out()))
     found = np.stack([coefficients(load(name), lights) for name in tqdm(chosen, disable=None)])
     size = np.square(found).sum(axis=1)
@@ -51,8 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def coefficients(material: Material, lights: np.ndarray) -> np.ndarray:  # (MODES,)
-    """Return the coefficients of a material's modes."""
+def fit(material: Material, lights: np.ndarray, *free: str) -> tuple[np.ndarray, Problem, State]:
+    """Return the normals (P, 3) of a material's sphere, its images, and what is fitted to them."""
     mask, normals = sphere_normals(_SIDE)
     images = np.zeros((len(normals), 3, len(lights)), np.float32)
     for number, light in enumerate(lights):
@@ -60,8 +68,35 @@ def coefficients(material: Material, lights: np.ndarray) -> np.ndarray:  # (MODE
         images[:, :, number] = np.pi * evaluate(material, wi, wo) * np.maximum(wi[:, 2:], 0.0)
     problem: Problem = build_problem(images, mask, 1, np.ones((len(lights), 3)), np.full((3, len(lights)), np.inf))
     state: State = build_start(problem, normals, lights, np.ones((len(lights), 3)))
-    free = frozenset({"log_albedo", "log_strength", "body", "lobes", "log_sharpness"})
-    state = solve(problem, state, free=free, iterations=_ITERATIONS, boost=4.0, weights=Weights())
+    moving = frozenset({"log_albedo", "log_strength", "body", "lobes", "log_sharpness", *free})
+    return normals, problem, solve(problem, state, free=moving, iterations=_ITERATIONS, boost=4.0, weights=Weights())
+
+
+def describe_left(material: Material, lights: np.ndarray) -> str:
+    """Return how far radiance and model differ, as logarithms: in all, where light grazes, and between channels."""
+    _, problem, state = fit(material, lights, "modes")
+    model = build_model(state)
+    seen = model.see(None)
+    angles = measure_angles(seen.normals, seen.directions)
+    lit = evaluate_factor(angles, state.modes) * seen.cosines.clamp_min(0.0)
+    predicted = reflect(angles, model) * lit[:, None]
+    left = torch.log((problem.images + LEAST_RADIANCE) / (predicted + LEAST_RADIANCE))  # (P, 3, L)
+    grey, weights = left.mean(dim=1), lit * (problem.usable > 0.0) * (predicted.mean(dim=1) > LEAST_RADIANCE)
+    colour = (left - grey[:, None]).square().mean(dim=1)
+    grazing = weights * (seen.cosines < _GRAZING)
+
+    def average(values: Tensor, shares: Tensor) -> float:
+        return float((values * shares).sum() / shares.sum())
+
+    return (
+        f"root mean square {average(grey.square(), weights) ** 0.5:.3f}, where n.l < {_GRAZING} the mean is "
+        f"{average(grey, grazing):+.3f}; channels differ by {average(colour, weights) ** 0.5:.3f}"
+    )
+
+
+def coefficients(material: Material, lights: np.ndarray) -> np.ndarray:  # (MODES,)
+    """Return the coefficients of a material's modes."""
+    normals, problem, state = fit(material, lights)
     model = build_model(state)
     seen = model.see(None)
     angles = measure_angles(seen.normals, seen.directions)

@@ -30,7 +30,8 @@ _OBSERVATIONS = 100.0
 """What all observations of an object count as together: errors of neighbouring pixels and lights correlate."""
 _SPREAD = 0.04
 """Standard deviation of the logarithms, apart from G."""
-_LEAST_RADIANCE, _LEAST_LIT = 0.02, 0.1
+LEAST_RADIANCE, _LEAST_LIT = 0.02, 0.1
+"""Added to radiance before its logarithm; least n . l that counts."""
 _LEAST_MOMENT = 1e-6
 _PART = 4096
 ASSET = Path(str(resources.files("assets"))) / "reflectance_modes.yaml"
@@ -70,8 +71,8 @@ def compare_logs(
     reflected = reflect(angles, model)
     predicted = (reflected * cosine.clamp_min(0.0)[:, None]).mean(dim=1)
     observed = seen.even_out(images * torch.exp(-model.log_intensities).T).mean(dim=1)
-    left = torch.log((observed + _LEAST_RADIANCE) / (predicted + _LEAST_RADIANCE))
-    weights = cosine * ((cosine > _LEAST_LIT) & (usable > 0.0) & (predicted > _LEAST_RADIANCE))
+    left = torch.log((observed + LEAST_RADIANCE) / (predicted + LEAST_RADIANCE))
+    weights = cosine * ((cosine > _LEAST_LIT) & (usable > 0.0) & (predicted > LEAST_RADIANCE))
     return left.clamp(-MOST_LOG_FACTOR, MOST_LOG_FACTOR), weights / weights.sum().clamp_min(1e-9)
 
 

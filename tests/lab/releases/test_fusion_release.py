@@ -119,12 +119,14 @@ def test_what_half_floats_do_not_hold_is_kept_as_their_largest(tmp_path: Path) -
     assert np.isfinite(back.evidence.gloss).all() and back.evidence.gloss.max() == 65504.0
 
 
-def test_an_answer_that_is_not_finite_stops_the_training(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_answer_that_is_not_finite_stops_the_training_and_the_step_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fusion, "_SIDE", 24)
+    monkeypatch.setattr(fusion, "_BATCH", 1)
     scene = answered(1)
     broken = replace(scene, evidence=replace(scene.evidence, gloss=scene.evidence.gloss * np.float32(np.inf)))
-    with pytest.raises(ArithmeticError, match="not finite"):
-        fusion.train([broken], 1, 16, 0)
+    last = int(np.random.default_rng(0).permutation(3)[-1])
+    with pytest.raises(ArithmeticError, match="at step 2; an answer is not finite"):
+        fusion.train([broken if number == last else scene for number in range(3)], 1, 16, 0)
 
 
 def test_photographs_are_those_of_cameras_that_expose_as_people_do(tmp_path: Path) -> None:
