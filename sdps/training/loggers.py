@@ -82,7 +82,11 @@ class TensorBoardLogger:
 
 
 class Meter:
-    """Averages losses and measures speed and waiting between two lines of metrics."""
+    """Averages losses and measures speed and waiting between two lines of metrics.
+
+    Attributes:
+        steps: Taken since the last line.
+    """
 
     def __init__(self) -> None:
         self._all_waited, self._all_started = 0.0, time.perf_counter()
@@ -90,7 +94,7 @@ class Meter:
 
     def _restart(self) -> None:
         self._losses: dict[str, list[float]] = {}
-        self._images, self._waited, self._started = 0, 0.0, time.perf_counter()
+        self.steps, self._images, self._waited, self._started = 0, 0, 0.0, time.perf_counter()
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
@@ -103,6 +107,7 @@ class Meter:
     def add(self, losses: dict[str, float], images: int) -> None:
         """Take the losses of one step on so many images."""
         self._images += images
+        self.steps += 1
         for name, value in losses.items():
             self._losses.setdefault(name, []).append(value)
 

@@ -146,6 +146,12 @@ def _run(trainer: "Trainer", loggers: Iterable[Logger], stop: StopRequest) -> tu
     saved = time.perf_counter()
     look = {"desc": trainer.stage.name, "bar_format": "{l_bar}{bar}| {elapsed}<{remaining} {postfix}"}
     bar = progress_bar(total=100.0, initial=100.0 * trainer.progress(), disable=not trainer.team.leads, **look)
+
+    def tell() -> None:
+        values = meter.summary() | {"learning_rate": trainer.learning_rate, "seconds": trainer.seconds()}
+        _report(loggers, trainer.step, values)
+        bar.set_postfix_str(f"loss {values['loss']:.3f}, {values['images_per_second']:.0f} images/s")
+
     with bar:
         while True:
             stopped = trainer.team.any(stop.requested)
@@ -158,15 +164,15 @@ def _run(trainer: "Trainer", loggers: Iterable[Logger], stop: StopRequest) -> tu
                 raise batch
             meter.add(trainer.take_step(batch, progress), batch.images.shape[0] * batch.images.shape[1])
             if trainer.step % config.log_every == 0:
-                values = meter.summary() | {"learning_rate": trainer.learning_rate, "seconds": trainer.seconds()}
-                _report(loggers, trainer.step, values)
-                bar.set_postfix_str(f"loss {values['loss']:.3f}, {values['images_per_second']:.0f} images/s")
+                tell()
             if config.validate_every and trainer.step % config.validate_every == 0 and trainer.team.leads:
                 _report(loggers, trainer.step, trainer.validate())
             if trainer.team.leads and time.perf_counter() - saved > 60.0 * config.checkpoint_minutes:
                 trainer.save()
                 saved = time.perf_counter()
             bar.update(100.0 * min(trainer.progress(), 1.0) - bar.n)
+        if meter.steps and not stopped:  # a run shorter than `log_every` has a line, too
+            tell()
     return meter.total_waiting_share(), stopped
 
 

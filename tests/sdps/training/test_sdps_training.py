@@ -23,6 +23,7 @@ from render.shared.errors import InputError
 from sdps.data.dataset import SampleKey, SceneDataset, collate
 from sdps.models.checkpoint import TrainedModel, load_state, load_weights, save_state, save_weights
 from sdps.models.registry import MODELS, create
+from sdps.publishing.learning_curves import read_metrics, write_curves
 from sdps.training import recipes, trainer
 from sdps.training.stage_factory import create_stage
 from sdps.training.stages import LightingStage, NormalStage
@@ -240,6 +241,16 @@ def test_averaged_weights_are_validated_saved_and_resumed(folder: Path, tmp_path
     train(NormalStage(config), folder, tmp_path / "parts", loggers=[StopAt(2)])
     train(NormalStage(config), folder, tmp_path / "parts")
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_the_last_steps_have_a_line_of_metrics_however_few_they_are(folder: Path, tmp_path: Path) -> None:
+    for steps, lines in ((2, [2]), (4, [3, 4])):
+        config = replace(QUICK, steps=steps, log_every=3, validation_scenes=0, validate_every=0)
+        place = tmp_path / str(steps)
+        train(NormalStage(config), folder, place)
+        rows = read_metrics(next(place.rglob("metrics.jsonl")))
+        assert [row["step"] for row in rows if "loss" in row] == lines
+        write_curves(next(place.rglob("metrics.jsonl")), tmp_path / "curves.png")
 
 
 def test_weights_that_are_kept_may_hold_a_share_of_the_start(folder: Path, tmp_path: Path) -> None:
