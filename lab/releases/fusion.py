@@ -41,9 +41,9 @@ def train(scenes: Sequence[Answered], epochs: int, width: int, seed: int) -> Fus
     steps = epochs * math.ceil(len(given) / _BATCH)
     adam = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)
     plan = torch.optim.lr_scheduler.OneCycleLR(adam, _RATE, total_steps=steps, pct_start=_WARM)
-    bar = progress_bar(total=steps, desc="fusion")
-    for _ in range(epochs):
-        for some in np.array_split(rng.permutation(len(given)), math.ceil(len(given) / _BATCH)):
+    parts = (part for _ in range(epochs) for part in np.array_split(rng.permutation(len(given)), steps // epochs))
+    with progress_bar(total=steps, desc="fusion") as bar:
+        for some in parts:
             inputs, truth = _batch([given[number] for number in some], rng)
             adam.zero_grad(set_to_none=True)
             loss = _loss(network, inputs, truth)

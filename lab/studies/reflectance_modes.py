@@ -13,6 +13,8 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -29,7 +31,7 @@ from sdps.refinement.image_model import State, build_model
 from sdps.refinement.modes import ASSET, LEAST_RADIANCE, compare_logs
 from sdps.refinement.problems import build_problem
 from sdps.refinement.refine import build_start
-from sdps.refinement.reflectance import MODES, evaluate_factor, measure_angles, mode_terms, reflect
+from sdps.refinement.reflectance import MODES, measure_angles, mode_terms, shade
 
 _SIDE, _LIGHTS, _ITERATIONS = 42, 100, 300
 _GRAZING = 0.2
@@ -40,13 +42,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Fit, and write the asset."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ASSET)
-    parser.add_argument("--left", nargs="+", metavar="NAME", help="materials; only say what is left of them")
+    parser.add_argument("--left", nargs="+", metavar="NAME", help="only say what is left of these materials")
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     lights = hemisphere_lights(_LIGHTS, np.random.default_rng(0)).astype(np.float32)
     if args.left:
         for name in tqdm(args.left, disable=None):
-            sys.stdout.write(f"{name}: {describe_left(load(name), lights)}\n")
+            grey, grazing, colour = measure_left(load(name), lights)
+            sys.stdout.write(
+                f"{name}: {grey:.3f}; {grazing:+.3f} where n.l < {_GRAZING}; channels {colour:.3f} apart\n"
+            )
         return 0
     chosen = sorted(set(names()) - set(held_out()))
     found = np.stack([coefficients(load(name), lights) for name in tqdm(chosen, disable=None)])
@@ -59,8 +64,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def fit(material: Material, lights: np.ndarray, *free: str) -> tuple[np.ndarray, Problem, State]:
-    """Return the normals (P, 3) of a material's sphere, its images, and what is fitted to them."""
+class Left(NamedTuple):
+    """How far the logarithms of radiance and of the model differ: root mean squares, but for `grazing`."""
+
+    grey: float  # of the channels' mean
+    grazing: float  # mean of that where n . l is small
+    colour: float  # between the channels
+
+
+def fit(material: Material, lights: np.ndarray, *more: str) -> tuple[Problem, State]:
+    """Return the images of a material's sphere, and the state fitted to them; `more`: what is free besides."""
     mask, normals = sphere_normals(_SIDE)
     images = np.zeros((len(normals), 3, len(lights)), np.float32)
     for number, light in enumerate(lights):
@@ -68,40 +81,38 @@ def fit(material: Material, lights: np.ndarray, *free: str) -> tuple[np.ndarray,
         images[:, :, number] = np.pi * evaluate(material, wi, wo) * np.maximum(wi[:, 2:], 0.0)
     problem: Problem = build_problem(images, mask, 1, np.ones((len(lights), 3)), np.full((3, len(lights)), np.inf))
     state: State = build_start(problem, normals, lights, np.ones((len(lights), 3)))
-    moving = frozenset({"log_albedo", "log_strength", "body", "lobes", "log_sharpness", *free})
-    return normals, problem, solve(problem, state, free=moving, iterations=_ITERATIONS, boost=4.0, weights=Weights())
+    free = frozenset({"log_albedo", "log_strength", "body", "lobes", "log_sharpness", *more})
+    return problem, solve(problem, state, free=free, iterations=_ITERATIONS, boost=4.0, weights=Weights())
 
 
-def describe_left(material: Material, lights: np.ndarray) -> str:
-    """Return how far radiance and model differ, as logarithms: in all, where light grazes, and between channels."""
-    _, problem, state = fit(material, lights, "modes")
+def measure_left(material: Material, lights: np.ndarray) -> Left:
+    """Return what the whole model does not explain of a material's sphere."""
+    problem, state = fit(material, lights, "modes")
     model = build_model(state)
     seen = model.see(None)
-    angles = measure_angles(seen.normals, seen.directions)
-    lit = evaluate_factor(angles, state.modes) * seen.cosines.clamp_min(0.0)
-    predicted = reflect(angles, model) * lit[:, None]
+    predicted = shade(seen.normals, seen.directions, SimpleNamespace(**model._asdict(), modes=state.modes))
     left = torch.log((problem.images + LEAST_RADIANCE) / (predicted + LEAST_RADIANCE))  # (P, 3, L)
-    grey, weights = left.mean(dim=1), lit * (problem.usable > 0.0) * (predicted.mean(dim=1) > LEAST_RADIANCE)
-    colour = (left - grey[:, None]).square().mean(dim=1)
-    grazing = weights * (seen.cosines < _GRAZING)
+    grey, usable = left.mean(dim=1), (problem.usable > 0.0) & (predicted.mean(dim=1) > LEAST_RADIANCE)
+    weights = seen.cosines.clamp_min(0.0) * usable
 
     def average(values: Tensor, shares: Tensor) -> float:
         return float((values * shares).sum() / shares.sum())
 
-    return (
-        f"root mean square {average(grey.square(), weights) ** 0.5:.3f}, where n.l < {_GRAZING} the mean is "
-        f"{average(grey, grazing):+.3f}; channels differ by {average(colour, weights) ** 0.5:.3f}"
+    return Left(
+        grey=average(grey.square(), weights) ** 0.5,
+        grazing=average(grey, weights * (seen.cosines < _GRAZING)),
+        colour=average((left - grey[:, None]).square().mean(dim=1), weights) ** 0.5,
     )
 
 
 def coefficients(material: Material, lights: np.ndarray) -> np.ndarray:  # (MODES,)
     """Return the coefficients of a material's modes."""
-    normals, problem, state = fit(material, lights)
+    problem, state = fit(material, lights)
     model = build_model(state)
     seen = model.see(None)
     angles = measure_angles(seen.normals, seen.directions)
     left, weights = compare_logs(model, problem.images, problem.usable, seen, angles)
-    angles = measure_angles(*(torch.from_numpy(part.astype(np.float32)) for part in (normals, lights)))
+    angles = measure_angles(*(torch.from_numpy(part.astype(np.float32)) for part in (sphere_normals(_SIDE)[1], lights)))
     shapes = torch.stack([torch.ones_like(left), *mode_terms(angles)], dim=-1)
     shapes = shapes.flatten(0, 1).double()  # (P L, 1 + MODES)
     root = weights.flatten().double().sqrt()[:, None]

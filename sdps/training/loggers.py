@@ -82,11 +82,7 @@ class TensorBoardLogger:
 
 
 class Meter:
-    """Averages losses and measures speed and waiting between two lines of metrics.
-
-    Attributes:
-        steps: Taken since the last line.
-    """
+    """Averages losses and measures speed and waiting between two lines of metrics."""
 
     def __init__(self) -> None:
         self._all_waited, self._all_started = 0.0, time.perf_counter()
@@ -94,7 +90,12 @@ class Meter:
 
     def _restart(self) -> None:
         self._losses: dict[str, list[float]] = {}
-        self.steps, self._images, self._waited, self._started = 0, 0, 0.0, time.perf_counter()
+        self._images, self._waited, self._started = 0, 0.0, time.perf_counter()
+
+    @property
+    def empty(self) -> bool:
+        """Whether no step was taken since the last line."""
+        return not self._losses
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
@@ -107,7 +108,6 @@ class Meter:
     def add(self, losses: dict[str, float], images: int) -> None:
         """Take the losses of one step on so many images."""
         self._images += images
-        self.steps += 1
         for name, value in losses.items():
             self._losses.setdefault(name, []).append(value)
 

@@ -171,7 +171,7 @@ def _run(trainer: "Trainer", loggers: Iterable[Logger], stop: StopRequest) -> tu
                 trainer.save()
                 saved = time.perf_counter()
             bar.update(100.0 * min(trainer.progress(), 1.0) - bar.n)
-        if meter.steps and not stopped:  # a run shorter than `log_every` has a line, too
+        if not (stopped or meter.empty):  # a run shorter than `log_every` has a line, too
             tell()
     return meter.total_waiting_share(), stopped
 

@@ -43,7 +43,7 @@ class TrainingConfig:
         learning_rate: Peak learning rate.
         schedule: `halving` (after each of `halve_after`), `cosine` (to zero), `constant`, or
             `warmup-stable-decay`: constant until the last share `cooldown` of the budget, then linearly to zero; the
-            budget may be raised until then. `trapezoid` is an earlier name of it.
+            budget may be raised until then.
         cooldown: See `schedule`.
         halve_after: Epochs after which `halving` halves; scaled with the budget when it is not `epochs`.
         warmup: Share of the budget over which the learning rate rises linearly from zero.

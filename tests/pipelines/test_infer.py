@@ -409,7 +409,9 @@ def test_every_stage_tells_how_far_it_is(hills: tuple, tmp_path: Path) -> None:
     assert told["normals"] == sorted(told["normals"]) and len(told["normals"]) > 5
 
 
-def test_the_bench_measures_every_step(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_bench_measures_every_step(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     flags = ["--height", "48", "--width", "64", "--images", "12", "--many", "20", "--out", str(tmp_path)]
     assert lab_main(["bench-infer", *flags, "--methods", "factorisation"]) == 0
     found = json.loads((tmp_path / "bench_infer.json").read_text())["kinds"]
@@ -421,6 +423,9 @@ def test_the_bench_measures_every_step(tmp_path: Path, capsys: pytest.CaptureFix
     large = json.loads((tmp_path / "bench_large.json").read_text())
     assert large["stages"]["normals"][0] > 0 and large["peak_gib"] > 0 and large["expected"] > 0
     assert "million" not in (said := capsys.readouterr().out) and "of work), expected" in said
+    asked = []
+    monkeypatch.setattr(bench_infer, "_large", lambda _, config: asked.append((config.width, config.height)) or 0)
+    assert lab_main(["bench-infer", "--quick", "--out", str(tmp_path)]) == 0 and asked == [(800, 600)]
     assert "too dark" in bench_infer.table({"pf14": {"error": "too dark"}}, bench_infer.BenchClassicalConfig(), "here")
 
 
