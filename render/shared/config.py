@@ -209,6 +209,8 @@ def _scalar(hint: Any, value: Any, name: str) -> Any:
     if isinstance(value, bool):
         if hint is bool:
             return value
+        if hint is str:  # a name that YAML takes for a truth value, as in `lights: true`
+            return str(value).lower()
     elif hint is not bool and isinstance(value, int | float | str):
         with suppress(ValueError, OverflowError):
             if hint is not int or float(value) == int(float(value)):

@@ -57,6 +57,10 @@ def test_overrides_reach_any_field_and_convert_types():
     assert lighting.augmentation.noise == 0.0
 
 
+def test_a_name_may_be_a_word_that_yaml_takes_for_a_truth_value() -> None:
+    assert presets.load("smoke", ["runs.nenet.lights=true"]).run("nenet").config.lights == "true"
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
