@@ -32,6 +32,7 @@ RATES = {
 _LEAST_RATE = 0.02
 _SEARCH_EVERY, _WHITENESS_STEP, _WHITEST = 20, 0.05, 0.95
 """The albedo of the brightest parts is searched every so many iterations, in such steps, up to such a value."""
+_RIM = 0.5  # n_z of the start from which on pixels are not near the rim
 _PART = 4096  # pixels worked on at once
 _NEARNESS = math.log(1e-3), math.log(0.6)
 _FITS, _MISFITS = 0.01, 0.03
@@ -53,6 +54,8 @@ class Weights(NamedTuple):
         near: Of how far the normals are from the start, by how badly the model fits: a model that does not describe
             the object's reflectance would explain it by wrong normals.
         dark: The same for pixels that are dark in all images, which say little, however well the model fits.
+        rim: The same for pixels near the rim of the object as the start sees it. Networks see the outline, and know how
+            steep the surface is there; the model, where it lacks something of the reflectance, flattens the rim.
         uneven: Of how differently far the lamps stand, where each has a distance of its own: mean square of logarithms.
     """
 
@@ -65,6 +68,7 @@ class Weights(NamedTuple):
     shift: tuple[float, float] = (10.0, 0.03)
     near: float = 0.15
     dark: float = 0.1
+    rim: float = 3.0
     uneven: float = 0.03
 
 
@@ -136,7 +140,7 @@ def solve(
     state = State(**{name: part.clone().requires_grad_(name in moving) for name, part in state._asdict().items()})
     adam = torch.optim.Adam([{"params": [getattr(state, name)], "base": RATES[name]} for name in sorted(moving)])
     start = build_model(State(*(part.detach() for part in state)))
-    faintness = _measure_faintness(problem.images)
+    held = weights.dark * _measure_faintness(problem.images) + weights.rim * _find_rim(start.normals)  # (P,)
     for number in range(iterations):
         part = number / max(iterations - 1, 1)
         for group in adam.param_groups:
@@ -146,7 +150,7 @@ def solve(
         if number % _SEARCH_EVERY == 0:
             images = _search_globals(problem, state, model, free)
         loss = data_term(model, images, problem.usable, problem.sites)
-        pull = weights.near * _measure_misfit(float(loss.detach())) + weights.dark * faintness  # (P,)
+        pull = weights.near * _measure_misfit(float(loss.detach())) + held
         loss = loss + (pull * (1.0 - (model.normals * start.normals).sum(dim=1))).mean()
         loss = loss + _sum_priors(state, model, near, weights, part, problem.sites)
         loss = loss + _hold_lamps(state, start.directions, free, weights, part)
@@ -199,6 +203,11 @@ def _measure_faintness(images: Tensor) -> Tensor:  # (P,)
         squared = images[part : part + _PART] ** 2
         bright[part : part + _PART] = (squared / (squared + DATA_FLOOR)).mean(dim=(1, 2))
     return 1.0 - bright
+
+
+def _find_rim(normals: Tensor) -> Tensor:  # (P,)
+    """Return 1 where normals (P, 3) are square to the view, to 0 from 60 degrees off it inwards."""
+    return (1.0 - normals[:, 2] / _RIM).clamp_min(0.0)
 
 
 def _sum_priors(
