@@ -26,7 +26,7 @@ from render.records.manifest import SceneSpec, read_manifest
 from render.records.shards import read_shard
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
-from render.shared.seeds import generator
+from render.shared.seeds import generator, spread_evenly
 from sdps.core.estimate import Estimate
 from sdps.core.metrics import angle_degrees, intensity_error
 from sdps.inference.inference_config import InferenceConfig
@@ -180,7 +180,7 @@ def _reliability(results: list[tuple[Scene, Estimate, Refined]], bins: int = 8) 
     for scene, begun, found in results:
         judged = expect_errors(scene, begun, found)
         actual = angle_degrees(found.normals[scene.mask], scene.normals[scene.mask])
-        some = np.linspace(0, len(actual) - 1, 500).astype(int)
+        some = spread_evenly(range(len(actual)), 500)
         normals.append(np.stack([judged.normals[scene.mask], actual])[:, some])
         lights.append(np.stack([judged.lights, angle_degrees(found.light_directions, scene.lights)]))
     for name, parts in (("normals", normals), ("lights", lights)):

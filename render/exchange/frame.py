@@ -7,6 +7,8 @@ fault of photometric-stereo data, because n . l does not change when both are fl
 import numpy as np
 from scipy import ndimage
 
+from render.shared.seeds import spread_evenly
+
 _PIXELS = 2000
 _LEAST_BORDER = 20  # pixels of silhouette below which nothing is said
 _MARGIN = 0.1  # lead in correlation another sign must have to be reported
@@ -53,7 +55,7 @@ def shading_fit(images: np.ndarray, normals: np.ndarray, mask: np.ndarray, light
         the lights, which removes the albedo.
     """
     rows, columns = np.nonzero(mask)
-    chosen = np.linspace(0, max(len(rows) - 1, 0), min(len(rows), _PIXELS)).astype(int)
+    chosen = spread_evenly(range(len(rows)), _PIXELS)
     rows, columns = rows[chosen], columns[chosen]
     grey = np.asarray(images[:, rows, columns], np.float64).mean(-1)  # (L, P)
     grey = grey / np.maximum(grey.mean(0), 1e-9)
