@@ -90,7 +90,7 @@ def measure(runner: Runner, shape: str, material: str, distance: float, focal: f
     begun, near = answered.start, answered.refined
     joined = near.normals if evidence is None else fuse(answered, evidence, mask).normals
     start = begun.normals, begun.light_directions, begun.intensities
-    distant = refine(images, mask, *start, config=_QUICK, rig=Rig(nearness=np.zeros(_LAMPS)))
+    distant = refine(images, mask, *start, config=_QUICK, rig=Rig(nearness=np.zeros(_LAMPS)), rim_known=True)
     answers = [(each.normals, each.light_directions) for each in (begun, distant, near)]
     scores = [score(*each) for each in (*answers, (joined, near.light_directions))]
     return Row(shape, material, distance, focal, *scores, float(placed.nearness.mean()), float(near.nearness.mean()))

@@ -214,7 +214,7 @@ class Runner:
         refined = refine(
             images, mask, estimate.normals, estimate.light_directions, begun,
             directions_given=lit, config=self.refining, stray=self.config.stray_light, saturation=saturation,
-            rig=rig, nearness=estimate.nearness,
+            rig=rig, nearness=estimate.nearness, rim_known=estimate.expected_error is not None,
         )  # fmt: skip
         expected = trust(refined, mask, estimate, given=lit, level=estimate.tilt is not None)
         if not self.method.fused or expected.void:

@@ -74,7 +74,7 @@ class RefineConfig:
 def refine(
     images: ImageSource, mask: np.ndarray, normals: np.ndarray, lights: np.ndarray, intensities: np.ndarray, *,
     directions_given: bool = False, rig: Rig = UNKNOWN, config: RefineConfig | None = None, stray: bool = True,
-    saturation: float = np.inf, nearness: np.ndarray | None = None,
+    saturation: float = np.inf, nearness: np.ndarray | None = None, rim_known: bool = False,
 ) -> Refined:  # fmt: skip
     """Refine normals and lights.
 
@@ -86,6 +86,7 @@ def refine(
         config, stray: Iterations and rates; whether stray light is subtracted.
         saturation: Radiance at which a channel is clipped; such observations are ignored.
         nearness: (L,) of the lamps, as a method found it: what to begin with where it is to be found.
+        rim_known: Normals of the start are good at the rim, as those of networks that tell their errors are: hold them.
 
     Raises:
         InputError: fewer than four images, shapes that do not fit, or an object that is black.
@@ -104,14 +105,15 @@ def refine(
     fine, before = config.fine_iterations if stride > 1 else 0, config.iterations_before if config.bounces else 0
     free, tries = _choose_free(directions_given, rig), 1 if rig.nearness is not None else 2
     with progress_bar(None, total=tries * before + config.iterations + fine * len(parts), desc="refine") as bar:
-        move = partial(solve, boost=config.boost, weights=Weights(), on_step=_advance(bar))
+        weights = Weights() if rim_known else Weights(rim=0.0)
+        move = partial(solve, boost=config.boost, weights=weights, on_step=_advance(bar))
         if before:
             problem, found, free = _choose_lamps(problem, start, free, partial(move, iterations=before), rig, first)
             problem, start = _trace_light(problem, start, found, config.bounces, grid)
         state = move(problem, start, free=free, iterations=config.iterations)
         if stride == 1:
             return collect(scene, [(parts[0], problem, state)], state)
-        weights = Weights(curl=(config.fine_curl, config.fine_curl))
+        weights = weights._replace(curl=(config.fine_curl, config.fine_curl))
         settle = partial(move, free=_OF_PIXELS, iterations=fine, boost=config.fine_boost, weights=weights)
         return collect(scene, _refine_tiles(scene, parts, values, problem, grid, state, full, settle), state)
 
