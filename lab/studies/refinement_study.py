@@ -103,15 +103,16 @@ def _refine(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> tu
         told = _turn(scene, wrong) if lit else (None, None)
         start = runner.estimate(scene.images, scene.mask, *told)
         gains = start.intensities if told[1] is None else told[1]
-        begun = start.normals, start.light_directions, gains
-        known = start.expected_error is not None
-        found = refine(scene.images, scene.mask, *begun, directions_given=given, rim_known=known)
+        found = refine(
+            scene.images, scene.mask, start.normals, start.light_directions, gains,
+            directions_given=given, rim_known=start.expected_error is not None,
+        )  # fmt: skip
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary, temporary.open("wb") as file:
-            kept = dict(zip(("normals", "lights", "gains"), begun, strict=True))
+            begun = {"normals": start.normals, "lights": start.light_directions, "gains": gains}
             if start.expected_error is not None:
-                kept["expected_error"] = start.expected_error
-            np.savez(file, **{f"start_{name}": value for name, value in kept.items()}, **vars(found))
+                begun["expected_error"] = start.expected_error
+            np.savez(file, **{f"start_{name}": value for name, value in begun.items()}, **vars(found))
     return read_kept(path)
 
 
