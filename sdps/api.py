@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -50,7 +50,7 @@ from sdps.training.trainer import TrainingResult
 __all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "load", "plan", "train"]
 
 AUTO = "auto"
-LIT_BY = (AUTO, "lamp", "any")
+LitBy = Literal["auto", "lamp", "any"]
 """What lit photographs: to be found from them, one lamp at a time in the dark, or any light."""
 _LEARNED = ("sdps-frames", "sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
 _CALIBRATED = ("frames", "psfcn", "robust-least-squares")
@@ -74,7 +74,7 @@ def infer(
     anyway: bool = False,
     flat: Wish = "auto",
     flatten: float = 0.0,
-    lit_by: str = AUTO,
+    lit_by: LitBy = "auto",
 ) -> Inference:
     """Estimate normals and lights of photographs.
 
@@ -90,7 +90,7 @@ def infer(
         findings: Of `check`, if it ran before.
         anyway: Go on where the checks found an error. The method may still find that it cannot.
         flat, flatten: What is done with flat things: wish and share of `sdps.methods.flat_things.Flatness`.
-        lit_by: Of `LIT_BY`: what method `auto` is to assume where no lights are given.
+        lit_by: What method `auto` is to assume where no lights are given.
 
     Returns:
         Normals, lights, and what follows: depth, albedo, relit pictures. Frame: x right, y up, z to the camera.
@@ -117,7 +117,7 @@ def infer(
 def plan(
     photos: Photographs, method: str = AUTO, *, models: str | Path | None = None,
     config: InferenceConfig | None = None, refine: bool | None = None, discontinuities: bool = False,
-    flat: Wish = "auto", flatten: float = 0.0, lit_by: str = AUTO,
+    flat: Wish = "auto", flatten: float = 0.0, lit_by: LitBy = "auto",
 ) -> Workload:  # fmt: skip
     """Return about what `infer` will take, in seconds and memory; arguments as of `infer`."""
     known, wished = (photos.light_directions is not None, photos.intensities is not None), Flatness(flat, flatten)
@@ -164,7 +164,7 @@ def estimate(
         InputError: sizes that do not fit, values that are not finite, an empty mask, or a method that is not there or
             wants lights that are not given.
     """
-    method, _ = choose_method(method, images, mask, AUTO, light_directions is not None, models, config)
+    method, _ = choose_method(method, images, mask, "auto", light_directions is not None, models, config)
     runner = _runner(method, (light_directions is not None, intensities is not None), models, config)
     if light_directions is not None and intensities is None:
         check_lights(len(images), light_directions)
@@ -287,7 +287,7 @@ def choose_method(
     method: str,
     images: ImageSource,
     mask: np.ndarray,
-    lit_by: str,
+    lit_by: LitBy,
     lit: bool,
     models: str | Path | None = None,
     config: InferenceConfig | None = None,
@@ -298,7 +298,7 @@ def choose_method(
     Args:
         method: As of `infer`.
         images, mask: As of `estimate`.
-        lit_by: Of `LIT_BY`.
+        lit_by: As of `infer`.
         lit: Light directions are given.
         models, config: As of `infer`.
         flat: What is wished of flat things, which show no shadows under a lamp: one that is said to be flat counts as
@@ -310,8 +310,8 @@ def choose_method(
     Raises:
         InputError: an unknown `lit_by`, or no weights for any light where that was asked for.
     """
-    if lit_by not in LIT_BY:
-        raise unknown("lit_by", lit_by, LIT_BY)
+    if lit_by not in get_args(LitBy):
+        raise unknown("lit_by", lit_by, get_args(LitBy))
     if method.partition("+")[0] != AUTO or lit or lit_by == "lamp":
         return method, ()
     find, chosen = _finder(models), method.replace(AUTO, ANY_LIGHT, 1)

@@ -3,6 +3,7 @@
 import argparse
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -10,6 +11,8 @@ from pipelines.app.pages import photo_questions
 from pipelines.app.pages.photo_questions import make_arguments, read_answers, say_plainly
 from pipelines.infer import add_arguments
 from render.shared.errors import InputError
+from sdps.api import LitBy
+from sdps.methods.flat_things import Wish
 from sdps.photos import Pose
 
 TEMPLATE = Path(photo_questions.__file__).parents[1] / "templates" / "photographs.html.j2"
@@ -21,6 +24,14 @@ def test_no_answers_are_the_defaults_of_the_command(tmp_path: Path) -> None:
     answers = read_answers({"refine": True})
     made = make_arguments(tmp_path, Pose("a", tmp_path, tmp_path), answers)
     assert vars(made) == vars(parser.parse_args([]))
+
+
+def test_page_command_and_python_know_the_same_kinds_of_light_and_of_flatness() -> None:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    (flag,) = (action for action in parser._actions if action.dest == "lit_by")
+    assert flag.choices == photo_questions._CHOICES["lit_by"] == get_args(LitBy)
+    assert set(photo_questions._CHOICES["flat"]) == set(get_args(Wish))
 
 
 def test_answers_become_flags(tmp_path: Path) -> None:
