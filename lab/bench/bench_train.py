@@ -38,8 +38,8 @@ from sdps.models.base import FusionNetwork, LightingNetwork, Lights
 from sdps.training.distributed import Team
 from sdps.training.loggers import Meter
 from sdps.training.stage_factory import create_stage
-from sdps.training.trainer import Trainer
 from sdps.training.training_config import LightingTraining, NormalTraining, TrainingConfig
+from sdps.training.training_run import TrainingRun
 
 RATIO_TARGETS = {"bfloat16": 2.7, "float32": 1.0}
 """Trainer over plain loop, by what the trainer computes in."""
@@ -226,9 +226,9 @@ def training(config: BenchTrainConfig, model: str) -> TrainingConfig:
     return replace(settings, lights="true") if isinstance(settings, NormalTraining) and entry.lights else settings
 
 
-def make_trainer(settings: TrainingConfig, model: str, folder: Path, scratch: Path) -> Trainer:
+def make_trainer(settings: TrainingConfig, model: str, folder: Path, scratch: Path) -> TrainingRun:
     """Build the trainer as a run does."""
-    return Trainer(create_stage(model, model, settings, {}), folder, scratch, Team(0, 1, torch.device("cpu")))
+    return TrainingRun(create_stage(model, model, settings, {}), folder, scratch, Team(0, 1, torch.device("cpu")))
 
 
 def first_batch(config: BenchTrainConfig, model: str, folder: Path) -> Batch:

@@ -6,49 +6,26 @@ a run that was stopped and resumed takes the same steps on the same batches as o
 several processes share every batch and take the steps one process would take.
 """
 
-import copy
 import logging
-import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor, nn
-from torch.nn.parallel import DistributedDataParallel
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from render.records.manifest import read_manifest
-from render.shared.config import to_plain
-from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.progress import progress_bar
-from render.shared.seeds import spread_evenly
-from sdps.data.dataset import Batch, SampleKey, SampleOptions, SceneDataset, collate
 from sdps.data.interrupts import StopRequest, stop_on_signal
-from sdps.data.resident.resident_scenes import ResidentScenes
-from sdps.data.sources import BatchSource, StoredScenes
-from sdps.models.checkpoint import TrainedModel, code_version, load_state, save_state, save_weights
-from sdps.training.distributed import Team, team
+from sdps.data.sources import BatchSource
+from sdps.training.distributed import team
 from sdps.training.loggers import JsonlLogger, Logger, Meter, TensorBoardLogger
-from sdps.training.muon import Muon
 from sdps.training.stages import Stage
-from sdps.training.training_config import EARLIER_NAMES, TrainingConfig
+from sdps.training.training_run import TrainingRun
 
-CHECKPOINT = "checkpoint.pt"
 METRICS = "metrics.jsonl"
-# What may differ between the parts of one run: how long, and how it is carried out, but not what is computed.
-_MAY_CHANGE = {
-    "epochs", "steps", "minutes", "workers", "cache", "shuffle_window",  # the last is in the source's identity
-    "log_every", "validate_every", "validation_scenes", "checkpoint_minutes", "precision", "channels_last",
-}  # fmt: skip
 
 _log = logging.getLogger(__name__)
-_MOST_SKIPPED = 5
-"""Steps in a row whose gradient is not finite, after which training ends."""
 
 
 @dataclass(frozen=True)
@@ -100,77 +77,77 @@ def train(
             no longer finite.
     """
     with team(device) as here:
-        trainer = Trainer(stage, Path(data_folder), Path(out_folder), here, source)
-        trainer.on_save = on_save
+        run = TrainingRun(stage, Path(data_folder), Path(out_folder), here, source)
+        run.on_save = on_save
         try:
-            return _train(trainer, list(loggers), tensorboard)
+            return _train(run, list(loggers), tensorboard)
         finally:
-            trainer.source.close()
+            run.source.close()
 
 
-def _train(trainer: "Trainer", loggers: list[Logger], tensorboard: bool) -> TrainingResult:
+def _train(run: TrainingRun, loggers: list[Logger], tensorboard: bool) -> TrainingResult:
     """Resume, run, validate and save."""
-    trainer.resume()
-    trainer.note_arithmetic()
-    if trainer.finished_metrics is not None and trainer.progress() >= 1.0:
-        return trainer.result(trainer.finished_metrics, 0.0, interrupted=False)
-    trainer.finished_metrics = None
-    if trainer.team.leads:
-        loggers.insert(0, JsonlLogger(trainer.folder / METRICS, trainer.step))
+    run.resume()
+    run.note_arithmetic()
+    if run.finished_metrics is not None and run.progress() >= 1.0:
+        return _describe_end(run, run.finished_metrics, 0.0, interrupted=False)
+    run.finished_metrics = None
+    if run.team.leads:
+        loggers.insert(0, JsonlLogger(run.folder / METRICS, run.step))
         if tensorboard:
-            loggers.append(TensorBoardLogger(trainer.folder / "tensorboard"))
+            loggers.append(TensorBoardLogger(run.folder / "tensorboard"))
     metrics: dict[str, float] = {}
     try:
         with stop_on_signal() as stop:
-            waiting_share, stopped = _run(trainer, loggers, stop)
-        if trainer.team.leads:
+            waiting_share, stopped = _take_steps(run, loggers, stop)
+        if run.team.leads:
             if not stopped:
-                metrics = trainer.finished_metrics = trainer.validate()
-                _report(loggers, trainer.step, metrics)
-                trainer.save_weights(metrics)
-            trainer.save()
+                metrics = run.finished_metrics = run.validate()
+                _report(loggers, run.step, metrics)
+                run.save_weights(metrics)
+            run.save()
     finally:
         for logger in loggers:
             logger.close()
-    trainer.team.wait()  # the others may want the leader's weights next
+    run.team.wait()  # the others may want the leader's weights next
     if stopped:
-        _log.warning("stopped after step %d; run the same command again to resume", trainer.step)
-    return trainer.result(metrics, waiting_share, interrupted=stopped)
+        _log.warning("stopped after step %d; run the same command again to resume", run.step)
+    return _describe_end(run, metrics, waiting_share, interrupted=stopped)
 
 
-def _run(trainer: "Trainer", loggers: Iterable[Logger], stop: StopRequest) -> tuple[float, bool]:
+def _take_steps(run: TrainingRun, loggers: Iterable[Logger], stop: StopRequest) -> tuple[float, bool]:
     """Take steps until the budget is spent or a stop is requested; return the share of time waited, and whether."""
-    config = trainer.config
-    batches = trainer.source.batches(trainer.samples)
+    config = run.config
+    batches = run.source.batches(run.samples)
     meter = Meter()
     saved = time.perf_counter()
-    look = {"desc": trainer.stage.name, "bar_format": "{l_bar}{bar}| {elapsed}<{remaining} {postfix}"}
-    bar = progress_bar(total=100.0, initial=100.0 * trainer.progress(), disable=not trainer.team.leads, **look)
+    look = {"desc": run.stage.name, "bar_format": "{l_bar}{bar}| {elapsed}<{remaining} {postfix}"}
+    bar = progress_bar(total=100.0, initial=100.0 * run.progress(), disable=not run.team.leads, **look)
 
     def tell() -> None:
-        values = meter.summary() | {"learning_rate": trainer.learning_rate, "seconds": trainer.seconds()}
-        _report(loggers, trainer.step, values)
+        values = meter.summary() | {"learning_rate": run.learning_rate, "seconds": run.seconds()}
+        _report(loggers, run.step, values)
         bar.set_postfix_str(f"loss {values['loss']:.3f}, {values['images_per_second']:.0f} images/s")
 
     with bar:
         while True:
-            stopped = trainer.team.any(stop.requested)
-            (progress,) = trainer.team.agree([trainer.progress()])
+            stopped = run.team.any(stop.requested)
+            (progress,) = run.team.agree([run.progress()])
             if progress >= 1.0 or stopped:
                 break
             with meter.waiting():
                 batch = next(batches)
             if isinstance(batch, InputError):
                 raise batch
-            meter.add(trainer.take_step(batch, progress), batch.images.shape[0] * batch.images.shape[1])
-            if trainer.step % config.log_every == 0:
+            meter.add(run.take_step(batch, progress), batch.images.shape[0] * batch.images.shape[1])
+            if run.step % config.log_every == 0:
                 tell()
-            if config.validate_every and trainer.step % config.validate_every == 0 and trainer.team.leads:
-                _report(loggers, trainer.step, trainer.validate())
-            if trainer.team.leads and time.perf_counter() - saved > 60.0 * config.checkpoint_minutes:
-                trainer.save()
+            if config.validate_every and run.step % config.validate_every == 0 and run.team.leads:
+                _report(loggers, run.step, run.validate())
+            if run.team.leads and time.perf_counter() - saved > 60.0 * config.checkpoint_minutes:
+                run.save()
                 saved = time.perf_counter()
-            bar.update(100.0 * min(trainer.progress(), 1.0) - bar.n)
+            bar.update(100.0 * min(run.progress(), 1.0) - bar.n)
         if not (stopped or meter.empty):  # a run shorter than `log_every` has a line, too
             tell()
     return meter.total_waiting_share(), stopped
@@ -182,294 +159,10 @@ def _report(loggers: Iterable[Logger], step: int, values: dict[str, float]) -> N
             logger.log(step, values)
 
 
-class _Loss(nn.Module):
-    """A stage's loss as a module, so that `DistributedDataParallel` sees one forward pass."""
-
-    def __init__(self, stage: Stage) -> None:
-        super().__init__()
-        self.stage, self.network = stage, stage.network
-
-    def forward(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        return self.stage.loss(batch)
-
-
-class Trainer:
-    """The state of a run and what can be done to it."""
-
-    def __init__(self, stage: Stage, data: Path, folder: Path, here: Team, source: BatchSource | None = None) -> None:
-        self.stage, self.config, self.data, self.folder, self.team = stage, stage.config, data, folder, here
-        config = self.config
-        stage.to(here.device)
-        self.arithmetic = here.same_arithmetic(config.precision)
-        self.source = source or _open_source(stage, data, here)
-        self._validates = (
-            config.validation_scenes > 0 and here.leads and any(scene.split == "val" for scene in read_manifest(data))
-        )
-        self.optimiser = _optimiser(stage.network, config)
-        average = get_ema_multi_avg_fn(config.ema)
-        self.average = AveragedModel(stage.network, multi_avg_fn=average) if config.ema else None
-        self._start = copy.deepcopy(stage.network) if config.start_share else None
-        self._blend = copy.deepcopy(self._start)
-        if config.compile:
-            stage.network.compile()
-        self._loss: nn.Module = _Loss(stage)
-        if here.world > 1:
-            self._loss = DistributedDataParallel(self._loss)
-        self.step = self.samples = 0
-        self.computed: list[dict[str, Any]] = []
-        """Step from which on, precision and processor: what the run was computed in, part by part."""
-        self.best = math.inf
-        self.learning_rate = config.learning_rate
-        self.saved: int | None = None  # step of the checkpoint on disk
-        self.on_save: Callable[[], None] | None = None
-        self.finished_metrics: dict[str, float] | None = None
-        self.skipped = 0  # steps in a row
-        self._earlier_seconds, self._started = 0.0, time.perf_counter()
-
-    def seconds(self) -> float:
-        """Return the seconds of training so far, those before a resume included."""
-        return self._earlier_seconds + time.perf_counter() - self._started
-
-    def progress(self) -> float:
-        """Return the share of the budget spent; 1 or more means done."""
-        config = self.config
-        if config.steps is not None:
-            return self.step / config.steps
-        if config.minutes is not None:
-            return self.seconds() / (60.0 * config.minutes)
-        return self.samples / (config.epochs * self.source.scenes)
-
-    def take_step(self, batch: Batch, progress: float) -> dict[str, float]:
-        """Take one optimiser step on `batch` and return its losses.
-
-        Args:
-            batch: This process's share of the step's scenes.
-            progress: Share of the budget spent, which the learning rate follows.
-
-        Raises:
-            InputError: the loss is not finite.
-        """
-        config = self.config
-        self.stage.network.train()
-        self.learning_rate = config.learning_rate_at(progress)
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate
-        sums: dict[str, Tensor] = {}
-        for part in _parts(batch, config.batch_scenes // config.accumulate):
-            share = len(batch.seed) / len(part.seed)
-            with self.arithmetic.autocast():
-                loss, terms = self._loss(part.to(self.team.device))
-            (loss / share).backward()
-            for name, value in {"loss": loss, **terms}.items():
-                sums[name] = sums.get(name, 0.0) + value.detach().double() / share
-        # One transfer a step: a GPU is waited for once.
-        totals = self.team.mean(dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True)))
-        if not math.isfinite(totals["loss"]):
-            raise self._divergence(f"the loss became {totals['loss']} at step {self.step + 1}")
-        if config.clip_gradient:
-            norm = torch.nn.utils.clip_grad_norm_(self.stage.network.parameters(), config.clip_gradient)
-            totals["gradient_norm"] = float(norm)
-        if math.isfinite(totals.get("gradient_norm", 0.0)):
-            self.optimiser.step()
-            self.skipped = 0
-        else:  # of one odd sample; the weights would be lost
-            self._skip_step(totals)
-        self.optimiser.zero_grad(set_to_none=True)
-        if self.average is not None:
-            self.average.update_parameters(self.stage.network)
-        self.step += 1
-        self.samples += config.batch_scenes
-        return totals
-
-    def _skip_step(self, totals: dict[str, float]) -> None:
-        """Leave the weights as they are, and say so; too often in a row is an error."""
-        self.skipped += 1
-        if self.skipped >= _MOST_SKIPPED:
-            raise self._divergence(f"the gradient is not finite in {self.skipped} steps in a row, to {self.step + 1}")
-        _log.warning("%s: the gradient of step %d is not finite; the step was left out", self.stage.name, self.step + 1)
-        totals["gradient_norm"] = 0.0
-
-    @torch.no_grad()
-    def validate(self) -> dict[str, float]:
-        """Return the stage's metrics, prefixed `val_`, averaged over fixed samples of the `val` split.
-
-        The best weights so far, by the stage's goal, are saved.
-        """
-        if not self._validates:
-            return {}
-        trained, self.stage.network = self.stage.network, self._kept()
-        self.stage.network.eval()
-        values: dict[str, float] = {}
-        try:
-            for suffix, options in self.stage.validations().items():
-                values |= {f"val_{name}{suffix}": value for name, value in self._measure(options).items()}
-        finally:
-            self.stage.network = trained
-        if values[f"val_{self.stage.goal}"] < self.best:
-            self.best = values[f"val_{self.stage.goal}"]
-            self.save_weights(values, "-best")
-        return values
-
-    def _measure(self, options: SampleOptions) -> dict[str, float]:
-        """Return the stage's metrics averaged over samples of the `val` split."""
-        # Opened anew: of a folder that is being rendered more scenes are there.
-        config = self.config
-        scenes = SceneDataset(self.data, "val", options, cache=config.cache, skip_missing=config.skip_missing)
-        rows = []
-        for index in spread_evenly(range(len(scenes)), config.validation_scenes):
-            batch = collate([scenes.sample(SampleKey(index, 0, index))])
-            assert isinstance(batch, Batch)  # `sample` raises
-            with self.arithmetic.autocast():
-                rows.append(self.stage.metrics(batch.to(self.team.device)))
-        return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-
-    @torch.no_grad()
-    def _kept(self) -> nn.Module:
-        """Return the network that is validated and saved: trained, averaged over time, or a mean with the start."""
-        kept: nn.Module = self.stage.network if self.average is None else self.average.module
-        if self._blend is None or self._start is None:
-            return kept
-        first, last = self._start.state_dict(), kept.state_dict()
-        for name, weight in self._blend.state_dict().items():  # shares memory with the network
-            counts = not weight.is_floating_point()
-            weight.copy_(last[name] if counts else torch.lerp(last[name], first[name], self.config.start_share))
-        return self._blend
-
-    def _divergence(self, what: str) -> InputError:
-        """Return the error that ends a run whose numbers are no longer finite, and says what is left of it."""
-        path = self.folder / CHECKPOINT
-        kept = "nothing was saved before"
-        if self.saved is not None:
-            kept = f"the last good state, of step {self.saved}, stays in {path}"
-        return InputError(f"{what}; {kept}; lower learning_rate and choose another --out")
-
-    def _require_finite(self) -> None:
-        """Refuse to write weights that a gradient has made infinite or NaN while the loss before it was finite."""
-        if not all(bool(torch.isfinite(weight).all()) for weight in self._kept().state_dict().values()):
-            raise self._divergence(f"the weights became infinite or NaN at step {self.step}")
-
-    def save(self) -> None:
-        """Write the checkpoint: weights, optimiser, random state, and place in the data.
-
-        Raises:
-            InputError: weights that are not finite; the checkpoint before stays.
-        """
-        self._require_finite()
-        cuda = torch.cuda.get_rng_state_all() if self.team.device.type == "cuda" else []
-        state = {
-            "identity": self._identity(),
-            "network": self.stage.network.state_dict(),
-            "average": self.average.state_dict() if self.average is not None else {},
-            "optimiser": self.optimiser.state_dict(),
-            "random": {"cpu": torch.get_rng_state(), "cuda": cuda},
-            "step": self.step,
-            "samples": self.samples,
-            "best": self.best,
-            "computed": self.computed,
-            "seconds": self.seconds(),
-            "finished_metrics": self.finished_metrics,
-        }
-        save_state(self.folder / CHECKPOINT, state)
-        self.saved = self.step
-        if self.on_save is not None:
-            self.on_save()
-
-    def resume(self) -> None:
-        """Go on from the folder's checkpoint, if there is one.
-
-        Raises:
-            InputError: the checkpoint is damaged, or of another configuration or data set.
-        """
-        path = self.folder / CHECKPOINT
-        if not path.is_file():
-            return
-        state = load_state(path)
-        self._compare(path, state.get("identity", {}))
-        with decoding(path, "a checkpoint of this run", "delete it to start this run again"):
-            self.stage.network.load_state_dict(state["network"])
-            self.optimiser.load_state_dict(state["optimiser"])
-            if self.average is not None:
-                self.average.load_state_dict(state["average"])
-            torch.set_rng_state(state["random"]["cpu"])
-            if self.team.device.type == "cuda" and state["random"]["cuda"]:
-                torch.cuda.set_rng_state_all(state["random"]["cuda"])
-            self.step, self.samples, self.best = state["step"], state["samples"], state["best"]
-            self.saved = self.step
-            self.computed = state.get("computed", [])
-            self.finished_metrics = state["finished_metrics"]
-            self._earlier_seconds, self._started = state["seconds"], time.perf_counter()
-
-    def note_arithmetic(self) -> None:
-        """Record what the following steps are computed in, and say so where the run began with something else."""
-        now = {"step": self.step, "precision": self.arithmetic.precision, "device": self.arithmetic.device}
-        if self.computed and self.computed[-1]["precision"] != now["precision"]:
-            _log.warning("%s: began in %s and goes on in %s (%s)", self.stage.name, self.computed[-1]["precision"],
-                         now["precision"], self.arithmetic.reason)  # fmt: skip
-        if not self.computed or {**self.computed[-1], "step": 0} != {**now, "step": 0}:
-            self.computed.append(now)
-
-    def _identity(self) -> dict[str, Any]:
-        """Return what a checkpoint must share with the run that resumes it."""
-        fixed = {key: value for key, value in to_plain(self.config).items() if key not in _MAY_CHANGE}
-        about = {"model": self.stage.model, **self.source.identity()}
-        return about | self.stage.origin() | {f"config.{key}": value for key, value in fixed.items()}
-
-    def _compare(self, path: Path, saved: dict[str, Any]) -> None:
-        """Refuse a checkpoint of another run; of settings that its day did not know, it had the defaults."""
-        defaults = {f"config.{key}": value for key, value in to_plain(type(self.config)()).items()}
-        for key, value in self._identity().items():
-            was = saved.get(key, defaults.get(key))
-            was = EARLIER_NAMES.get(was, was) if isinstance(was, str) else was
-            if isinstance(was, dict) and isinstance(defaults.get(key), dict):
-                was = defaults[key] | was
-            if was != value:
-                raise InputError(f"{path}: of another run ({key} was {was!r}, now {value!r}); choose another --out")
-
-    def save_weights(self, metrics: dict[str, float], suffix: str = "") -> None:
-        """Write the network with everything needed to use and to trace it; InputError where it is not finite."""
-        self._require_finite()
-        metadata = {
-            "config": to_plain(self.config),
-            **self.source.identity(),
-            "code": code_version(),
-            "step": self.step,
-            "computed": self.computed,
-            "seconds": round(self.seconds(), 1),
-            "metrics": metrics,
-            **self.stage.origin(),
-        }
-        model = TrainedModel(self.stage.model, self._kept(), self.stage.options, metadata)
-        save_weights(self.folder / f"{self.stage.name}{suffix}.safetensors", model)
-
-    def result(self, metrics: dict[str, float], waiting_share: float, *, interrupted: bool) -> TrainingResult:
-        """Describe how the run ended."""
-        name = self.stage.name
-        weights = None if interrupted else {name: self.folder / f"{name}.safetensors"}
-        return TrainingResult(weights, self.step, self.seconds(), metrics, waiting_share, interrupted)
-
-
-def _open_source(stage: Stage, data: Path, here: Team) -> BatchSource:
-    """Return batches of a data folder, made by loader processes or on the device."""
-    config, options = stage.config, stage.sample_options()
-    shared: dict[str, Any] = {"batch": config.batch_scenes, "workers": config.workers, "rank": here.rank,
-                              "world": here.world}  # fmt: skip
-    if config.resident:
-        return ResidentScenes(data, options, device=here.device, growing=config.skip_missing, **shared)
-    return StoredScenes(
-        SceneDataset(data, "train", options, cache=config.cache, skip_missing=config.skip_missing),
-        pin_memory=here.device.type == "cuda", window=config.shuffle_window, **shared,
-    )  # fmt: skip
-
-
-def _optimiser(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer | Muon:
-    """Return the optimiser that a configuration names."""
-    options: dict[str, Any] = {"lr": config.learning_rate, "weight_decay": config.weight_decay}
-    if config.optimiser == "muon":
-        return Muon(network, **options)
-    kind = torch.optim.Adam if config.optimiser == "adam" else torch.optim.AdamW
-    return kind(network.parameters(), **options, fused=True)
-
-
-def _parts(batch: Batch, scenes: int) -> list[Batch]:
-    """Split a batch into parts of so many scenes, the last of the rest: with more processes there are fewer parts."""
-    return [Batch(*tensors) for tensors in zip(*(tensor.split(scenes) for tensor in batch), strict=True)]
+def _describe_end(
+    run: TrainingRun, metrics: dict[str, float], waiting_share: float, *, interrupted: bool
+) -> TrainingResult:
+    """Return how the run ended."""
+    name = run.stage.name
+    weights = None if interrupted else {name: run.folder / f"{name}.safetensors"}
+    return TrainingResult(weights, run.step, run.seconds(), metrics, waiting_share, interrupted)

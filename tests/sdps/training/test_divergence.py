@@ -11,8 +11,9 @@ from render.shared.errors import InputError
 from sdps.models.checkpoint import TrainedModel, load_state, load_weights, save_weights
 from sdps.models.registry import create
 from sdps.training.stages import NormalStage
-from sdps.training.trainer import CHECKPOINT, train
+from sdps.training.trainer import train
 from sdps.training.training_config import NormalTraining
+from sdps.training.training_run import CHECKPOINT
 
 QUICK = NormalTraining(
     steps=6, batch_scenes=2, images=2, size=32, crop=16, lights="true", log_every=1, workers=0, validation_scenes=0,

@@ -24,11 +24,12 @@ from sdps.data.dataset import SampleKey, SceneDataset, collate
 from sdps.models.checkpoint import TrainedModel, load_state, load_weights, save_state, save_weights
 from sdps.models.registry import MODELS, create
 from sdps.publishing.learning_curves import read_metrics, write_curves
-from sdps.training import recipes, trainer
+from sdps.training import recipes, training_run
 from sdps.training.stage_factory import create_stage
 from sdps.training.stages import LightingStage, NormalStage
-from sdps.training.trainer import CHECKPOINT, METRICS, TrainingResult, train
+from sdps.training.trainer import METRICS, TrainingResult, train
 from sdps.training.training_config import LightingTraining, NormalTraining
+from sdps.training.training_run import CHECKPOINT
 
 TIMES = {"seconds", "images_per_second", "waiting_share"}
 QUICK = NormalTraining(
@@ -191,7 +192,7 @@ def test_a_checkpoint_may_call_its_schedule_by_the_earlier_name(folder: Path, tm
 
 def test_minutes_are_counted_across_resumed_runs(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     looks = count()  # a clock that goes on by a tenth of a second whenever it is looked at
-    monkeypatch.setattr(trainer, "time", SimpleNamespace(perf_counter=lambda: 0.1 * next(looks)))
+    monkeypatch.setattr(training_run, "time", SimpleNamespace(perf_counter=lambda: 0.1 * next(looks)))
     config = replace(QUICK, steps=None, minutes=0.05, schedule="cosine")
     stopped = train(NormalStage(config), folder, tmp_path, loggers=[StopAt(2)])
     finished = train(NormalStage(config), folder, tmp_path)
