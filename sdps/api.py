@@ -12,11 +12,8 @@ result.save("out")  # the files of `sdps infer`, but for its report
 ```
 """
 
-import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 from weakref import WeakKeyDictionary
@@ -34,10 +31,10 @@ from sdps.inference.inference_config import InferenceConfig
 from sdps.methods import pretrained
 from sdps.methods.flat_things import NOT_FLAT, Flatness, Wish
 from sdps.methods.light_witness import ANY_LIGHT, is_lit_by_lamps, question_lights, see_lights
-from sdps.methods.method import AFTER, FUSE, REFINE, Method
-from sdps.methods.parse import can_fuse, finish, parse, uses_networks
+from sdps.methods.method import AFTER, FUSE, REFINE
+from sdps.methods.parse import adapt, can_fuse, find_best, finish, parse, uses_networks
 from sdps.methods.runner import Runner
-from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
+from sdps.models.registry import COMBINATIONS, MODELS
 from sdps.photos import Finding, Photographs, check, load
 from sdps.photos.faults import ANYWAY
 from sdps.photos.light_files.light_advice import advise
@@ -52,14 +49,8 @@ __all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "
 AUTO = "auto"
 LitBy = Literal["auto", "lamp", "any"]
 """What lit photographs: to be found from them, one lamp at a time in the dark, or any light."""
-_LEARNED = ("sdps-frames", "sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
-_CALIBRATED = ("frames", "psfcn", "robust-least-squares")
-"""Tried in this order; the parts may be trained or shipped one by one."""
-_FALLBACK = "pf14"
 _LAMPS_SEEN: WeakKeyDictionary[Photographs, dict[tuple[str, InferenceConfig | None], bool]] = WeakKeyDictionary()
 """Of photographs that were looked at, by models and configuration, whether lamps lit them."""
-
-_log = logging.getLogger(__name__)
 
 
 def infer(
@@ -102,7 +93,7 @@ def infer(
     stop(photos, findings, anyway)
     known, wished = (photos.light_directions is not None, photos.intensities is not None), Flatness(flat, flatten)
     method, seen = choose_method(method, photos, photos.mask, lit_by, known[0], models, config, wished)
-    runner = _runner(method, known, models, config, refine, len(photos), wished)
+    runner = make_runner(method, known, models, config, refine, len(photos), wished)
     forecast = workload(photos, runner, discontinuities=discontinuities)
     if not anyway:
         forecast.check()
@@ -122,7 +113,7 @@ def plan(
     """Return about what `infer` will take, in seconds and memory; arguments as of `infer`."""
     known, wished = (photos.light_directions is not None, photos.intensities is not None), Flatness(flat, flatten)
     method, _ = choose_method(method, photos, photos.mask, lit_by, known[0], models, config, wished)
-    runner = _runner(method, known, models, config, refine, len(photos), wished)
+    runner = make_runner(method, known, models, config, refine, len(photos), wished)
     return workload(photos, runner, discontinuities=discontinuities)
 
 
@@ -165,10 +156,10 @@ def estimate(
             wants lights that are not given.
     """
     method, _ = choose_method(method, images, mask, "auto", light_directions is not None, models, config)
-    runner = _runner(method, (light_directions is not None, intensities is not None), models, config)
+    runner = make_runner(method, (light_directions is not None, intensities is not None), models, config)
     if light_directions is not None and intensities is None:
         check_lights(len(images), light_directions)
-        seen = see_lights(images, mask, _finder(models), config)
+        seen = see_lights(images, mask, pretrained.finder(models), config)
         intensities, _ = question_lights(images, mask, light_directions, None, seen)
     return runner.estimate(
         images, mask, light_directions, intensities, saturation=saturation, rig=Rig(camera, light_nearness)
@@ -185,7 +176,7 @@ def available_methods(models: str | Path | None = None) -> dict[str, str]:
     """
     about = {name: item.summary for items in (COMBINATIONS, MODELS) for name, item in items.items()}
     about |= {name: f"{entry.summary} ({entry.paper})" for name, entry in classical.METHODS.items()}
-    find = _finder(models)
+    find = pretrained.finder(models)
 
     def usable(name: str) -> bool:
         try:
@@ -252,10 +243,6 @@ class _ProgressLogger:
         """Nothing is open."""
 
 
-def _finder(models: str | Path | None) -> Callable[[str], Path]:
-    return partial(pretrained.require, out=None if models is None else Path(models))
-
-
 def stop(photos: Photographs, findings: tuple[Finding, ...], anyway: bool) -> None:
     """Stop at the first grave finding, unless asked to go on.
 
@@ -272,7 +259,7 @@ def ask_about_lights(
 ) -> tuple[np.ndarray, tuple[Finding, ...]]:
     """Ask a network about lights that are given: return intensities, found where none are given, and what it says."""
     assert photos.light_directions is not None
-    seen = see_lights(photos, photos.mask, _finder(models), config)
+    seen = see_lights(photos, photos.mask, pretrained.finder(models), config)
     intensities, fit = question_lights(
         photos, photos.mask, photos.light_directions, photos.intensities, seen, photos.files
     )
@@ -314,7 +301,7 @@ def choose_method(
         raise unknown("lit_by", lit_by, get_args(LitBy))
     if method.partition("+")[0] != AUTO or lit or lit_by == "lamp":
         return method, ()
-    find, chosen = _finder(models), method.replace(AUTO, ANY_LIGHT, 1)
+    find, chosen = pretrained.finder(models), method.replace(AUTO, ANY_LIGHT, 1)
     if lit_by == "any":
         parse(ANY_LIGHT, find)
         return chosen, ()
@@ -339,7 +326,7 @@ def _see_lamps(
     told = _LAMPS_SEEN.setdefault(images, {}) if isinstance(images, Photographs) else {}
     key = str(models), config
     if key not in told:
-        told[key] = is_lit_by_lamps(images, mask, _finder(models), config)
+        told[key] = is_lit_by_lamps(images, mask, pretrained.finder(models), config)
     return told[key]
 
 
@@ -375,15 +362,15 @@ def _tell_flat(found: Estimate, flat: Flatness, *, lit: bool) -> Iterator[Findin
     yield Finding("note", f"{level}{slow}{side}{last}")
 
 
-def _runner(
+def make_runner(
     method: str, known: tuple[bool, bool], models: str | Path | None, config: InferenceConfig | None,
     refine: bool | None = False, images: int = 0, flat: Flatness = NOT_FLAT,
 ) -> Runner:  # fmt: skip
     """Return the method of an expression with its networks; `known`: light directions, intensities."""
-    find = _finder(models)
+    find = pretrained.finder(models)
     plain, _, after = method.rpartition("+")
     plain = plain if after in AFTER else method
-    chosen = _adapt(_automatic(known[0], find) if plain == AUTO else plain, known, find)
+    chosen = adapt(find_best(known[0], find) if plain == AUTO else plain, known, find)
     if plain != method:
         return Runner(finish(chosen, after, find), find, config, flat=flat)
     fuses = can_fuse(chosen, find)
@@ -391,37 +378,3 @@ def _runner(
         refine = uses_networks(chosen) and images >= (FEWEST if fuses else FEWEST_IMAGES)
     chosen = finish(chosen, FUSE if fuses else REFINE, find) if refine else chosen
     return Runner(chosen, find, config, flat=flat)
-
-
-def _adapt(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> Method:
-    """Return the method of an expression that uses what is known of the lights."""
-    directions, intensities = known
-    if not directions:
-        method = parse(text, find)
-        if TRUE_LIGHTS in (method.lighting, method.intensities):
-            raise InputError(
-                f"--method {text} needs the lights; give them with --lights, or put a lighting model before it, "
-                f"as in lcnet+{text}"
-            )
-        if intensities and not uses_networks(method):
-            _log.warning("%s finds the intensities itself; those given are not used", text)
-        return replace(method, intensities=TRUE_LIGHTS) if intensities and uses_networks(method) else method
-    if "+" not in text and text in classical.METHODS and not classical.METHODS[text].calibrated:
-        _log.warning("%s finds the lights itself; those given are not used", text)
-        return parse(text, find)
-    method = parse(text if "+" in text else f"{TRUE_LIGHTS}+{text}", find)
-    if method.lighting != TRUE_LIGHTS:
-        _log.warning("%s finds the lights itself; those given are not used", text)
-    return replace(method, name=method.name.replace("true lights", "given lights"))
-
-
-def _automatic(lit: bool, find: Callable[[str], Path]) -> str:
-    """Return the best method whose weights are there."""
-    for name in _CALIBRATED if lit else _LEARNED:
-        try:
-            _adapt(name, (lit, False), find)
-        except InputError:
-            continue
-        return name
-    _log.warning("no trained network is there; using %s, which wants a diffuse object", _FALLBACK)
-    return _FALLBACK

@@ -195,18 +195,18 @@ def test_methods_that_can_be_used_are_listed():
 def test_the_automatic_method_depends_on_what_follows(
     lit: bool, refine: bool | None, images: int, expected: str
 ) -> None:
-    from sdps import api
+    from sdps.api import make_runner
 
     assert (
-        api._runner("auto", (lit, False), None, None, refine, images).method.name.replace(" (shipped)", "") == expected
+        make_runner("auto", (lit, False), None, None, refine, images).method.name.replace(" (shipped)", "") == expected
     )
 
 
 def test_intensities_without_directions_are_used() -> None:
     """They were left unused without a word."""
-    from sdps import api
+    from sdps.api import make_runner
 
-    runner = api._runner("auto", (False, True), None, None)
+    runner = make_runner("auto", (False, True), None, None)
     assert runner.method.intensities == "true"
 
 
@@ -214,7 +214,7 @@ def test_intensities_without_directions_are_used() -> None:
 def test_what_a_method_does_not_look_at_is_said(
     caplog: pytest.LogCaptureFixture, method: str, known: tuple[bool, bool]
 ) -> None:
-    from sdps import api
+    from sdps.api import make_runner
 
-    api._runner(method, known, None, None)
+    make_runner(method, known, None, None)
     assert "those given are not used" in caplog.text

@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from render.shared.imaging.vectors import unit
 from render.shared.seeds import generator
-from sdps.api import _runner
+from sdps.api import make_runner
 from sdps.core.geometry import UNKNOWN, Capture, reach
 from sdps.core.integration import integrate
 from sdps.core.metrics import normal_mae
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _count_sides(side: int, images: int, each: int) -> None:
     """Print how often the network has the right side, and how often evidence tells it, for raised and hollow things."""
     mask, turn = np.ones((side, side), bool), np.array([-1, -1, 1], np.float32)
-    runner = _runner("auto", (False, False), None, None, False, images, Flatness("yes"))
+    runner = make_runner("auto", (False, False), None, None, False, images, Flatness("yes"))
     sys.stdout.write("lamps          kind   network  told right  wrong  not told\n")
     for name, settings in _LAMPS.items():
         for kind in KINDS:
@@ -84,7 +84,7 @@ def _count_sides(side: int, images: int, each: int) -> None:
 def _judge(scene: "Flat", given: str, wish: Wish) -> str:
     """Return degrees of the network's, refined and joined normals, and of these turned inside out; and the tilt."""
     mask, known = np.ones(scene.heights.shape, bool), (given == "all", given != "none")
-    runner = _runner("auto", known, None, None, None, len(scene.images), Flatness(wish))
+    runner = make_runner("auto", known, None, None, None, len(scene.images), Flatness(wish))
     lights, gains = (value if there else None for value, there in zip((scene.lights, scene.gains), known, strict=True))
     found = runner.estimate(scene.images, mask, lights, gains, rig=UNKNOWN)
     assert isinstance(found, RefinedEstimate)

@@ -1,5 +1,6 @@
 """Methods from words: expressions such as `lcnet+psfcn`, and flags."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,13 @@ from sdps.classical import registry as classical
 from sdps.methods import pretrained
 from sdps.methods.method import AFTER, CLASSICAL, CONSTANT, FUSE, NONE, REFINE, Method, join, label, stem
 from sdps.models.registry import COMBINATIONS, MODELS, TRUE_LIGHTS
+
+_LEARNED = ("sdps-frames", "sdps-plus", "sdps", "lcnet-soft+psfcn", "lcnet+psfcn")
+_CALIBRATED = ("frames", "psfcn", "robust-least-squares")
+"""Tried in this order; the parts may be trained or shipped one by one."""
+_FALLBACK = "pf14"
+
+_log = logging.getLogger(__name__)
 
 
 def combine(lighting: str | None, normals: str | None, intensities: str | None, find: Callable[[str], Path]) -> Method:
@@ -96,6 +104,48 @@ def finish(method: Method, last: str, find: Callable[[str], Path]) -> Method:
             f"sdps-frames+{last}"
         )
     return replace(method, name=f"{method.name}, fused", refined=True, fused=True, paper="")
+
+
+def adapt(text: str, known: tuple[bool, bool], find: Callable[[str], Path]) -> Method:
+    """Return the method of an expression that uses what is known of the lights.
+
+    Args:
+        text, find: As of `parse`.
+        known: Light directions are given; intensities are.
+
+    Raises:
+        InputError: as `parse`, or the method needs lights that are not given.
+    """
+    directions, intensities = known
+    if not directions:
+        method = parse(text, find)
+        if TRUE_LIGHTS in (method.lighting, method.intensities):
+            raise InputError(
+                f"--method {text} needs the lights; give them with --lights, or put a lighting model before it, "
+                f"as in lcnet+{text}"
+            )
+        if intensities and not uses_networks(method):
+            _log.warning("%s finds the intensities itself; those given are not used", text)
+        return replace(method, intensities=TRUE_LIGHTS) if intensities and uses_networks(method) else method
+    if "+" not in text and text in classical.METHODS and not classical.METHODS[text].calibrated:
+        _log.warning("%s finds the lights itself; those given are not used", text)
+        return parse(text, find)
+    method = parse(text if "+" in text else f"{TRUE_LIGHTS}+{text}", find)
+    if method.lighting != TRUE_LIGHTS:
+        _log.warning("%s finds the lights itself; those given are not used", text)
+    return replace(method, name=method.name.replace("true lights", "given lights"))
+
+
+def find_best(lit: bool, find: Callable[[str], Path]) -> str:
+    """Return the best method whose weights are there; `lit`: light directions are given."""
+    for name in _CALIBRATED if lit else _LEARNED:
+        try:
+            adapt(name, (lit, False), find)
+        except InputError:
+            continue
+        return name
+    _log.warning("no trained network is there; using %s, which wants a diffuse object", _FALLBACK)
+    return _FALLBACK
 
 
 def can_fuse(method: Method, find: Callable[[str], Path]) -> bool:

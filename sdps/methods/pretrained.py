@@ -89,6 +89,6 @@ def require(name: str, out: Path | None = None) -> Path:
     raise InputError(f"{path}: no such weights; train them with `sdps train --models {plain}`")
 
 
-def finder(out: Path | None) -> "partial[Path]":
+def finder(out: str | Path | None) -> "partial[Path]":
     """Return what gives the weights file of a name: trained in `out`, else shipped; it raises InputError."""
-    return partial(require, out=out)
+    return partial(require, out=None if out is None else Path(out))
