@@ -15,7 +15,7 @@ from render.shared.errors import InputError
 from sdps.core.estimate import Estimate
 from sdps.core.metrics import angle_degrees
 from sdps.methods.fusion.evidence import Evidence, find_place
-from sdps.methods.fusion.network import FusionNet
+from sdps.methods.fusion.network import FusionNet, prepare
 from sdps.refinement.trust import RefinedEstimate
 
 
@@ -27,10 +27,10 @@ def ball(side: int) -> tuple[np.ndarray, np.ndarray]:
     return (normals * mask[..., None]).astype(np.float32), mask
 
 
-def answered(seed: int, held_out: bool = False) -> Answered:
+def answered(seed: int, held_out: bool = False, off_by: float = 0.2) -> Answered:
     """Return a ball of which the network knows the truth, and refinement something else that it believes itself."""
     rng, (normals, mask) = np.random.default_rng(seed), ball(24)
-    off = normals + mask[..., None] * rng.normal(0.0, 0.2, 3)
+    off = normals + mask[..., None] * rng.normal(0.0, off_by, 3)
     wrong = (off / np.maximum(np.linalg.norm(off, axis=-1, keepdims=True), 1e-9)).astype(np.float32)
     flat = {name: np.where(mask, value, 0.0).astype(np.float32) for name, value in
             {"told": 2.0, "told_first": 3.0, "expected": 3.0, "residual": 0.05, "albedo": 1.0, "gloss": 1.0,
@@ -61,6 +61,17 @@ def test_fusion_learns_whom_to_believe(monkeypatch: pytest.MonkeyPatch) -> None:
     assert after[4] < 0.5 * before[4]
     assert list(fusion.group([*scenes, other]))[:2] == ["learned from", "held out"]
     assert "held out" in "".join(tabulate(fusion.group([*scenes, other]), FusionNet().eval()))
+
+
+def test_an_easy_scene_counts_about_as_much_as_a_hard_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fusion, "_EXPECTED", 0.0)
+    losses, errors = [], []
+    for off_by in (0.05, 1.6):
+        scene = answered(3, off_by=off_by)
+        losses.append(float(fusion._loss(FusionNet().eval(), prepare(scene.evidence), fusion._truth(scene))))
+        errors.append(measure(scene, FusionNet().eval())[3])  # of the plain mean, which it begins as
+    assert errors[1] > 4.0 * errors[0]
+    assert losses[0] < losses[1] < 1.6 * losses[0]
 
 
 UP = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (4, 1))

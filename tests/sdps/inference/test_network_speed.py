@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from render.shared.progress import report_to
-from sdps.api import _runner
+from sdps.api import make_runner
 from sdps.inference import network_speed
 from sdps.inference.estimator import Estimator
 from sdps.inference.network_speed import time_lights, time_normals
 
 
 def find_estimator(method: str, images: int = 8) -> Estimator:
-    estimator = _runner(method, (False, False), None, None, False, images).estimator
+    estimator = make_runner(method, (False, False), None, None, False, images).estimator
     assert estimator is not None
     return estimator
 

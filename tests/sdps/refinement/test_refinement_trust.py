@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sdps.api import _runner
+from sdps.api import make_runner
 from sdps.core.estimate import Estimate
 from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
@@ -131,10 +131,12 @@ def test_a_doubted_refinement_leaves_what_the_method_found(count: int) -> None:
 def test_refinement_is_the_default_where_a_network_finds_the_normals() -> None:
     cases = {("auto", False): True, ("lcnet+psfcn", False): True, ("auto", True): True, ("pf14", False): False}
     for (method, lit), wanted in cases.items():
-        assert _runner(method, (lit, False), None, None, None, images=FEWEST_IMAGES).method.refined == wanted, method
-    assert not _runner("lcnet+psfcn", (False, False), None, None, None, images=FEWEST_IMAGES - 1).method.refined
-    assert not _runner("auto", (False, False), None, None, False, images=96).method.refined
-    assert _runner("pf14", (False, False), None, None, True, images=96).method.refined
+        assert make_runner(method, (lit, False), None, None, None, images=FEWEST_IMAGES).method.refined == wanted, (
+            method
+        )
+    assert not make_runner("lcnet+psfcn", (False, False), None, None, None, images=FEWEST_IMAGES - 1).method.refined
+    assert not make_runner("auto", (False, False), None, None, False, images=96).method.refined
+    assert make_runner("pf14", (False, False), None, None, True, images=96).method.refined
 
 
 def test_channels_that_the_object_hardly_reflects_say_little_of_intensities() -> None:

@@ -11,7 +11,7 @@ from sdps_scenes import hemisphere_lights
 
 import sdps
 from render.shared.errors import InputError
-from sdps.api import _runner
+from sdps.api import make_runner
 from sdps.photos import Photographs, load
 from sdps.surface import workload as workloads
 from sdps.surface.workload import LIMIT, workload
@@ -46,7 +46,7 @@ def test_one_line_says_pixels_pictures_minutes_and_memory(photos: Photographs) -
 )
 @pytest.mark.parametrize(("height", "width", "count"), [(4000, 6000, 100), (4000, 6000, 8), (3000, 4000, 1000)])
 def test_any_ordinary_camera_fits(photos: Photographs, method: str, height: int, width: int, count: int) -> None:
-    runner = _runner(method, (False, False), None, None, None)
+    runner = make_runner(method, (False, False), None, None, None)
     found = workload(larger(photos, height, width, count), runner)
     assert found.gib <= LIMIT
     found.check()

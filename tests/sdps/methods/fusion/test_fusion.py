@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from render.shared.errors import InputError
-from sdps.api import _runner
+from sdps.api import make_runner
 from sdps.core.estimate import Estimate
 from sdps.core.geometry import Rig
 from sdps.core.metrics import angle_degrees
@@ -120,10 +120,10 @@ def test_fused_methods_are_asked_for_by_name() -> None:
     ):
         with pytest.raises(InputError, match=said):
             parse(text, require)
-    assert _runner("auto", (False, False), None, None, None, images=FEWEST).method.fused
-    assert not _runner("auto", (False, False), None, None, None, images=FEWEST - 1).method.refined
-    assert not _runner("sdps-frames+refine", (False, False), None, None, None, images=40).method.fused
-    assert not _runner("lcnet+psfcn", (False, False), None, None, None, images=40).method.fused
+    assert make_runner("auto", (False, False), None, None, None, images=FEWEST).method.fused
+    assert not make_runner("auto", (False, False), None, None, None, images=FEWEST - 1).method.refined
+    assert not make_runner("sdps-frames+refine", (False, False), None, None, None, images=40).method.fused
+    assert not make_runner("lcnet+psfcn", (False, False), None, None, None, images=40).method.fused
 
 
 def photographs() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
