@@ -1,9 +1,8 @@
 """Draw a photograph, and normals and their errors before and after refinement.
 
-    python -m lab.studies.refinement_study --out out/refinement --merltest FOLDER
-    python -m lab.studies.refinement_picture --out out/refinement --merltest FOLDER SCENE ... refinement.jpg
+    python -m lab.studies.refinement_picture --merltest FOLDER SCENE ... refinement.jpg
 
-SCENE is the name of a scene in that folder's manifest.
+FOLDER: of `sdps evaluate merltest`; SCENE: the name of a scene in its manifest, as bunny-chrome.
 """
 
 import argparse
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lab.studies.refinement_study import Scene, expect_errors, read_kept
+from lab.studies.refinement_study import Scene, expect_errors, refine_scene
 from pipelines.shared import pictures
 from render.records.manifest import read_manifest
 from sdps.core.metrics import angle_degrees
@@ -24,7 +23,8 @@ _YELLOW, _SIDE = 20.0, 220  # degrees; pixels of a tile
 def main() -> int:
     """Draw one row a scene."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=Path("out/refinement"), help="folder where answers are kept")
+    parser.add_argument("--start", default="sdps-frames", help="method to start from")
     parser.add_argument("--merltest", type=Path, required=True)
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("picture", type=Path)
@@ -33,7 +33,7 @@ def main() -> int:
     rows = []
     for name in args.scenes:
         scene = Scene(args.merltest, specs[name], False, 0, True)
-        begun, found = read_kept(args.out / "merltest-all" / f"{name.replace('/', '_')}.npz")
+        begun, found = refine_scene(scene, args.out / f"merltest-all-{args.start}", args.start, False, 0.0)
         lit = scene.images[int(np.argmax(scene.lights @ np.array([-0.4, 0.5, 0.77])))]
         maps = [
             pictures.tone_map(lit, pictures.auto_exposure(lit[None], scene.mask)),

@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         tag += f"-{args.light_error:g}" if args.light_error else ""
         tag += f"-{args.start}" if args.start else ""
         scene = Scene(folder, spec, not args.merltest and number % 2 == 1, images, args.merltest is not None)
-        results.append((scene, *_refine(scene, args.out / tag, args.start, args.lights, args.light_error)))
+        results.append((scene, *refine_scene(scene, args.out / tag, args.start, args.lights, args.light_error)))
     for line in _fit(results) if args.fit else _table(results):
         sys.stdout.write(f"{line}\n")
     return 0
@@ -93,7 +93,7 @@ def render_scenes(preset: Path, out: Path) -> Path:
     return out / "data" if (out / "data").is_dir() else out
 
 
-def _refine(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> tuple[Estimate, Refined]:
+def refine_scene(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> tuple[Estimate, Refined]:
     """Return the start and what refinement makes of it, read back where it is there."""
     path = out / f"{scene.name.replace('/', '_')}.npz"
     if not path.exists():
@@ -113,10 +113,10 @@ def _refine(scene: Scene, out: Path, name: str, given: bool, wrong: float) -> tu
             if start.expected_error is not None:
                 begun["expected_error"] = start.expected_error
             np.savez(file, **{f"start_{name}": value for name, value in begun.items()}, **vars(found))
-    return read_kept(path)
+    return _read_kept(path)
 
 
-def read_kept(path: Path) -> tuple[Estimate, Refined]:
+def _read_kept(path: Path) -> tuple[Estimate, Refined]:
     """Return a start and its refinement, read back."""
     with np.load(path) as archive:
         begun = Estimate(
