@@ -48,7 +48,7 @@ __all__ = ["Inference", "available_methods", "check_out", "estimate", "infer", "
 
 AUTO = "auto"
 LitBy = Literal["auto", "lamp", "any"]
-"""What lit photographs: to be found from them, one lamp at a time in the dark, or any light."""
+"""What lit the photographs: found out from them, one lamp at a time in the dark, or any light."""
 _LAMPS_SEEN: WeakKeyDictionary[Photographs, dict[tuple[str, InferenceConfig | None], bool]] = WeakKeyDictionary()
 """Of photographs that were looked at, by models and configuration, whether lamps lit them."""
 

@@ -23,7 +23,7 @@ from lab.shared.answered_scenes import Answered, read_all, tabulate
 from render.shared.errors import InputError
 from render.shared.files import atomic_path
 from render.shared.progress import progress_bar
-from sdps.core.losses import expected_error_loss
+from sdps.core.losses import expected_error_loss, mean_over_object
 from sdps.core.symmetry import SYMMETRIES
 from sdps.methods.fusion.fuse import load_fusion
 from sdps.methods.fusion.network import FusionNet, Inputs, prepare
@@ -59,9 +59,9 @@ def train(scenes: Sequence[Answered], epochs: int, width: int, seed: int) -> Fus
 
 
 def _loss(network: FusionNet, inputs: Inputs, truth: Tensor) -> Tensor:
-    """Return the mean chord to true normals (B, 3, H, W), and how badly it was expected.
+    """Return the error against true normals (B, 3, H, W), plus the loss of the expected error.
 
-    Every scene counts by what the plain mean of both normals leaves of it: an easy scene as much as a hard one.
+    Each scene's error is divided by that of the plain mean, so that an easy scene counts as much as a hard one.
     """
     found, mask = network(inputs), inputs.maps[:, -1:]
     mean = functional.normalize(inputs.network + inputs.refined, dim=1)
@@ -70,9 +70,8 @@ def _loss(network: FusionNet, inputs: Inputs, truth: Tensor) -> Tensor:
 
 
 def _mean_chord(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:  # (B,)
-    """Return each scene's mean distance between normals (B, 3, H, W) and true ones on its object."""
-    chord = ((normals - truth).square().sum(dim=1, keepdim=True) + 1e-6).sqrt() * mask
-    return chord.sum(dim=(1, 2, 3)) / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)
+    """Return each scene's mean distance between normals (B, 3, H, W) and true ones over its object."""
+    return mean_over_object(((normals - truth).square().sum(dim=1, keepdim=True) + 1e-6).sqrt(), mask)
 
 
 def _truth(scene: Answered) -> Tensor:

@@ -1,8 +1,8 @@
 """Draw a photograph, and normals and their errors before and after refinement.
 
-    python -m lab.studies.refinement_picture --merltest FOLDER SCENE ... refinement.jpg
+    python -m lab.studies.refinement_picture --merltest out/merl/merltest
 
-FOLDER: of `sdps evaluate merltest`; SCENE: the name of a scene in its manifest, as bunny-chrome.
+The folder is one that `sdps evaluate merltest` rendered. Scenes are refined where that has not been done yet.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from pipelines.shared import pictures
 from render.records.manifest import read_manifest
 from sdps.core.metrics import angle_degrees
 
+SCENES = ("bunny-blue-acrylic", "bunny-black-fabric", "bunny-chrome", "sphere-black-obsidian")
 _YELLOW, _SIDE = 20.0, 220  # degrees; pixels of a tile
 
 
@@ -26,8 +27,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("out/refinement"), help="folder where answers are kept")
     parser.add_argument("--start", default="sdps-frames", help="method to start from")
     parser.add_argument("--merltest", type=Path, required=True)
-    parser.add_argument("scenes", nargs="+")
-    parser.add_argument("picture", type=Path)
+    parser.add_argument("--scenes", nargs="+", default=SCENES, help="names in the folder's manifest")
+    parser.add_argument("--picture", type=Path, default=Path("docs/images/refinement.jpg"))
     args = parser.parse_args()
     specs = {spec.id: spec for spec in read_manifest(args.merltest)}
     rows = []

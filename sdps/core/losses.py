@@ -22,6 +22,11 @@ def soft_class_loss(logits: Tensor, target: Tensor) -> Tensor:
     return functional.cross_entropy(logits.float().flatten(0, 1), target.flatten(0, 1))
 
 
+def mean_over_object(values: Tensor, mask: Tensor) -> Tensor:  # (B,)
+    """Return each scene's mean of values (B, 1, H, W) over its object; 0 where the mask (B, 1, H, W) is empty."""
+    return (values * mask).sum(dim=(1, 2, 3)) / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)
+
+
 def faithful_normal_loss(normals: Tensor, truth: Tensor) -> Tensor:
     """Return the mean of 1 - cos over ALL pixels, as the authors' code does.
 
@@ -44,8 +49,7 @@ def masked_normal_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
         mask: (B, 1, H, W), 0 or 1; a scene without object pixels adds zero.
     """
     cosine = (normals * truth).sum(dim=1, keepdim=True)  # (B, 1, H, W)
-    sums = ((1.0 - cosine) * mask).sum(dim=(1, 2, 3))  # (B,)
-    return (sums / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)).mean()
+    return mean_over_object(1.0 - cosine, mask).mean()
 
 
 _CHORD_FLOOR = 0.02
@@ -64,7 +68,7 @@ def chord_normal_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
     """
     squares = (normals - truth).square().sum(dim=1, keepdim=True)  # (B, 1, H, W)
     distances = (squares + _CHORD_FLOOR**2).sqrt() - _CHORD_FLOOR
-    return ((distances * mask).sum(dim=(1, 2, 3)) / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)).mean()
+    return mean_over_object(distances, mask).mean()
 
 
 def expected_distance_loss(expected: Tensor, distances: Tensor) -> Tensor:
@@ -85,8 +89,7 @@ def expected_error_loss(expected: Tensor, normals: Tensor, truth: Tensor, mask: 
         mask: (B, 1, H, W), 0 or 1; a scene without object pixels adds zero.
     """
     distances = (normals.detach() - truth).norm(dim=1, keepdim=True)
-    each = expected_distance_loss(expected, distances) * mask
-    return (each.sum(dim=(1, 2, 3)) / mask.sum(dim=(1, 2, 3)).clamp(min=1.0)).mean()
+    return mean_over_object(expected_distance_loss(expected, distances), mask).mean()
 
 
 def normal_gradient_loss(normals: Tensor, truth: Tensor, mask: Tensor) -> Tensor:

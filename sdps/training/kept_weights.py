@@ -1,4 +1,4 @@
-"""Which weights of a training are validated and saved: the trained ones, their average, or a mean with the first."""
+"""Which weights are validated and saved: the trained ones, their average over steps, or a mean with the first."""
 
 import copy
 
@@ -11,33 +11,32 @@ class KeptWeights:
     """The weights that a run keeps of the network it trains.
 
     Args:
-        network: It, with the weights it begins with.
-        ema: Decay of the average over steps; 0: there is none.
-        start_share: Share of the weights it begins with in what is kept.
+        network: The network, with its initial weights.
+        ema: Decay of the average over steps; 0 for no average.
+        start_share: Share of the initial weights in the kept ones.
     """
 
     def __init__(self, network: nn.Module, ema: float, start_share: float) -> None:
         self._trained, self._start_share = network, start_share
         self._average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(ema)) if ema else None
         self._start = copy.deepcopy(network) if start_share else None
-        self._blend = copy.deepcopy(self._start)
 
     def update(self) -> None:
-        """Take the weights after a step into the average."""
+        """Add the weights after a step to the average."""
         if self._average is not None:
             self._average.update_parameters(self._trained)
 
     @torch.no_grad()
     def network(self) -> nn.Module:
-        """Return the network with the kept weights; the next call may write into it."""
+        """Return the network with the kept weights."""
         kept: nn.Module = self._trained if self._average is None else self._average.module
-        if self._blend is None or self._start is None:
+        if self._start is None:
             return kept
-        first, last = self._start.state_dict(), kept.state_dict()
-        for name, weight in self._blend.state_dict().items():  # shares memory with the network
+        mixed, last = copy.deepcopy(self._start), kept.state_dict()
+        for name, weight in mixed.state_dict().items():  # shares memory with the network
             counts = not weight.is_floating_point()
-            weight.copy_(last[name] if counts else torch.lerp(last[name], first[name], self._start_share))
-        return self._blend
+            weight.copy_(last[name] if counts else torch.lerp(last[name], weight, self._start_share))
+        return mixed
 
     def are_finite(self) -> bool:
         """Return whether no weight is infinite or NaN."""

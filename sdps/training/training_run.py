@@ -1,7 +1,4 @@
-"""The state of a training run: network, optimiser, place in the data; and what can be done to it.
-
-Legend: a step takes `batch_scenes` scenes, in `accumulate` parts, over all processes of a team.
-"""
+"""The state of a training run (network, optimiser, place in the data), and the operations on it."""
 
 import logging
 import math
@@ -53,12 +50,12 @@ class _Loss(nn.Module):
 
 
 class TrainingRun:
-    """A run as it stands, and what can be done to it.
+    """The state of a run, and the operations on it.
 
     Args:
         stage: What is trained; carries the configuration.
         data: Folder of rendered data.
-        folder: Of the run.
+        folder: The run's folder.
         here: The processes that share each batch.
         source: Where training batches come from; None: the stored scenes of `data`.
     """
@@ -81,7 +78,7 @@ class TrainingRun:
             self._loss = DistributedDataParallel(self._loss)
         self.step = self.samples = 0
         self.computed: list[dict[str, Any]] = []
-        """Step from which on, precision and processor: what the run was computed in, part by part."""
+        """The precision and processor of each part of the run, and the step it began at."""
         self.best = math.inf
         self.learning_rate = config.learning_rate
         self.saved: int | None = None  # step of the checkpoint on disk
@@ -136,7 +133,7 @@ class TrainingRun:
         if math.isfinite(totals.get("gradient_norm", 0.0)):
             self.optimiser.step()
             self.skipped = 0
-        else:  # of one odd sample; the weights would be lost
+        else:  # one odd sample would spoil the weights
             self._skip_step(totals)
         self.optimiser.zero_grad(set_to_none=True)
         self.kept.update()
@@ -175,7 +172,7 @@ class TrainingRun:
 
     def _measure(self, options: SampleOptions) -> dict[str, float]:
         """Return the stage's metrics averaged over samples of the `val` split."""
-        # Opened anew: of a folder that is being rendered more scenes are there.
+        # Opened again each time: a folder that is still being rendered has more scenes by now.
         config = self.config
         scenes = SceneDataset(self.data, "val", options, cache=config.cache, skip_missing=config.skip_missing)
         rows = []
@@ -187,7 +184,7 @@ class TrainingRun:
         return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
     def _divergence(self, what: str) -> InputError:
-        """Return the error that ends a run whose numbers are no longer finite, and says what is left of it."""
+        """Return the error for a run whose numbers are no longer finite; it says which checkpoint is left."""
         path = self.folder / CHECKPOINT
         kept = "nothing was saved before"
         if self.saved is not None:
@@ -298,24 +295,24 @@ def _optimiser(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimi
 
 
 def _parts(batch: Batch, scenes: int) -> list[Batch]:
-    """Split a batch into parts of so many scenes, the last of the rest: with more processes there are fewer parts."""
+    """Split a batch into parts of this many scenes; the last may be smaller. With more processes there are fewer."""
     return [Batch(*tensors) for tensors in zip(*(tensor.split(scenes) for tensor in batch), strict=True)]
 
 
 def _identify(stage: Stage, source: BatchSource) -> dict[str, Any]:
-    """Return model, data, origin of the weights, and the settings that decide what is computed."""
+    """Return what identifies a run: model, data, origin of the weights, and the settings that affect the result."""
     fixed = {key: value for key, value in to_plain(stage.config).items() if key not in _MAY_CHANGE}
     about = {"model": stage.model, **source.identity()}
     return about | stage.origin() | {f"config.{key}": value for key, value in fixed.items()}
 
 
 def _require_same(path: Path, saved: dict[str, Any], stage: Stage, source: BatchSource) -> None:
-    """Refuse a checkpoint of another run; of settings that its day did not know, it had the defaults.
+    """Refuse a checkpoint of another run; settings that did not exist when it was written count as their defaults.
 
     Args:
         path: Of the checkpoint.
         saved: What `_identify` returned when it was written.
-        stage, source: Of the run that is to go on.
+        stage, source: Of the run to resume.
 
     Raises:
         InputError: they differ.

@@ -131,9 +131,8 @@ def test_a_doubted_refinement_leaves_what_the_method_found(count: int) -> None:
 def test_refinement_is_the_default_where_a_network_finds_the_normals() -> None:
     cases = {("auto", False): True, ("lcnet+psfcn", False): True, ("auto", True): True, ("pf14", False): False}
     for (method, lit), wanted in cases.items():
-        assert make_runner(method, (lit, False), None, None, None, images=FEWEST_IMAGES).method.refined == wanted, (
-            method
-        )
+        runner = make_runner(method, (lit, False), None, None, None, images=FEWEST_IMAGES)
+        assert runner.method.refined == wanted, method
     assert not make_runner("lcnet+psfcn", (False, False), None, None, None, images=FEWEST_IMAGES - 1).method.refined
     assert not make_runner("auto", (False, False), None, None, False, images=96).method.refined
     assert make_runner("pf14", (False, False), None, None, True, images=96).method.refined
