@@ -312,7 +312,7 @@ def choose_method(
     if flat.asked or _see_lamps(images, mask, models, config):
         return method, ()
     text = (
-        "Next to nothing of the object is in shadow in any picture: not one lamp lit it, but a room or several. So "
+        "The light of each picture seems to come from many sides: not one lamp lit it, but a room or several lamps. So "
         "the normals are found by a network for any light, which finds no lights. For better ones darken the room and "
         "use one lamp; if you did, say so with --lit-by lamp."
     )

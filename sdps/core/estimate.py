@@ -61,6 +61,8 @@ class Estimate:
             where the method does not predict it.
         expected_light_error: (L,) float32, the same of the light directions.
         nearness: (L,) float32, rho of the lamps (`sdps.core.geometry`), given or found; None: taken for distant.
+        light_covariance: (L, 3, 3) float32, of the directions that an image's light comes from, 0 of a lamp; None: all
+            light is taken for lamps.
         confidence: (L,) float32, probability of the two likeliest direction classes, multiplied; None where lights were
             not found as classes.
         precision: What networks computed in, `float32` or `bfloat16`; empty where there were none.
@@ -80,6 +82,7 @@ class Estimate:
     expected_error: np.ndarray | None = field(default=None, kw_only=True)
     expected_light_error: np.ndarray | None = field(default=None, kw_only=True)
     nearness: np.ndarray | None = field(default=None, kw_only=True)
+    light_covariance: np.ndarray | None = field(default=None, kw_only=True)
     confidence: np.ndarray | None = field(default=None, kw_only=True)
     precision: str = field(default="", kw_only=True)
     stray_light: np.ndarray | None = field(default=None, kw_only=True)
@@ -93,7 +96,7 @@ class Estimate:
         """Return it without its lights: no lamps lit the images, but light from where these say on average."""
         return replace(
             self, light_directions=np.zeros((0, 3), np.float32), intensities=np.zeros(0, np.float32),
-            expected_light_error=None, nearness=None, confidence=None,
+            expected_light_error=None, nearness=None, light_covariance=None, confidence=None,
         )  # fmt: skip
 
 

@@ -31,6 +31,10 @@ class Symmetry(NamedTuple):
             x, y = -y, x
         return xp.stack([x, y, z], dim)
 
+    def matrices(self, matrices: Array) -> Array:
+        """Turn matrices (..., 3, 3) that map vectors to vectors."""
+        return self.vectors(self.vectors(matrices, dim=-1), dim=-2)
+
     @property
     def back(self) -> "Symmetry":
         """What undoes it; a mirrored turn undoes itself."""

@@ -42,6 +42,7 @@ class Batch(NamedTuple):
     nearness: Tensor  # (B, Q) float32, rho of the lamps (`sdps.core.geometry`), 0 of distant ones
     places: Tensor  # (B, 3, S, S) float32, where pixels lie, in the object's radii from its middle; 0 outside the mask
     sights: Tensor  # (B, 3, S, S) float32, towards the camera, z = 1
+    covariance: Tensor  # (B, Q, 3, 3) float32, of the directions that an image's light comes from, 0 of single lamps
 
     def to(self, device: torch.device) -> "Batch":
         """Copy every tensor to `device`."""
@@ -189,17 +190,12 @@ def make_sample(scene: SceneSpec, stored: StoredScene, options: SampleOptions, r
     strengths = intensities if weights is None else intensities * placed.irradiance
     corner = _crop_corner(mask, options.crop, options.min_object, rng) if options.crop else (0, 0)
     return Batch(
-        images=_channels_first(images),
-        mask=torch.from_numpy(mask[None].astype(np.float32)),
-        normals=_channels_first(normals),
-        directions=torch.from_numpy(placed.directions),
-        intensities=torch.from_numpy(strengths),
-        corner=torch.tensor(corner),
-        seed=torch.tensor(seed),
-        nearness=torch.from_numpy(placed.nearness),
-        places=_channels_first(placed.places),
-        sights=_channels_first(placed.sights),
-    )
+        images=_channels_first(images), mask=torch.from_numpy(mask[None].astype(np.float32)),
+        normals=_channels_first(normals), directions=torch.from_numpy(placed.directions),
+        intensities=torch.from_numpy(strengths), corner=torch.tensor(corner), seed=torch.tensor(seed),
+        nearness=torch.from_numpy(placed.nearness), covariance=torch.from_numpy(placed.covariance),
+        places=_channels_first(placed.places), sights=_channels_first(placed.sights),
+    )  # fmt: skip
 
 
 def _channels_first(pictures: np.ndarray) -> Tensor:  # (..., 3, H, W) float32

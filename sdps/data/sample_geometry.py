@@ -55,6 +55,7 @@ class Placed(NamedTuple):
         directions: (Q, 3) float32, unit, from C to the lamps.
         nearness: (Q,) float32, rho; 0 of distant lamps.
         irradiance: (Q,) float32, at C, over pi.
+        covariance: (Q, 3, 3) float32, of the directions that light comes from; 0 of single lamps.
     """
 
     places: np.ndarray
@@ -62,6 +63,7 @@ class Placed(NamedTuple):
     directions: np.ndarray
     nearness: np.ndarray
     irradiance: np.ndarray
+    covariance: np.ndarray
 
     def mix(self, weights: np.ndarray) -> "Placed":
         """Return the lamps that stand for mixed light: of L lamps, each image has shares (Q, L).
@@ -72,11 +74,13 @@ class Placed(NamedTuple):
         strengths = (weights * self.irradiance).astype(np.float64)
         vectors = strengths @ self.directions
         lengths = np.linalg.norm(vectors, axis=1).clip(_FAINTEST)
-        nearness = strengths @ self.nearness / strengths.sum(axis=1)
-        directions, nearness, irradiance = (
-            part.astype(np.float32) for part in (vectors / lengths[:, None], nearness, lengths)
-        )
-        return self._replace(directions=directions, nearness=nearness, irradiance=irradiance)
+        shares = strengths / strengths.sum(axis=1, keepdims=True)
+        means = shares @ self.directions
+        squares = np.einsum("ql,li,lj->qij", shares, self.directions, self.directions, dtype=np.float64)
+        spread = squares - means[:, :, None] * means[:, None]
+        found = vectors / lengths[:, None], shares @ self.nearness, lengths, spread
+        directions, nearness, irradiance, covariance = (part.astype(np.float32) for part in found)
+        return self._replace(directions=directions, nearness=nearness, irradiance=irradiance, covariance=covariance)
 
 
 def lay_out(scene: SceneSpec, depth: np.ndarray, mask: np.ndarray, chosen: np.ndarray) -> Layout:
@@ -115,5 +119,8 @@ def place(layout: Layout, mask: np.ndarray, directions: np.ndarray) -> Placed:
         nearness = radius / np.linalg.norm(positions - centre, axis=1)
     seen_from, irradiance = incident(centre[None], directions, positions, reference)
     sights = np.concatenate([tilts, np.ones((*depth.shape, 1))], axis=-1)
-    found = ((points - centre) / radius * mask[..., None], sights, seen_from[:, 0], nearness, irradiance[:, 0])
+    covariance = np.zeros((len(directions), 3, 3))
+    found = (
+        (points - centre) / radius * mask[..., None], sights, seen_from[:, 0], nearness, irradiance[:, 0], covariance,
+    )  # fmt: skip
     return Placed(*(np.ascontiguousarray(part, np.float32) for part in found))

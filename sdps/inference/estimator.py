@@ -217,7 +217,7 @@ class Estimator(InferenceConfig):
         normal model that needs them.
         """
         directions, intensities = known.directions, known.intensities
-        exposure, confidence, errors, nearness = {}, None, None, None
+        exposure, confidence, errors, nearness, covariance = {}, None, None, None, None
         if self.lighting is not None and (directions is None or intensities is None):
             view = self._view(scene, self.lighting, None, resize_input, INPUT_SIZE**2)
             lights = self._run_lighting(cast(LightingNetwork, self.lighting.network), view)
@@ -228,6 +228,8 @@ class Estimator(InferenceConfig):
             errors = None if lights.expected_error is None else _to_numpy(lights.expected_error)
             if known.directions is None and lights.nearness is not None:
                 nearness = share_nearness(_to_numpy(lights.nearness))
+            if known.directions is None and lights.covariance is not None:
+                covariance = _to_numpy(lights.covariance)
         elif intensities is None and self.needs_lights:
             intensities = np.full(len(scene), self._mean_intensity(), np.float32)
         return Estimate(
@@ -237,6 +239,7 @@ class Estimator(InferenceConfig):
             expected_light_error=errors,
             confidence=confidence,
             nearness=nearness,
+            light_covariance=covariance,
             exposure=exposure,
         )
 
@@ -247,6 +250,8 @@ class Estimator(InferenceConfig):
         lights = Lights(self._tensor(found.light_directions), self._tensor(found.intensities))
         if found.nearness is not None:
             lights = lights._replace(nearness=self._tensor(found.nearness))
+        if found.light_covariance is not None:
+            lights = lights._replace(covariance=self._tensor(found.light_covariance))
         if known.directions is not None or self.lighting is None:
             return lights
         errors = found.expected_light_error

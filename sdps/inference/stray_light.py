@@ -9,7 +9,7 @@ Legend: L images, P pixels.
 
 import numpy as np
 
-SHADOW = 0.05
+_SHADOW = 0.05
 """A pixel counts as in shadow where it has less than this share of its bright values."""
 _BRIGHT = 75.0
 """Percentile of a pixel's values over the images that is called bright; above are highlights, of metals above all."""
@@ -30,7 +30,7 @@ def stray_light(values: np.ndarray) -> np.ndarray:
     Returns:
         (L, 3) float32, zero where nothing is in shadow.
     """
-    shadow = find_shadow(values, SHADOW)
+    shadow = _find_shadow(values, _SHADOW)
     level = np.full((len(values), 3), np.nan, np.float32)
     for image, inside, found in zip(values, shadow, level, strict=True):
         for channel in np.flatnonzero(inside.sum(0) >= _FEWEST):
@@ -42,7 +42,7 @@ def stray_light(values: np.ndarray) -> np.ndarray:
     return np.clip(level, -most, most)
 
 
-def find_shadow(values: np.ndarray, share: float) -> np.ndarray:  # (L, P, ...) bool
+def _find_shadow(values: np.ndarray, share: float) -> np.ndarray:  # (L, P, ...) bool
     """Find where values (L, P, ...) float32 of object pixels have less than a share of the pixel's bright ones."""
     strength = values.mean(axis=tuple(range(1, values.ndim)), keepdims=True, dtype=np.float64)  # of the light, about
     relative = values / np.maximum(strength.astype(np.float32), np.float32(1e-12))

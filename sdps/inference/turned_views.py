@@ -18,8 +18,11 @@ from sdps.models.base import Lights
 
 
 def turn_lights(symmetry: Symmetry, lights: Lights | None) -> Lights | None:
-    """Turn the directions of lights."""
-    return None if lights is None else lights._replace(directions=symmetry.vectors(lights.directions))
+    """Turn the directions of lights, and how they spread."""
+    if lights is None:
+        return None
+    covariance = None if lights.covariance is None else symmetry.matrices(lights.covariance)
+    return lights._replace(directions=symmetry.vectors(lights.directions), covariance=covariance)
 
 
 class TurnedView:
@@ -85,7 +88,9 @@ def mean_lights(found: list[tuple[Symmetry, Lights]]) -> Lights:
         spread = torch.rad2deg((directions - mean).square().sum(-1).mean(0).sqrt())  # (B, Q)
         expected = (expected.square() - spread.square()).clamp(min=expected.square() / len(found)).sqrt()
     near = [lights.nearness.float() for _, lights in found if lights.nearness is not None]
-    return Lights(mean, intensities, confidence, expected, torch.stack(near).mean(0) if near else None)
+    wide = [each.back.matrices(lights.covariance.float()) for each, lights in found if lights.covariance is not None]
+    nearness, covariance = (torch.stack(values).mean(0) if values else None for values in (near, wide))
+    return Lights(mean, intensities, confidence, expected, nearness, covariance)
 
 
 def mean_normals(

@@ -193,7 +193,7 @@ def find_intensities(images: ReducedImages, directions: np.ndarray, start: np.nd
     """
     images = _sample_pixels(images)
     start = scale_to_mean(np.asarray(start, np.float64))
-    held = _PRIOR * (1.0 + (measure_misfit(images, directions, start) / _MISFIT) ** 4)
+    held = _PRIOR * (1.0 + (_measure_misfit(images, directions, start) / _MISFIT) ** 4)
     found = start.copy()
     for _ in range(_ROUNDS):
         _, weights, shading = fit_normals(images, directions, found)
@@ -263,7 +263,7 @@ def _sample_pixels(images: ReducedImages) -> ReducedImages:
     return replace(images, values=images.values[:, np.sort(chosen)])
 
 
-def measure_misfit(images: ReducedImages, directions: np.ndarray, intensities: np.ndarray) -> float:
+def _measure_misfit(images: ReducedImages, directions: np.ndarray, intensities: np.ndarray) -> float:
     """Return the mean absolute residual of Lambert's law, relative to the images' mean."""
     shading = fit_normals(images, directions, intensities)[2]
     return float(np.abs(images.values / intensities[:, None] - shading).mean())
@@ -280,17 +280,17 @@ def _find_order(
     def nearest(order: np.ndarray) -> float:
         return min(_read(directions, axes, order, "", seen).apart for axes in AXES)
 
-    now, misfit = nearest(plain), measure_misfit(images, directions, intensities)
+    now, misfit = nearest(plain), _measure_misfit(images, directions, intensities)
     for order, name in ((np.array([rank[file] for file in files]), "sorted"), (plain[::-1], "reversed")):
         if (order == plain).all():
             continue
-        left = measure_misfit(images, directions[order], intensities[order])
+        left = _measure_misfit(images, directions[order], intensities[order])
         if (nearest(order) < 0.4 * now and now > _APART and left < misfit) or left < 0.5 * misfit:
             return order, name
     if len(files) >= _FEWEST_ROWS and now > _APART:
         pairs = angle_degrees(seen[:, None], directions[None])
         order = linear_sum_assignment(pairs)[1]
-        left = measure_misfit(images, directions[order], intensities[order])
+        left = _measure_misfit(images, directions[order], intensities[order])
         if pairs[plain, order].mean() < min(_NEAR, 0.4 * now) and left < 0.7 * misfit:
             return order, "other"
     return plain, ""

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,12 @@ from sdps.core.estimate import Estimate
 from sdps.core.intensities import grey, scale_to_mean
 from sdps.inference.image_source import ImageSource
 from sdps.inference.inference_config import InferenceConfig
-from sdps.inference.stray_light import find_shadow
 from sdps.methods.flat_things import covers_frame
 from sdps.methods.given_lights import (
     LightFit,
     carry_intensities,
     compare_lights,
     find_intensities,
-    measure_misfit,
     read_small,
     reduce_images,
 )
@@ -36,11 +35,9 @@ ANY_LIGHT = "anylight"
 """The combination that assumes nothing of the light."""
 _LOOKED = 16
 """Images that are looked at, spread over all."""
-_SHADOW = 0.1
-"""A pixel is in shadow where it has less than this share of its bright values."""
-_IN_SHADOW, _DOUBT, _MISFIT = 0.04, 5.0, 0.1
-"""Share of the object in shadow, mean error to expect of the lights in degrees, and what Lambert's law leaves
-unexplained, from which on the witnesses speak for lamps, and against them (docs/studies/stray-light.md)."""
+ROOM = 0.2
+"""Variance of the directions of a picture's light, over all three axes, from which on no lamp was alone: networks tell
+at most 0.16 of rendered lamps, at least 0.25 of surroundings, with 8 images (docs/studies/stray-light.md)."""
 
 _log = logging.getLogger(__name__)
 
@@ -50,26 +47,38 @@ def is_lit_by_lamps(
 ) -> bool:
     """Return whether one lamp at a time lit the images, or nothing speaks against it.
 
-    Three witnesses must agree that none did: next to nothing is in shadow, where a lamp leaves part of any round
-    object; the network that finds lamps expects to be far off; and a matte surface under what it finds does not explain
-    the images. What covers the frame tells nothing: flat things have no shadows under a lamp either.
+    The network that finds light of any kind says how far the directions of a picture's light spread; those of a lamp do
+    not. What covers the frame tells nothing: the network has seen round things.
 
     Args:
         images, mask, find, config: As for `see_lights`.
+
+    Raises:
+        InputError: no weights for any light.
     """
-    if covers_frame(mask):
-        return True
+    return covers_frame(mask) or measure_spread(images, mask, find, config) < ROOM
+
+
+def measure_spread(
+    images: ImageSource, mask: np.ndarray, find: Callable[[str], Path], config: InferenceConfig | None = None
+) -> float:
+    """Return how far the directions of a picture's light spread, as a network tells: the mean over pictures of their
+    variance over all three axes, 0 to 1, of a lamp 0; of weights that take all light for lamps, always 0.
+
+    Args:
+        images, mask, find, config: As for `see_lights`.
+
+    Raises:
+        InputError: no weights for any light.
+    """
     numbers = spread_evenly(range(len(images)), _LOOKED)
     read, share = read_small(images, mask, numbers, INPUT_SIZE)
     inside = share > (0.5 if (share > 0.5).any() else 0.0)
     small = np.where(inside[..., None], read / np.maximum(share, 1e-6)[..., None], np.float32(0.0))
-    if find_shadow(small[:, inside].mean(-1), _SHADOW).mean() >= _IN_SHADOW:
-        return True
-    seen = see_lights(small, inside, find, config)
-    if seen is None or seen.expected_light_error is None or float(seen.expected_light_error.mean()) < _DOUBT:
-        return True
-    strengths = scale_to_mean(grey(seen.intensities.astype(np.float64)))
-    return measure_misfit(reduce_images(small, inside), seen.light_directions.astype(np.float64), strengths) < _MISFIT
+    seen = _ask(ANY_LIGHT, small, inside, find, replace(config or InferenceConfig(), stray_light=False))
+    if seen.light_covariance is None:
+        return 0.0
+    return float(np.trace(seen.light_covariance, axis1=1, axis2=2).mean())
 
 
 def see_lights(
@@ -84,14 +93,21 @@ def see_lights(
         config: How networks are used.
     """
     for name in _ASKED:
-        pair = COMBINATIONS[name]
         try:
-            find(pair.lighting)
+            find(COMBINATIONS[name].lighting)
         except InputError:
             continue
-        method = Method(name=pair.lighting, lighting=pair.lighting, light_views=pair.light_views)
-        return Runner(method, find, config).estimate(images, mask, None, None)
+        return _ask(name, images, mask, find, config)
     return None
+
+
+def _ask(
+    name: str, images: ImageSource, mask: np.ndarray, find: Callable[[str], Path], config: InferenceConfig | None
+) -> Estimate:
+    """Return the lights that the lighting network of a combination finds."""
+    pair = COMBINATIONS[name]
+    method = Method(name=pair.lighting, lighting=pair.lighting, light_views=pair.light_views)
+    return Runner(method, find, config).estimate(images, mask, None, None)
 
 
 def question_lights(

@@ -31,6 +31,7 @@ class Lights(NamedTuple):
     confidence: Tensor | None = None  # (B, Q) float32 in [0, 1], the product of the likeliest direction classes
     expected_error: Tensor | None = None  # (B, Q) float32, degrees to expect of the direction; None: not predicted
     nearness: Tensor | None = None  # (B, Q) float32, rho of the lamps (`sdps.core.geometry`); None: taken for distant
+    covariance: Tensor | None = None  # (B, Q, 3, 3) float32, of the directions light comes from; None: single lamps
 
     def select(self, images: slice) -> "Lights":
         """Return the lights of some images."""
@@ -151,6 +152,7 @@ class Observations(NamedTuple):
     light_errors: Tensor | None = None  # (B, Q), degrees to expect of the directions; None: they are exact
     nearness: Tensor | None = None  # (B, Q), rho of the lamps
     placement: Placement | None = None  # None: lamps are distant, the camera is orthographic
+    covariance: Tensor | None = None  # (B, Q, 3, 3), of the directions light comes from
 
 
 class Truth(NamedTuple):
@@ -197,17 +199,19 @@ class FusionNetwork(NormalNetwork, ABC):
             brightness: `brightness(...)` of all images of the scene where `images` are only some; see `normalised`.
             placement: Where pixels lie; None: lamps are distant, the camera is orthographic.
         """
-        directions = light_errors = nearness = None
+        directions = light_errors = nearness = covariance = None
         if self.needs_lights:
             assert lights is not None
             images, directions = divide(images, lights.intensities), lights.directions
-            light_errors, nearness = lights.expected_error, lights.nearness
+            light_errors, nearness, covariance = lights.expected_error, lights.nearness, lights.covariance
         if self.normalised:
             found = brightness if brightness is not None else self.brightness(images)
             # The published norm is that of 32 images of 3 channels, whatever the number of images here.
             images = images / ((32 * 3 * found).sqrt() + _SCALE_FLOOR)
         seen = Observations(images, directions, mask if self.needs_mask else None, light_errors)
-        return seen._replace(nearness=nearness, placement=placement) if self.sees_places else seen
+        if not self.sees_places:
+            return seen
+        return seen._replace(nearness=nearness, placement=placement, covariance=covariance)
 
     @staticmethod
     def brightness(images: Tensor) -> Tensor:

@@ -37,6 +37,7 @@ from sdps.models.blocks import (
     deconv,
     pool,
 )
+from sdps.models.covariance import pack, turn
 
 FRAMES = ("normal", "camera")
 _SEEN, _KNOWN = 11, 7
@@ -47,6 +48,8 @@ _LARGEST = 2.0
 """Logarithm of the largest distance that is expected, beyond any: odd input must not end in infinity."""
 _ERROR_SCALE = 10.0
 """Degrees to expect of a light that count as 1."""
+_COVARIANCE = 3.0
+"""Factor on covariances: light from all around, a third in each direction, counts as 1."""
 _NEAREST = 0.04
 """Squared distance, in a lamp's own, below which pixels are not lit more strongly."""
 _MAP = 32
@@ -61,6 +64,7 @@ class Pixels(NamedTuple):
     values: Tensor  # (N, Q, 3) float32, exposed images over the light intensities
     directions: Tensor  # (N, Q, 3) float32, unit
     errors: Tensor  # (N, Q) float32, degrees to expect of the directions
+    covariances: Tensor  # (N, Q, 6) float32, of the directions light comes from (`sdps.models.covariance`)
 
 
 class FusedMap(NamedTuple):
@@ -99,9 +103,10 @@ class FrameNet(FusionNetwork):
         heads: Of the attention across the lights of a pixel, after the last `attending` of the blocks; 0 for none.
         attending: Layers of attention.
         context: Channels of `Surroundings` at an eighth of the resolution, a multiple of 4; 0 for none.
+        covariance: The network is told how far the light of an image is from a single lamp's.
     """
 
-    added = ("attend", "surroundings")
+    added = ("attend", "surroundings", "about")
 
     needs_mask = True
     kept_bytes = 6
@@ -111,7 +116,7 @@ class FrameNet(FusionNetwork):
 
     def __init__(
         self, *, width: int = 64, blocks: int = 4, frame: str = "normal", heads: int = 0, attending: int = 2,
-        context: int = 0,
+        context: int = 0, covariance: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if blocks < 1 or width < 1:
@@ -124,6 +129,7 @@ class FrameNet(FusionNetwork):
             raise unknown("frame", str(frame), FRAMES)
         self.frame = frame
         self.seen, self.known = nn.Linear(_SEEN, width), nn.Linear(_KNOWN, width)
+        self.about = nn.Linear(6, width, bias=False) if covariance else None
         self.exchange = nn.Sequential(*(Exchange(width) for _ in range(blocks)))
         self.attend = nn.ModuleList(LightAttention(width, heads) for _ in range(attending if heads else 0))
         self.fuse = nn.Sequential(
@@ -137,6 +143,8 @@ class FrameNet(FusionNetwork):
         self.size_multiple, self.reach = (8, 96) if context else (4, 32)
         self.back = nn.Sequential(conv(192, 96), deconv(96, 64))
         self.leave = nn.Sequential(conv(128, 64), nn.Conv2d(64, 4, 3, padding=1))
+        if self.about is not None:
+            nn.init.zeros_(self.about.weight)
         # Training begins at the first normals.
         for parameter in (*self.offset.parameters(), *self.leave[-1].parameters()):
             nn.init.zeros_(parameter)
@@ -203,7 +211,7 @@ class FrameNet(FusionNetwork):
         """Return the fused map of all of a scene's images, which are never copied as a whole."""
         assert accumulated[0].mask is not None  # the network asks for it
         inside = accumulated[0].mask[:, 0] > 0.5  # (1, H, W)
-        directions, errors, nearness = _all_lights(accumulated)
+        directions, errors, nearness, covariances = _all_lights(accumulated)
         placement = accumulated[0].placement
         found = torch.zeros(inside.numel(), 3 + _MAP, device=inside.device)
         places = inside.flatten().nonzero()[:, 0]
@@ -212,7 +220,7 @@ class FrameNet(FusionNetwork):
             # Autocast to bfloat16 refuses to join images of 16-bit floats.
             with torch.autocast(inside.device.type, enabled=False):
                 values = torch.cat([part.images[0].flatten(2)[..., some] for part in accumulated])  # (Q, 3, n)
-            lights = (each.expand(len(some), *each.shape[1:]) for each in (directions, errors))
+            lights = (each.expand(len(some), *each.shape[1:]) for each in (directions, errors, covariances))
             pixels = Pixels(values.permute(2, 0, 1).float(), *lights)
             if placement is not None:
                 own = Placement(*(each[0].flatten(1)[:, some].T for each in placement))
@@ -231,7 +239,10 @@ class FrameNet(FusionNetwork):
             axes = frames(first) if self.frame == "normal" else camera  # (N, 3, 3)
             start = (axes @ first[..., None])[..., 0]  # the first normal in the frame
             seen, known = pixel_inputs(pixels, axes, start, scale, residual)
+            spread = _COVARIANCE * turn(pixels.covariances, axes)
         tokens = self.seen(seen) + self.known(known)[:, None]  # (N, Q, C)
+        if self.about is not None:
+            tokens = tokens + self.about(spread)
         alone = len(self.exchange) - len(self.attend)  # layers without attention
         for number, layer in enumerate(self.exchange):
             tokens = layer(tokens)
@@ -253,15 +264,19 @@ class FrameNet(FusionNetwork):
         return FusedMap(places[:, :3], places[:, 3:], inside[:, None].float(), sights)
 
 
-def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return directions (1, Q, 3), the errors to expect of them and nearness (1, Q), as exact as images are kept."""
+def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return directions (1, Q, 3), the errors to expect of them and nearness (1, Q), as exact as images are kept, and
+    covariances (1, Q, 6).
+    """
     directions = torch.cat([part.directions for part in parts if part.directions is not None], dim=1)
     errors = [part.light_errors for part in parts if part.light_errors is not None]
     expected = torch.cat(errors, dim=1) if errors else torch.zeros_like(directions[..., 0])
     near = [part.nearness for part in parts if part.nearness is not None]
     nearness = torch.cat(near, dim=1) if near else torch.zeros_like(expected)
+    about = [pack(part.covariance) for part in parts if part.covariance is not None]
+    covariances = torch.cat(about, dim=1) if about else directions.new_zeros(*expected.shape, 6)
     kept = parts[0].images.dtype
-    return directions.to(kept).float(), expected.to(kept).float(), nearness.float()
+    return directions.to(kept).float(), expected.to(kept).float(), nearness.float(), covariances.float()
 
 
 def object_pixels(seen: Observations) -> tuple[Tensor, Pixels]:
@@ -271,7 +286,9 @@ def object_pixels(seen: Observations) -> tuple[Tensor, Pixels]:
     values = seen.images.permute(0, 3, 4, 1, 2)[inside]  # (N, Q, 3)
     which = torch.arange(len(inside), device=inside.device).repeat_interleave(inside.flatten(1).sum(1))
     errors = torch.zeros_like(seen.directions[..., 0]) if seen.light_errors is None else seen.light_errors
-    pixels = Pixels(values, seen.directions[which].to(values.dtype), errors[which].to(values.dtype))
+    about = seen.directions.new_zeros(*errors.shape, 6) if seen.covariance is None else pack(seen.covariance)
+    lights = (each[which].to(values.dtype) for each in (seen.directions, errors, about))
+    pixels = Pixels(values, *lights)
     if seen.placement is None:
         return inside, pixels
     own = Placement(*(each.permute(0, 2, 3, 1)[inside] for each in seen.placement))
@@ -284,8 +301,10 @@ def see_lamps(pixels: Pixels, nearness: Tensor, own: Placement) -> Pixels:
     with torch.autocast(nearness.device.type, enabled=False):
         off = pixels.directions.float() - nearness.float()[..., None] * own.places.float()[:, None]  # (N, Q, 3)
         squared = off.square().sum(dim=-1).clamp(min=_NEAREST)
-        towards = (off / squared.sqrt()[..., None]) @ turn_to_sight(own.sights.float()).transpose(1, 2)
-    return pixels._replace(values=pixels.values * squared[..., None], directions=towards)
+        turns = turn_to_sight(own.sights.float())
+        towards = (off / squared.sqrt()[..., None]) @ turns.transpose(1, 2)
+        covariances = turn(pixels.covariances.float(), turns)
+    return Pixels(pixels.values * squared[..., None], towards, pixels.errors, covariances)
 
 
 def pixel_inputs(pixels: Pixels, axes: Tensor, start: Tensor, scale: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -298,7 +317,7 @@ def pixel_inputs(pixels: Pixels, axes: Tensor, start: Tensor, scale: Tensor, res
         scale: (N, 3), radiance of a Lambertian surface of the pixel's colour that faces the light.
         residual: (N,), mean absolute error of that surface, relative to `scale`.
     """
-    values, directions, errors = pixels
+    values, directions, errors, _ = pixels
     relative = values / (scale + 0.1 * scale.mean(dim=1, keepdim=True) + _DARK)[:, None]  # all equal on matte surfaces
     local = directions @ axes.transpose(1, 2)  # (N, Q, 3)
     view = axes[:, :, 2]  # (N, 3), z of the camera

@@ -19,6 +19,7 @@ from sdps.core.lighting import LightClasses, ReadOut
 from sdps.core.losses import expected_distance_loss
 from sdps.models.base import LightingNetwork, Lights
 from sdps.models.blocks import LOG_USUAL, SLOPE, Convolution, chord_degrees
+from sdps.models.covariance import unpack
 
 SIDE = 64
 """Pixels a side that the network sees; larger images are averaged."""
@@ -45,6 +46,7 @@ class SetPrediction(NamedTuple):
     intensities: Tensor  # (B, Q) float32, positive, relative
     expected: Tensor  # (B, Q) float32, distance to the true direction
     nearness: Tensor  # (B, Q) float32, rho of the lamps; 0 of a network that takes them for distant
+    covariance: Tensor  # (B, Q, 3, 3) float32, of light's directions; 0 of a network that takes all for lamps
 
 
 class Level(nn.Module):
@@ -95,13 +97,14 @@ class LightSetNet(LightingNetwork):
         intensity_range: Intensities drawn in training.
         breadth: Factor on the channels of the convolutions, which are multiples of 16.
         nearness: Predict how near the lamps stand; the released networks before it take them for distant.
+        covariance: Predict how far the light of an image is from a single lamp's.
     """
 
-    added = ("near",)
+    added = ("near", "about")
 
     def __init__(
         self, *, width: int = 256, blocks: int = 3, heads: int = 4, intensity_range: tuple[float, float] = (0.2, 2.0),
-        nearness: bool = False, breadth: float = 1.0,
+        nearness: bool = False, breadth: float = 1.0, covariance: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if blocks < 0 or width < 1 or heads < 1 or width % heads:
@@ -119,6 +122,10 @@ class LightSetNet(LightingNetwork):
         if self.near is not None:  # all lamps begin alike
             nn.init.zeros_(self.near.weight)
             nn.init.constant_(self.near.bias, _USUAL_NEARNESS)
+        self.about = nn.Linear(width, 6) if covariance else None
+        if self.about is not None:
+            nn.init.zeros_(self.about.weight)
+            nn.init.zeros_(self.about.bias)
 
     def encode(self, images: Tensor, mask: Tensor) -> Tensor:
         """Return the object's radiance and the mask, (B, Q, 4, S, S), of images of any side, 128 in use."""
@@ -142,11 +149,14 @@ class LightSetNet(LightingNetwork):
             nearness = torch.zeros_like(values[..., 0])
             if self.near is not None:
                 nearness = functional.softplus(self.near(read)[..., 0])
+            covariance = values.new_zeros(*nearness.shape, 3, 3)
+            if self.about is not None:
+                covariance = unpack(self.about(read))
             # Towards the camera at first; lights behind the object are not to be found.
             directions = functional.normalize(values[..., :3] + values.new_tensor([0.0, 0.0, 0.5]), dim=-1)
             strengths = values[..., 3]
             intensities = _USUAL_INTENSITY * (strengths - strengths.mean(dim=1, keepdim=True)).exp()
-            return SetPrediction(directions, intensities, (values[..., 4] + LOG_USUAL).exp(), nearness)
+            return SetPrediction(directions, intensities, (values[..., 4] + LOG_USUAL).exp(), nearness, covariance)
 
     def predict_parts(self, parts: list[Tensor], seed: int) -> SetPrediction:
         """Return what groups of images say; all images together give the intensities of a group their scale."""
@@ -162,6 +172,7 @@ class LightSetNet(LightingNetwork):
             scale = (together.intensities[:, part] / some.intensities).log().mean(dim=1, keepdim=True).exp()
             found.directions[:, part], found.expected[:, part] = some.directions, some.expected
             found.intensities[:, part], found.nearness[:, part] = some.intensities * scale, some.nearness
+            found.covariance[:, part] = some.covariance
         return found
 
     def loss(self, prediction: SetPrediction, truth: Lights) -> dict[str, Tensor]:
@@ -177,13 +188,19 @@ class LightSetNet(LightingNetwork):
         if self.near is not None and truth.nearness is not None:
             terms["nearness"] = (prediction.nearness - truth.nearness).abs().mean()
             total = total + terms["nearness"]
+        if self.about is not None and truth.covariance is not None:
+            off = (prediction.covariance - truth.covariance).square().sum(dim=(-2, -1))
+            terms["covariance"] = (off + 1e-6).sqrt().mean()
+            total = total + terms["covariance"]
         return {"total": total, **terms}
 
     def read_lights(self, prediction: SetPrediction, read_out: ReadOut = "centre") -> Lights:
         """Return the regressed lights; there are no classes to read out."""
         errors = chord_degrees(prediction.expected)
         nearness = None if self.near is None else prediction.nearness
-        return Lights(prediction.directions, prediction.intensities, expected_error=errors, nearness=nearness)
+        covariance = None if self.about is None else prediction.covariance
+        found = Lights(prediction.directions, prediction.intensities, expected_error=errors)
+        return found._replace(nearness=nearness, covariance=covariance)
 
 
 def image_inputs(local: Tensor) -> tuple[Tensor, Tensor]:

@@ -191,7 +191,10 @@ class NormalStage(Stage):
         found = torch.zeros_like(batch.nearness) if lights.nearness is None else lights.nearness.float()
         nearness = torch.lerp(found, batch.nearness, share)
         error = None if lights.expected_error is None else (1.0 - share) * lights.expected_error.float()
-        return Lights(functional.normalize(directions, dim=-1), intensities, expected_error=error, nearness=nearness)
+        flat = torch.zeros_like(batch.covariance) if lights.covariance is None else lights.covariance.float()
+        covariance = torch.lerp(flat, batch.covariance, share[..., None, None])
+        directions = functional.normalize(directions, dim=-1)
+        return Lights(directions, intensities, expected_error=error, nearness=nearness, covariance=covariance)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the network's own loss on the crops, as configured."""
@@ -262,7 +265,8 @@ def leave_out(batch: Batch, fewest: int) -> Batch:
     """Return a batch with so many images of each scene or more, as its first scene's seed draws."""
     most = batch.images.shape[1]
     count = int(generator(int(batch.seed[0]), "images").integers(min(fewest, most), most, endpoint=True))
-    some = {name: getattr(batch, name)[:, :count] for name in ("images", "directions", "intensities", "nearness")}
+    names = "images", "directions", "intensities", "nearness", "covariance"
+    some = {name: getattr(batch, name)[:, :count] for name in names}
     return batch._replace(**some)
 
 
@@ -280,7 +284,7 @@ def flatten_some(placement: Placement, seeds: Tensor) -> Placement:
 
 def true_lights(batch: Batch) -> Lights:
     """Return the lights of a batch's scenes."""
-    return Lights(batch.directions, batch.intensities, nearness=batch.nearness)
+    return Lights(batch.directions, batch.intensities, nearness=batch.nearness, covariance=batch.covariance)
 
 
 def lighting_options(model: str, config: LightingTraining) -> dict[str, Any]:
@@ -323,6 +327,9 @@ def light_errors(lights: Lights, batch: Batch, suffix: str) -> dict[str, float]:
     }
     if lights.nearness is not None:
         values[f"nearness_error{suffix}"] = float((lights.nearness.float() - batch.nearness).abs().mean())
+    if lights.covariance is not None:
+        off = (lights.covariance.float() - batch.covariance).square().sum(dim=(-2, -1)).sqrt()
+        values[f"covariance_error{suffix}"] = float(off.mean())
     return values
 
 

@@ -37,6 +37,7 @@ def images_per_second(run: Run, device: torch.device) -> float:
         torch.rand(scenes, images, 3, side, side), torch.ones(scenes, 1, side, side), vectors,
         functional.normalize(torch.rand(scenes, images, 3) + 0.1, dim=-1), torch.ones(scenes, images),
         torch.zeros(scenes, 2, dtype=torch.int64), torch.arange(scenes), torch.zeros(scenes, images), vectors, vectors,
+        torch.zeros(scenes, images, 3, 3),
     ).to(device)  # fmt: skip
     least = float("inf")
     for _ in range(_TIMED_STEPS):

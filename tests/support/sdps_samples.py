@@ -25,4 +25,5 @@ def distant_layout(images: Tensor) -> dict[str, Tensor]:
     scenes, count, _, *sides = images.shape
     sights = torch.zeros(scenes, 3, *sides)
     sights[:, 2] = 1.0
-    return {"nearness": torch.zeros(scenes, count), "places": torch.zeros(scenes, 3, *sides), "sights": sights}
+    lamps = {"nearness": torch.zeros(scenes, count), "covariance": torch.zeros(scenes, count, 3, 3)}
+    return {**lamps, "places": torch.zeros(scenes, 3, *sides), "sights": sights}

@@ -135,6 +135,7 @@ def make_batch(held: Held, numbers: np.ndarray, options: SampleOptions, rng: np.
     return Batch(
         images=images, mask=maps[:, :1], normals=maps[:, 1:4], directions=directions, intensities=intensities,
         corner=corner, seed=torch.from_numpy(rng.integers(2**63, size=len(numbers))), nearness=nearness,
+        covariance=nearness.new_zeros(*nearness.shape, 3, 3),
         places=maps[:, 4:7], sights=maps[:, 7:],
     )  # fmt: skip
 

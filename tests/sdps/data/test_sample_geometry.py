@@ -76,6 +76,18 @@ def test_what_faces_all_lamps_of_a_mixture_is_lit_as_by_the_lamp_that_stands_for
     assert ((low < mixed.nearness) & (mixed.nearness < high)).all()
 
 
+def test_light_from_many_sides_has_the_covariance_of_its_directions() -> None:
+    found = placed(replace(NEAR, light_distances=()))
+    assert not found.covariance.any() and np.abs(found.mix(np.eye(3)).covariance).max() < 1e-6, "single lamps"
+    apart = found._replace(directions=np.array([[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8], [0.0, 0.0, 1.0]], np.float32))
+    two, three = apart.mix(np.array([[0.5, 0.5, 0.0], [0.25, 0.25, 0.5]])).covariance
+    np.testing.assert_allclose(two, np.diag([0.36, 0.0, 0.0]), atol=1e-6)
+    np.testing.assert_allclose(three, np.diag([0.18, 0.0, 0.01]), atol=1e-6)
+    around = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
+    whole = Placed(found.places, found.sights, around, np.zeros(6, np.float32), np.ones(6, np.float32), np.zeros(0))
+    np.testing.assert_allclose(whole.mix(np.ones((1, 6))).covariance[0], np.eye(3) / 3.0, atol=1e-6)
+
+
 def test_geometry_turns_and_shrinks_with_the_scene() -> None:
     layout = lay_out(FROM_NEARBY, DEPTH, MASK, np.arange(3))
     plain, symmetry = place(layout, MASK, NEAR.light_directions()), Symmetry(1, True)

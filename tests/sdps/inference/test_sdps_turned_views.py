@@ -9,7 +9,7 @@ from render.shared.errors import InputError
 from sdps.core.metrics import angle_degrees
 from sdps.core.symmetry import SYMMETRIES, Symmetry
 from sdps.inference.estimator import Estimator
-from sdps.inference.turned_views import mean_lights
+from sdps.inference.turned_views import mean_lights, turn_lights
 from sdps.models.base import Lights
 from sdps.models.checkpoint import TrainedModel
 from sdps.models.registry import create
@@ -49,10 +49,14 @@ def test_the_first_views_are_groups_and_all_are_different() -> None:
 
 def test_the_mean_of_lights_undoes_the_turns() -> None:
     true = torch.nn.functional.normalize(torch.rand(1, 4, 3), dim=-1)
-    gains = torch.rand(1, 4)
-    found = [(symmetry, Lights(symmetry.vectors(true), *[gains] * 4)) for symmetry in SYMMETRIES]
-    mean = mean_lights(found)
-    for one, two in zip(mean, (true, *[gains] * 4), strict=True):
+    gains, sides = torch.rand(1, 4), torch.rand(1, 4, 2, 3)
+    spread = sides.transpose(-1, -2) @ sides
+    lights = Lights(true, *[gains] * 4, covariance=spread)
+    turned = [turn_lights(symmetry, lights) for symmetry in SYMMETRIES]
+    for symmetry, found in zip(SYMMETRIES, turned, strict=True):
+        own = symmetry.vectors(sides)
+        torch.testing.assert_close(found.covariance, own.transpose(-1, -2) @ own)
+    for one, two in zip(mean_lights(list(zip(SYMMETRIES, turned, strict=True))), lights, strict=True):
         torch.testing.assert_close(one, two)
 
 

@@ -102,14 +102,14 @@ def test_a_frame_has_the_normal_along_z_and_the_view_in_its_xz_plane():
 
 
 def test_what_a_pixel_is_told_does_not_change_when_it_turns_about_the_view():
-    values, lights, errors = torch.rand(20, 9, 3), unit(20, 9), torch.rand(20, 9)
+    values, lights, errors, spread = torch.rand(20, 9, 3), unit(20, 9), torch.rand(20, 9), torch.zeros(20, 9, 6)
     turned = rotate_about_view(lights, 1.1)
     inputs = []
     for directions in (lights, turned):
         first, scale, error = first_normals(values, directions)
         axes = frames(first)
         start = (axes @ first[..., None])[..., 0]
-        inputs.append(pixel_inputs(Pixels(values, directions, errors), axes, start, scale, error))
+        inputs.append(pixel_inputs(Pixels(values, directions, errors, spread), axes, start, scale, error))
     for one, other in zip(*inputs, strict=True):
         torch.testing.assert_close(one, other, atol=2e-3, rtol=1e-3)
 
@@ -130,6 +130,50 @@ def test_the_map_turns_with_the_scene(trained, turns):
         ours, theirs = trained.turn(trained.encode(seen), symmetry), trained.encode(turned)
         for one, other in zip(ours[:3], theirs[:3], strict=True):
             torch.testing.assert_close(one, other, atol=5e-3, rtol=0)
+
+
+@pytest.fixture
+def told() -> FrameNet:
+    """Return a network that is told how far light spreads, and heeds it."""
+    network = FrameNet(width=16, blocks=2, covariance=True).eval()
+    for last in (network.offset, network.leave[-1], network.about):
+        torch.nn.init.normal_(last.weight, std=0.1)
+    return network
+
+
+def spread_out(seen: Observations, axes: Tensor) -> Observations:
+    """Return observations whose light spreads along axes (1, Q, 2, 3)."""
+    return seen._replace(covariance=axes.transpose(-1, -2) @ axes)
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+def test_light_that_spreads_turns_with_the_scene(told, turns):
+    axes, symmetry, seen = 0.5 * torch.randn(1, 9, 2, 3), Symmetry(turns, False), observations(9)
+    turned = Observations(symmetry.images(seen.images), symmetry.vectors(seen.directions), symmetry.images(seen.mask))
+    with torch.no_grad():
+        ours = told.turn(told.encode(spread_out(seen, axes)), symmetry)
+        theirs, without = told.encode(spread_out(turned, symmetry.vectors(axes))), told.encode(turned)
+    torch.testing.assert_close(ours.feature, theirs.feature, atol=5e-3, rtol=0)
+    assert (theirs.feature - without.feature).abs().max() > 0.05, "it makes a difference"
+
+
+def test_light_that_spreads_is_seen_along_the_line_of_sight(told):
+    """A pixel before a pinhole is one before an orthographic camera, turned with its line of sight."""
+    axes, seen = 0.5 * torch.randn(1, 9, 2, 3), observations(9)
+    tilt = torch.tensor([0.3, -0.2, 1.0])
+    turn = turn_to_sight(tilt)
+    flat = spread_out(seen._replace(directions=seen.directions @ turn.T), axes @ turn.T)
+    whole = tilt[None, :, None, None].expand(1, 3, *seen.mask.shape[-2:])
+    tilted = spread_out(seen, axes)._replace(placement=Placement(torch.zeros_like(whole), whole))
+    with torch.no_grad():
+        ours, theirs = told.encode(flat), told.encode(tilted)
+        names = "images", "directions", "covariance"
+        parts = [tilted._replace(**{name: getattr(tilted, name)[:, some] for name in names})
+                 for some in (slice(4), slice(4, 9))]  # fmt: skip
+        in_parts = aggregated(told, parts)
+    torch.testing.assert_close(ours.feature, theirs.feature, atol=1e-3, rtol=0)
+    inside = seen.mask[0, 0] > 0.5
+    torch.testing.assert_close(in_parts.feature[..., inside], theirs.feature[..., inside], atol=0.02, rtol=0)
 
 
 def test_neither_order_nor_chunks_of_images_matter(trained, monkeypatch):

@@ -92,6 +92,25 @@ def test_many_images_meet_in_groups_that_share_one_scale(network, monkeypatch):
     assert (found.directions - other.directions).abs().max() > 1e-4
 
 
+def test_how_far_light_spreads_is_learned_and_told():
+    network, (images, mask) = LightSetNet(width=32, blocks=2, heads=2, covariance=True).eval(), scene()
+    with torch.no_grad():
+        told = network.read_lights(network(images, mask)).covariance
+    assert told is not None and not told.any(), "training begins at single lamps"
+    all_around = torch.eye(3).expand(1, 5, 3, 3)
+    truth = Lights(functional.normalize(torch.randn(1, 5, 3), dim=-1), torch.ones(1, 5), covariance=all_around)
+    terms = network.loss(network(images, mask), truth)
+    assert float(terms["covariance"]) == pytest.approx(3**0.5, abs=1e-3)
+    terms["covariance"].backward()
+    assert network.about.bias.grad[[0, 3, 5]].lt(0.0).all() and network.about.bias.grad[[1, 2, 4]].abs().max() < 1e-6
+    torch.nn.init.normal_(network.about.weight)
+    with torch.no_grad():
+        found = network(images, mask)
+        parts = network.predict_parts([network.encode(images, mask)], 0)
+    torch.testing.assert_close(found.covariance, found.covariance.transpose(-1, -2))
+    torch.testing.assert_close(parts.covariance, found.covariance)
+
+
 def test_images_of_any_side_are_seen_alike(network):
     images, mask = scene(2)
     small = [functional.avg_pool2d(part.flatten(0, 1), 2) for part in (images * mask[:, None], mask[:, None])]
@@ -138,7 +157,8 @@ def test_black_images_have_a_light(network, values):
 def test_the_scale_of_intensities_costs_nothing_and_the_ratios_do(network):
     directions = functional.normalize(torch.randn(1, 4, 3), dim=-1)
     strengths = torch.tensor([[0.3, 0.6, 1.2, 0.9]])
-    prediction = SetPrediction(directions, strengths, torch.full((1, 4), 0.1), torch.zeros(1, 4))
+    lamps = torch.zeros(1, 4), torch.zeros(1, 4, 3, 3)
+    prediction = SetPrediction(directions, strengths, torch.full((1, 4), 0.1), *lamps)
     alike, other = (
         network.loss(prediction, Lights(directions, scale * torch.tensor([[0.3, 0.6, 1.2, last]])))["relative"]
         for scale, last in ((2.0, 0.9), (1.0, 1.8))
@@ -149,7 +169,8 @@ def test_the_scale_of_intensities_costs_nothing_and_the_ratios_do(network):
 
 def test_expected_errors_are_in_degrees(network):
     chord = torch.tensor([[2.0 * math.sin(math.radians(5.0)), 3.0]])
-    lights = network.read_lights(SetPrediction(torch.zeros(1, 2, 3), torch.ones(1, 2), chord, torch.zeros(1, 2)))
+    lamps = torch.zeros(1, 2), torch.zeros(1, 2, 3, 3)
+    lights = network.read_lights(SetPrediction(torch.zeros(1, 2, 3), torch.ones(1, 2), chord, *lamps))
     np.testing.assert_allclose(lights.expected_error, [[10.0, 180.0]], rtol=1e-5)
 
 
