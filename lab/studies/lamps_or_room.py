@@ -44,12 +44,12 @@ def tell_photographs(data: Path, light: str, models: Path | None) -> Iterator[li
         yield [measure_spread(each, item.mask, find) for each in mixed]
 
 
-def tabulate(light: str, told: Sequence[Sequence[float]], limit: float) -> list[list[str]]:
-    """Return a row for each number of images: how many count as lit from many sides, and the spread of what is told."""
+def tabulate(light: str, told: Sequence[Sequence[float]]) -> list[list[str]]:
+    """Return a row for each number of images: how many count as lit from many sides, and what is told of all."""
     rows = []
-    for count, values in zip(COUNTS, np.array(told).T, strict=True):
-        shown = " ".join(f"{each:.2f}" for each in np.quantile(values, _SHARES))
-        rows.append([light, str(count), f"{(values >= limit).sum()} of {len(values)}", shown])
+    for count, values in zip(COUNTS, np.reshape(told, (-1, len(COUNTS))).T, strict=True):
+        shown = " ".join(f"{each:.2f}" for each in np.quantile(values, _SHARES)) if len(values) else "-"
+        rows.append([light, str(count), f"{(values >= ROOM).sum()} of {len(values)}", shown])
     return rows
 
 
@@ -63,9 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     lines = []
     for light in LIGHTS:
-        lines += tabulate(light, list(tell_scenes(args.data, light, args.scenes, args.models)), ROOM)
+        lines += tabulate(light, list(tell_scenes(args.data, light, args.scenes, args.models)))
     for light in mixed_photographs.MIXED if args.photographs else ():
-        lines += tabulate(f"real, {light}", list(tell_photographs(args.photographs, light, args.models)), ROOM)
+        lines += tabulate(f"real, {light}", list(tell_photographs(args.photographs, light, args.models)))
     head = ["light", "images", "not lamps", "least, median and largest variance"]
     sys.stdout.write(render_text("Variance of the directions of light, as a network tells it", head, lines))
     return 0
