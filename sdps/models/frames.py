@@ -66,6 +66,10 @@ class Pixels(NamedTuple):
     errors: Tensor  # (N, Q) float32, degrees to expect of the directions
     covariances: Tensor  # (N, Q, 6) float32, of the directions light comes from (`sdps.models.covariance`)
 
+    def select(self, which: Tensor | slice) -> "Pixels":
+        """Return some pixels, in float32."""
+        return Pixels(*(part[which].float() for part in self))
+
 
 class FusedMap(NamedTuple):
     """What is known of every pixel once all lights were seen."""
@@ -104,6 +108,8 @@ class FrameNet(FusionNetwork):
         attending: Layers of attention.
         context: Channels of `Surroundings` at an eighth of the resolution, a multiple of 4; 0 for none.
         covariance: The network is told how far the light of an image is from a single lamp's.
+        learn_every: The layers before the fusion learn from every n-th pixel, diagonal by diagonal, and only see the
+            others: what pixels of one scene teach is much alike.
     """
 
     added = ("attend", "surroundings", "about")
@@ -116,7 +122,7 @@ class FrameNet(FusionNetwork):
 
     def __init__(
         self, *, width: int = 64, blocks: int = 4, frame: str = "normal", heads: int = 0, attending: int = 2,
-        context: int = 0, covariance: bool = False,
+        context: int = 0, covariance: bool = False, learn_every: int = 1,
     ) -> None:  # fmt: skip
         super().__init__()
         if blocks < 1 or width < 1:
@@ -125,9 +131,11 @@ class FrameNet(FusionNetwork):
             raise InputError(f"heads must divide width, and attending be 0 to blocks, got {heads} and {attending}")
         if context < 0 or context % 4:
             raise InputError(f"context must be a multiple of 4, or 0, got {context}")
+        if learn_every < 1:
+            raise InputError(f"learn_every must be at least 1, got {learn_every}")
         if frame not in FRAMES:
             raise unknown("frame", str(frame), FRAMES)
-        self.frame = frame
+        self.frame, self.learn_every = frame, learn_every
         self.seen, self.known = nn.Linear(_SEEN, width), nn.Linear(_KNOWN, width)
         self.about = nn.Linear(6, width, bias=False) if covariance else None
         self.exchange = nn.Sequential(*(Exchange(width) for _ in range(blocks)))
@@ -168,14 +176,17 @@ class FrameNet(FusionNetwork):
         return 2.1e-6 * images * pixels + 2.0e-6 * views * box
 
     def encode(self, seen: Observations) -> FusedMap:
-        """Return the fused map of all of a scene's images; without gradients a few pixels at a time."""
+        """Return the fused map of all of a scene's images; what is not learned from, a few pixels at a time."""
         inside, pixels = object_pixels(seen)
-        count = max(1, len(pixels.values) if torch.is_grad_enabled() else _STRIP // seen.images.shape[1])
-        found = [
-            self._per_pixel(Pixels(*(part.float() for part in some)))
-            for some in zip(*(each.split(count) for each in pixels), strict=True)
-        ]
-        return self._to_map(torch.cat(found), inside, seen.placement)
+        if not torch.is_grad_enabled():
+            return self._to_map(self._look(pixels), inside, seen.placement)
+        learned = _diagonals(inside, self.learn_every)
+        some, others = learned.nonzero()[:, 0], (~learned).nonzero()[:, 0]
+        found = self._per_pixel(pixels.select(some))
+        with torch.no_grad():
+            looked = self._look(pixels.select(others))
+        whole = found.new_zeros(len(learned), found.shape[1])
+        return self._to_map(whole.index_copy(0, some, found).index_copy(0, others, looked), inside, seen.placement)
 
     def regress(self, feature: FusedMap) -> Tensor:
         return self.correct(feature)[0]
@@ -231,6 +242,12 @@ class FrameNet(FusionNetwork):
         sights = None if placement is None else placement.sights
         return FusedMap(places_of_all[:, :3], places_of_all[:, 3:], inside[:, None].float(), sights)
 
+    def _look(self, pixels: Pixels) -> Tensor:
+        """Return `_per_pixel`, a few pixels at a time."""
+        count = max(1, _STRIP // pixels.values.shape[1])
+        parts = range(0, max(1, len(pixels.values)), count)
+        return torch.cat([self._per_pixel(pixels.select(slice(start, start + count))) for start in parts])
+
     def _per_pixel(self, pixels: Pixels) -> Tensor:
         """Return normals and features of pixels, (N, 3 + 32)."""
         with torch.no_grad(), torch.autocast(pixels.values.device.type, enabled=False):
@@ -277,6 +294,12 @@ def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor, Tensor, Tens
     covariances = torch.cat(about, dim=1) if about else directions.new_zeros(*expected.shape, 6)
     kept = parts[0].images.dtype
     return directions.to(kept).float(), expected.to(kept).float(), nearness.float(), covariances.float()
+
+
+def _diagonals(inside: Tensor, every: int) -> Tensor:
+    """Return which of the pixels of `inside` (B, H, W), in reading order, lie on every so many diagonals: (N,) bool."""
+    rows, columns = (torch.arange(side, device=inside.device) for side in inside.shape[1:])
+    return ((rows[:, None] + columns) % every == 0).expand_as(inside)[inside]
 
 
 def object_pixels(seen: Observations) -> tuple[Tensor, Pixels]:

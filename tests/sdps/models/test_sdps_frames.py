@@ -176,6 +176,21 @@ def test_light_that_spreads_is_seen_along_the_line_of_sight(told):
     torch.testing.assert_close(in_parts.feature[..., inside], theirs.feature[..., inside], atol=0.02, rtol=0)
 
 
+def test_layers_before_the_fusion_learn_from_every_third_diagonal_and_see_all(trained):
+    seen, some = observations(9), FrameNet(width=16, blocks=2, learn_every=3).eval()
+    some.load_state_dict(trained.state_dict())
+    ours, all_of_it = some.encode(seen), trained.encode(seen)
+    torch.testing.assert_close(ours.feature, all_of_it.feature, atol=1e-5, rtol=0)
+    rows, columns = torch.arange(8)[:, None], torch.arange(8)
+    weights = torch.randn(8, 8) * seen.mask[0, 0]
+    learned = weights * ((rows + columns) % 3 == 0)
+    (gradient,) = torch.autograd.grad((ours.feature * weights).sum(), some.seen.weight)
+    (expected,) = torch.autograd.grad((all_of_it.feature * learned).sum(), trained.seen.weight)
+    torch.testing.assert_close(gradient, expected, atol=1e-4, rtol=1e-3)
+    with pytest.raises(InputError, match="learn_every must be at least 1, got 0"):
+        FrameNet(learn_every=0)
+
+
 def test_neither_order_nor_chunks_of_images_matter(trained, monkeypatch):
     monkeypatch.setattr("sdps.models.frames._STRIP", 64)
     seen, order = observations(9), torch.randperm(9)
