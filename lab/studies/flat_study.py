@@ -30,7 +30,7 @@ from sdps.surface.relight import trace_light
 _ROOM, _NOISE = 32, 0.003
 _PORTRAIT = ((0.05, 0.1, 0.35, 0.05), (0.12, 0.2, 0.12, 0.03), (-0.1, -0.35, 0.2, 0.03), (0.3, 0.05, 0.08, 0.03))
 KINDS = ("coin", "weave", "paint")
-_LAMPS: dict[str, dict[str, float]] = {
+LAMPS: dict[str, dict[str, float]] = {
     "far": {"depth": 1.0},
     "far, raking": {"depth": 1.0, "slant": 78.0},
     "far, deep": {"depth": 2.0, "slant": 78.0},
@@ -65,7 +65,7 @@ def _count_sides(side: int, images: int, each: int) -> None:
     mask, turn = np.ones((side, side), bool), np.array([-1, -1, 1], np.float32)
     runner = make_runner("auto", (False, False), None, None, False, images, Flatness("yes"))
     sys.stdout.write("lamps          kind   network  told right  wrong  not told\n")
-    for name, settings in _LAMPS.items():
+    for name, settings in LAMPS.items():
         for kind in KINDS:
             counts = dict.fromkeys(("network", "right", "wrong", "not"), 0)
             for seed, depth in itertools.product(range(each), (1.0, -1.0)):

@@ -4,17 +4,19 @@
     python -m lab.studies.lamps_or_room DATA --models OUT --scenes 20 --photographs DiLiGenT/pmsData
 
 The scenes are those of `lab.studies.any_light_study`, which no network has seen. Photographs of real objects under one
-lamp at a time are looked at as they are, and mixed (`lab.studies.mixed_photographs`).
+lamp at a time are looked at as they are, and mixed (`lab.studies.mixed_photographs`). Flat discs under lamps
+(`lab.studies.flat_study`), which no network has seen, are what fools it.
 """
 
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from lab.studies import mixed_photographs
+from lab.studies import flat_study, mixed_photographs
 from lab.studies.any_light_study import LIGHTS, choose, photograph, unpack
 from pipelines.evaluate.benchmarks.diligent import DiligentConfig, diligent_objects
 from pipelines.shared.text_tables import render_text
@@ -23,6 +25,8 @@ from sdps.methods import pretrained
 from sdps.methods.light_witness import ROOM, measure_spread
 
 COUNTS = (4, 8, 16)
+_SIDE, _DISC = 128, 0.9
+"""Pixels of a disc's side, and its squared radius in half sides."""
 _SHARES = (0.0, 0.5, 1.0)
 """Of the scenes, in order of what is told, whose values are shown."""
 
@@ -42,6 +46,14 @@ def tell_photographs(data: Path, light: str, models: Path | None) -> Iterator[li
         images = mixed_photographs.read_all(item)
         mixed = (mixed_photographs.mix(images, count, mixed_photographs.MIXED[light], item.name) for count in COUNTS)
         yield [measure_spread(each, item.mask, find) for each in mixed]
+
+
+def tell_discs(models: Path | None) -> Iterator[list[float]]:
+    """Yield what is told of each flat thing under lamps, cut out as a disc."""
+    find, (x, y) = pretrained.finder(models), np.meshgrid(*2 * [np.linspace(-1.0, 1.0, _SIDE)])
+    for kind, lamps in product(flat_study.KINDS, flat_study.LAMPS.values()):
+        images = flat_study.photograph(kind, _SIDE, max(COUNTS), **lamps).images
+        yield [measure_spread(images[:count], x**2 + y**2 < _DISC, find) for count in COUNTS]
 
 
 def tabulate(light: str, told: Sequence[Sequence[float]]) -> list[list[str]]:
@@ -64,6 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     lines = []
     for light in LIGHTS:
         lines += tabulate(light, list(tell_scenes(args.data, light, args.scenes, args.models)))
+    lines += tabulate("flat discs, lamps", list(tell_discs(args.models)))
     for light in mixed_photographs.MIXED if args.photographs else ():
         lines += tabulate(f"real, {light}", list(tell_photographs(args.photographs, light, args.models)))
     head = ["light", "images", "not lamps", "least, median and largest variance"]

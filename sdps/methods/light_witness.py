@@ -48,7 +48,7 @@ def is_lit_by_lamps(
     """Return whether one lamp at a time lit the images, or nothing speaks against it.
 
     The network that finds light of any kind says how far the directions of a picture's light spread; those of a lamp do
-    not. What covers the frame tells nothing: the network has seen round things.
+    not. What covers the frame tells nothing: the network has not seen flat things.
 
     Args:
         images, mask, find, config: As for `see_lights`.
