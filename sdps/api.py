@@ -314,7 +314,7 @@ def choose_method(
     text = (
         "The light of each picture seems to come from many sides: not one lamp lit it, but a room or several lamps. So "
         "the normals are found by a network for any light, which finds no lights. For better ones darken the room and "
-        "use one lamp; if you did, say so with --lit-by lamp, or of a flat thing with --flat."
+        "use one lamp; if you did, say so with --lit-by lamp, and if the object is flat, use --flat."
     )
     return chosen, (Finding("note", text),)
 
