@@ -30,7 +30,7 @@ def stray_light(values: np.ndarray) -> np.ndarray:
     Returns:
         (L, 3) float32, zero where nothing is in shadow.
     """
-    shadow = _find_shadow(values, _SHADOW)
+    shadow = _find_shadow(values)
     level = np.full((len(values), 3), np.nan, np.float32)
     for image, inside, found in zip(values, shadow, level, strict=True):
         for channel in np.flatnonzero(inside.sum(0) >= _FEWEST):
@@ -42,11 +42,11 @@ def stray_light(values: np.ndarray) -> np.ndarray:
     return np.clip(level, -most, most)
 
 
-def _find_shadow(values: np.ndarray, share: float) -> np.ndarray:  # (L, P, ...) bool
-    """Find where values (L, P, ...) float32 of object pixels have less than a share of the pixel's bright ones."""
+def _find_shadow(values: np.ndarray) -> np.ndarray:  # (L, P, ...) bool
+    """Find where values (L, P, ...) float32 of object pixels are in shadow."""
     strength = values.mean(axis=tuple(range(1, values.ndim)), keepdims=True, dtype=np.float64)  # of the light, about
     relative = values / np.maximum(strength.astype(np.float32), np.float32(1e-12))
-    return relative < share * np.percentile(relative, _BRIGHT, axis=0)
+    return relative < _SHADOW * np.percentile(relative, _BRIGHT, axis=0)
 
 
 def remove_stray_light(images: np.ndarray, level: np.ndarray) -> np.ndarray:

@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 import photo_folders as folders
 import pytest
+import torch
 from any_light_weights import write_weights
 
 import sdps
 from render.shared.errors import InputError
 from sdps.api import choose_method
+from sdps.core.metrics import angle_degrees
 from sdps.methods import pretrained
 from sdps.methods.flat_things import Flatness
 from sdps.methods.light_witness import ROOM, is_lit_by_lamps, measure_spread
@@ -82,8 +84,24 @@ def test_photographs_in_a_lit_room_are_not_taken_for_those_of_a_lamp(tmp_path: P
     assert any("many sides" in finding.text for finding in found.findings)
     assert sdps.plan(photos, models=out).method == found.method
     assert "anylight" not in sdps.plan(photos, models=out, lit_by="lamp").method
-    out = write_weights(tmp_path / "lamps")
-    assert "anylight" not in sdps.plan(photos, models=out).method
+    assert choose_method("auto", photos, photos.mask, "auto", False, write_weights(tmp_path / "lamps")) == ("auto", ())
+
+
+def test_normals_are_found_under_light_that_spreads_as_far_as_was_told(tmp_path: Path) -> None:
+    (images, mask), found = shade(RING, 0.5), []
+    for spread in (0.0, 0.6):
+        find = pretrained.finder(write_weights(tmp_path / str(spread), spread))
+        estimator = Runner(parse("anylight", find), find).estimator
+        assert estimator is not None and estimator.normals is not None
+        network = estimator.normals.network
+        torch.manual_seed(0)
+        for last in (network.offset, network.about):
+            torch.nn.init.normal_(last.weight, std=0.3)
+        found.append(estimator.estimate(images, mask))
+        covariance = found[-1].light_covariance
+        assert covariance is not None
+        np.testing.assert_allclose(covariance, np.broadcast_to(spread / 3.0 * np.eye(3), (8, 3, 3)), atol=2e-3)
+    assert angle_degrees(found[0].normals[mask], found[1].normals[mask]).mean() > 0.5
 
 
 def test_of_any_light_nothing_is_taken_off_the_images_and_no_lights_are_told(tmp_path: Path) -> None:
