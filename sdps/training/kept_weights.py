@@ -14,10 +14,11 @@ class KeptWeights:
         network: The network, with its initial weights.
         ema: Decay of the average over steps; 0 for no average.
         start_share: Share of the initial weights in the kept ones.
+        added: Names of weights that nothing was taken for: they are kept as trained.
     """
 
-    def __init__(self, network: nn.Module, ema: float, start_share: float) -> None:
-        self._trained, self._start_share = network, start_share
+    def __init__(self, network: nn.Module, ema: float, start_share: float, added: frozenset[str] = frozenset()) -> None:
+        self._trained, self._start_share, self._added = network, start_share, added
         self._average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(ema)) if ema else None
         self._start = copy.deepcopy(network) if start_share else None
 
@@ -34,8 +35,8 @@ class KeptWeights:
             return kept
         mixed, last = copy.deepcopy(self._start), kept.state_dict()
         for name, weight in mixed.state_dict().items():  # shares memory with the network
-            counts = not weight.is_floating_point()
-            weight.copy_(last[name] if counts else torch.lerp(last[name], weight, self._start_share))
+            alone = name in self._added or not weight.is_floating_point()
+            weight.copy_(last[name] if alone else torch.lerp(last[name], weight, self._start_share))
         return mixed
 
     def are_finite(self) -> bool:

@@ -32,14 +32,14 @@ def create_stage(name: str, model: str, config: TrainingConfig, trained: Mapping
     if "start" in trained:
         first = trained["start"]
         try:
-            _take_weights(stage.network, first.network)
+            stage.added = _take_weights(stage.network, first.network)
         except RuntimeError as error:
             raise InputError(_ANOTHER.format(name, first.name)) from error
     return stage
 
 
-def _take_weights(network: nn.Module, first: nn.Module) -> None:
-    """Copy the weights of a network into one of its kind.
+def _take_weights(network: nn.Module, first: nn.Module) -> frozenset[str]:
+    """Copy the weights of a network into one of its kind; return the names of those that it lacks.
 
     Raises:
         RuntimeError: sizes differ, or parts are missing.
@@ -48,6 +48,7 @@ def _take_weights(network: nn.Module, first: nn.Module) -> None:
     loaded = network.load_state_dict(first.state_dict(), strict=False)
     if loaded.unexpected_keys or any(key.partition(".")[0] not in added for key in loaded.missing_keys):
         raise RuntimeError(f"missing {loaded.missing_keys}, not known {loaded.unexpected_keys}")
+    return frozenset(loaded.missing_keys)
 
 
 def _stage(name: str, model: str, config: TrainingConfig, trained: Mapping[str, TrainedModel]) -> Stage:

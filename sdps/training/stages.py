@@ -34,6 +34,9 @@ class Stage(ABC):
         model: Name in the registry.
         config: The run's configuration.
         options: Options of the network.
+
+    Attributes:
+        added: Names of weights that the start it was given lacks.
     """
 
     goal = "direction_mae"
@@ -41,6 +44,7 @@ class Stage(ABC):
 
     def __init__(self, name: str, model: str, config: TrainingConfig, options: dict[str, Any]) -> None:
         self.name, self.model, self.config, self.options = name, model, config, options
+        self.added: frozenset[str] = frozenset()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(config.seed, "weights", model))
             self.network: nn.Module = registry.create(model, **options)

@@ -70,7 +70,7 @@ class TrainingRun:
             config.validation_scenes > 0 and here.leads and any(scene.split == "val" for scene in read_manifest(data))
         )
         self.optimiser = _optimiser(stage.network, config)
-        self.kept = KeptWeights(stage.network, config.ema, config.start_share)
+        self.kept = KeptWeights(stage.network, config.ema, config.start_share, stage.added)
         if config.compile:
             stage.network.compile()
         self._loss: nn.Module = _Loss(stage)

@@ -25,6 +25,7 @@ from sdps.models.checkpoint import TrainedModel, load_state, load_weights, save_
 from sdps.models.registry import MODELS, create
 from sdps.publishing.learning_curves import read_metrics, write_curves
 from sdps.training import recipes, training_run
+from sdps.training.kept_weights import KeptWeights
 from sdps.training.stage_factory import create_stage
 from sdps.training.stages import LightingStage, NormalStage
 from sdps.training.trainer import METRICS, TrainingResult, train
@@ -266,6 +267,21 @@ def test_weights_that_are_kept_may_hold_a_share_of_the_start(folder: Path, tmp_p
     train(NormalStage(config), folder, tmp_path / "parts", loggers=[StopAt(1)])
     train(NormalStage(config), folder, tmp_path / "parts")
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_weights_that_the_start_lacks_are_kept_as_they_are_trained() -> None:
+    small = {"width": 8, "blocks": 1}
+    start = TrainedModel("frames", create("frames", **small), small, {})
+    config = NormalTraining(start="before", start_share=0.25, options=small | {"covariance": True}, lights="true")
+    stage = create_stage("mine", "frames", config, {"start": start})
+    assert stage.added == {"about.weight"}
+    kept = KeptWeights(stage.network, 0.0, config.start_share, stage.added)
+    with torch.no_grad():
+        for weight in stage.network.parameters():
+            weight += 1.0
+    first, mixed = start.network.state_dict(), kept.network().state_dict()
+    assert (mixed.pop("about.weight") == 1.0).all()
+    assert all(torch.allclose(weight, first[name] + 0.75) for name, weight in mixed.items())
 
 
 def test_a_step_whose_gradient_is_not_finite_is_left_out_and_many_end_training(
