@@ -1,11 +1,11 @@
-"""How often `auto` sees that no lamp was alone: rendered scenes under lamps, lamps in a room, and surroundings.
+"""How often `auto` recognises light that is not a single lamp: rendered scenes under lamps, in rooms, in surroundings.
 
     python -m lab.studies.lamps_or_room DATA
     python -m lab.studies.lamps_or_room DATA --models OUT --scenes 20 --photographs DiLiGenT/pmsData
 
 The scenes are those of `lab.studies.any_light_study`, which no network has seen. Photographs of real objects under one
 lamp at a time are looked at as they are, and mixed (`lab.studies.mixed_photographs`). Flat discs under lamps
-(`lab.studies.flat_study`), which no network has seen, are what fools it.
+(`lab.studies.flat_study`), which no network was trained on, are often mistaken for light from many sides.
 """
 
 import argparse

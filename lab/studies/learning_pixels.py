@@ -11,49 +11,31 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
 import torch
 from torch import Tensor
 
-from pipelines.shared import presets
+from lab.studies.seen_and_unseen import build_stage
 from pipelines.shared.text_tables import render_text
-from render.shared.seeds import generator, spread_evenly
+from render.shared.seeds import spread_evenly
 from sdps.core.precision import arithmetic
-from sdps.data.dataset import Batch, make_sample
-from sdps.data.scene_store import SceneStore, list_finished
-from sdps.methods import pretrained
-from sdps.models.checkpoint import load_weights
-from sdps.training.stage_factory import create_stage
+from sdps.data.dataset import Batch, SampleKey, SceneDataset, collate
 from sdps.training.stages import Stage
-from sdps.training.training_config import NormalTraining
 
-_NAME = "frames-any"
 _EVERY = (1, 2, 3, 6)
 _ROUNDS = 3
 _AFTER = ("enter", "smaller", "quarter", "surroundings", "back", "leave")
 """Layers after the fusion."""
 
 
-def build_stage(every: int) -> Stage:
-    """Return the stage, its layers before the fusion learning from every so many diagonals."""
-    run = presets.load("anylight").run(_NAME)
-    config = cast(NormalTraining, run.config)
-    find = pretrained.finder(None)
-    trained = {use: load_weights(find(name)) for use, name in (("lighting", "lightset-any"), ("start", _NAME))}
-    stage = create_stage(_NAME, _NAME, replace(config, options=config.options | {"learn_every": every}), trained)
-    stage.to(torch.device("cpu"))
-    return stage
-
-
 def read_batches(data: Path, stage: Stage) -> list[Batch]:
     """Return two batches of training scenes, which share none."""
-    count, store, options = stage.config.batch_scenes, SceneStore(data, cache=False), stage.sample_options()
-    scenes = spread_evenly(list_finished(data, "train", skip_missing=True), 2 * count)
-    samples = [make_sample(scene, store.load(scene), options, generator(0, "learning", scene.id)) for scene in scenes]
-    return [Batch(*(torch.stack(part) for part in zip(*samples[start::2], strict=True))) for start in (0, 1)]
+    scenes = SceneDataset(data, "train", stage.sample_options(), cache=False, skip_missing=True)
+    chosen = spread_evenly(range(len(scenes)), 2 * stage.config.batch_scenes)
+    batches = [collate([scenes.sample(SampleKey(index, 0, index)) for index in chosen[start::2]]) for start in (0, 1)]
+    return [cast(Batch, batch) for batch in batches]  # `sample` raises
 
 
 def take_step(stage: Stage, batch: Batch) -> tuple[float, Tensor]:
@@ -80,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("data", type=Path)
     parser.add_argument("--rounds", type=int, default=_ROUNDS)
     args = parser.parse_args(arguments)
-    stages = {every: build_stage(every) for every in _EVERY}
+    stages = {every: build_stage("anylight", "frames-any", None, learn_every=every) for every in _EVERY}
     batch, other = read_batches(args.data, stages[1])
     whole = take_step(stages[1], batch)[1]
     least = dict.fromkeys(_EVERY, float("inf"))

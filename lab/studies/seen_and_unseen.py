@@ -12,17 +12,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 
 from pipelines.shared import presets
 from pipelines.shared.text_tables import render_text
-from render.shared.seeds import generator, spread_evenly
+from render.shared.seeds import spread_evenly
 from sdps.core.precision import arithmetic
-from sdps.data.dataset import Batch, SampleOptions, make_sample
-from sdps.data.scene_store import SceneStore, list_finished
+from sdps.data.dataset import Batch, SampleKey, SampleOptions, SceneDataset, collate
 from sdps.methods import pretrained
 from sdps.models.checkpoint import load_weights
 from sdps.training.stage_factory import create_stage
@@ -30,26 +29,26 @@ from sdps.training.stages import Stage
 from sdps.training.training_config import NormalTraining
 
 
-def build_stage(preset: str, run: str, models: Path | None) -> Stage:
-    """Return the stage of a run, with its trained weights."""
+def build_stage(preset: str, run: str, models: Path | None, **options: Any) -> Stage:
+    """Return the stage of a run of a normal network, with its trained weights; `options` change the network's."""
     found, find = presets.load(preset).run(run), pretrained.finder(models)
     weights = load_weights(find(run))
-    config = replace(cast(NormalTraining, found.config), start=run, options=weights.options)
+    config = replace(cast(NormalTraining, found.config), start=run, options=weights.options | options)
     trained = {use: load_weights(find(name)) for use, name in found.requires.items() if use != "start"}
     stage = create_stage(run, found.model, config, trained | {"start": weights})
     stage.to(torch.device("cpu"))
-    stage.network.eval()
     return stage
 
 
 def measure(stage: Stage, data: Path, split: str, count: int, options: SampleOptions) -> np.ndarray:
     """Return the errors of so many scenes (N,), in degrees."""
-    store, errors = SceneStore(data, cache=False), []
+    scenes, errors = SceneDataset(data, split, options, cache=False, skip_missing=True), []
     half = arithmetic(stage.config.precision, torch.device("cpu"))
-    for scene in spread_evenly(list_finished(data, split, skip_missing=True), count):
-        sample = make_sample(scene, store.load(scene), options, generator(0, "seen and unseen", scene.id))
+    for index in spread_evenly(range(len(scenes)), count):
+        batch = collate([scenes.sample(SampleKey(index, 0, index))])
+        assert isinstance(batch, Batch)  # `sample` raises
         with torch.no_grad(), half.autocast():
-            errors.append(stage.metrics(Batch(*(part[None] for part in sample)))[stage.goal])
+            errors.append(stage.metrics(batch)[stage.goal])
     return np.array(errors)
 
 
@@ -63,6 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scenes", type=int, default=40)
     args = parser.parse_args(arguments)
     stage, lines = build_stage(args.preset, args.run, args.models), []
+    stage.network.eval()
     for split, (suffix, options) in product(("train", "val"), stage.validations().items()):
         errors = measure(stage, args.data, split, args.scenes, options)
         unsure = errors.std() / len(errors) ** 0.5

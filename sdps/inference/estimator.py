@@ -226,10 +226,9 @@ class Estimator(InferenceConfig):
             intensities = _to_numpy(lights.intensities) if intensities is None else intensities
             confidence = None if lights.confidence is None else _to_numpy(lights.confidence)
             errors = None if lights.expected_error is None else _to_numpy(lights.expected_error)
-            if known.directions is None and lights.nearness is not None:
-                nearness = share_nearness(_to_numpy(lights.nearness))
-            if known.directions is None and lights.covariance is not None:
-                covariance = _to_numpy(lights.covariance)
+            if known.directions is None:
+                nearness = None if lights.nearness is None else share_nearness(_to_numpy(lights.nearness))
+                covariance = None if lights.covariance is None else _to_numpy(lights.covariance)
         elif intensities is None and self.needs_lights:
             intensities = np.full(len(scene), self._mean_intensity(), np.float32)
         return Estimate(

@@ -1,6 +1,5 @@
 """What networks see of the light: whether it is one lamp at a time, and whether lights that are given are right."""
 
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -36,10 +35,9 @@ ANY_LIGHT = "anylight"
 _LOOKED = 16
 """Images that are looked at, spread over all."""
 ROOM = 0.2
-"""Variance of the directions of a picture's light, over all three axes, from which on no lamp was alone: networks tell
-at most 0.16 of rendered lamps, at least 0.25 of surroundings, with 8 images (docs/studies/stray-light.md)."""
-
-_log = logging.getLogger(__name__)
+"""Variance of the directions of a picture's light, summed over the three axes, from which on it did not come from a
+single lamp. With 8 images a network estimates 0.16 or less for rendered lamps, 0.25 or more for surroundings
+(docs/studies/stray-light.md)."""
 
 
 def is_lit_by_lamps(
@@ -47,8 +45,8 @@ def is_lit_by_lamps(
 ) -> bool:
     """Return whether one lamp at a time lit the images, or nothing speaks against it.
 
-    The network that finds light of any kind says how far the directions of a picture's light spread; those of a lamp do
-    not. What covers the frame tells nothing: the network has not seen flat things.
+    A network estimates how far the directions of a picture's light spread; those of a lamp do not. It was never trained
+    on flat things, so an object that covers the frame counts as lit by lamps.
 
     Args:
         images, mask, find, config: As for `see_lights`.
@@ -62,8 +60,8 @@ def is_lit_by_lamps(
 def measure_spread(
     images: ImageSource, mask: np.ndarray, find: Callable[[str], Path], config: InferenceConfig | None = None
 ) -> float:
-    """Return how far the directions of a picture's light spread, as a network tells: the mean over pictures of their
-    variance over all three axes, 0 to 1, of a lamp 0; of weights that take all light for lamps, always 0.
+    """Return how far the directions of a picture's light spread, as a network estimates it: their variance, summed over
+    the three axes and averaged over the pictures, from about 0 (a lamp) to 1. Weights that know only lamps give 0.
 
     Args:
         images, mask, find, config: As for `see_lights`.

@@ -64,11 +64,11 @@ class Pixels(NamedTuple):
     values: Tensor  # (N, Q, 3) float32, exposed images over the light intensities
     directions: Tensor  # (N, Q, 3) float32, unit
     errors: Tensor  # (N, Q) float32, degrees to expect of the directions
-    covariances: Tensor  # (N, Q, 6) float32, of the directions light comes from (`sdps.models.covariance`)
+    covariances: Tensor | None = None  # (N, Q, 6) float32, of light's directions (`covariance`); None: not told
 
     def select(self, which: Tensor | slice) -> "Pixels":
         """Return some pixels, in float32."""
-        return Pixels(*(part[which].float() for part in self))
+        return Pixels(*(None if part is None else part[which].float() for part in self))  # type: ignore[arg-type]
 
 
 class FusedMap(NamedTuple):
@@ -177,16 +177,14 @@ class FrameNet(FusionNetwork):
 
     def encode(self, seen: Observations) -> FusedMap:
         """Return the fused map of all of a scene's images; what is not learned from, a few pixels at a time."""
-        inside, pixels = object_pixels(seen)
+        inside, pixels = object_pixels(self._heed(seen))
         if not torch.is_grad_enabled():
-            return self._to_map(self._look(pixels), inside, seen.placement)
-        learned = _diagonals(inside, self.learn_every)
-        some, others = learned.nonzero()[:, 0], (~learned).nonzero()[:, 0]
-        found = self._per_pixel(pixels.select(some))
-        with torch.no_grad():
-            looked = self._look(pixels.select(others))
-        whole = found.new_zeros(len(learned), found.shape[1])
-        return self._to_map(whole.index_copy(0, some, found).index_copy(0, others, looked), inside, seen.placement)
+            found = self._look(pixels)
+        elif self.learn_every == 1:
+            found = self._per_pixel(pixels.select(slice(None)))
+        else:
+            found = self._learn_from_some(pixels, _diagonals(inside, self.learn_every))
+        return self._to_map(found, inside, seen.placement)
 
     def regress(self, feature: FusedMap) -> Tensor:
         return self.correct(feature)[0]
@@ -216,7 +214,7 @@ class FrameNet(FusionNetwork):
 
     def accumulate(self, so_far: list[Observations] | None, seen: Observations) -> list[Observations]:
         """Keep the images of a scene, in 16 bits."""
-        return [*(so_far or []), seen._replace(images=seen.images.half())]
+        return [*(so_far or []), self._heed(seen)._replace(images=seen.images.half())]
 
     def aggregate(self, accumulated: list[Observations]) -> FusedMap:
         """Return the fused map of all of a scene's images, which are never copied as a whole."""
@@ -231,8 +229,9 @@ class FrameNet(FusionNetwork):
             # Autocast to bfloat16 refuses to join images of 16-bit floats.
             with torch.autocast(inside.device.type, enabled=False):
                 values = torch.cat([part.images[0].flatten(2)[..., some] for part in accumulated])  # (Q, 3, n)
-            lights = (each.expand(len(some), *each.shape[1:]) for each in (directions, errors, covariances))
-            pixels = Pixels(values.permute(2, 0, 1).float(), *lights)
+            lit_from, unsure = (each.expand(len(some), *each.shape[1:]) for each in (directions, errors))
+            told = None if covariances is None else covariances.expand(len(some), -1, -1)
+            pixels = Pixels(values.permute(2, 0, 1).float(), lit_from, unsure, told)
             if placement is not None:
                 own = Placement(*(each[0].flatten(1)[:, some].T for each in placement))
                 pixels = see_lamps(pixels, nearness.expand(len(some), -1), own)
@@ -241,6 +240,19 @@ class FrameNet(FusionNetwork):
         places_of_all = found.unflatten(0, inside.shape).permute(0, 3, 1, 2)
         sights = None if placement is None else placement.sights
         return FusedMap(places_of_all[:, :3], places_of_all[:, 3:], inside[:, None].float(), sights)
+
+    def _heed(self, seen: Observations) -> Observations:
+        """Return observations without covariances where the network is not told them: they would be turned in vain."""
+        return seen if self.about is not None else seen._replace(covariance=None)
+
+    def _learn_from_some(self, pixels: Pixels, learned: Tensor) -> Tensor:
+        """Return `_per_pixel`, with gradients of the pixels of `learned` (N,) bool alone."""
+        some, others = learned.nonzero()[:, 0], (~learned).nonzero()[:, 0]
+        found = self._per_pixel(pixels.select(some))
+        with torch.no_grad():
+            looked = self._look(pixels.select(others))
+        whole = found.new_zeros(len(learned), found.shape[1])
+        return whole.index_copy(0, some, found).index_copy(0, others, looked)
 
     def _look(self, pixels: Pixels) -> Tensor:
         """Return `_per_pixel`, a few pixels at a time."""
@@ -256,10 +268,10 @@ class FrameNet(FusionNetwork):
             axes = frames(first) if self.frame == "normal" else camera  # (N, 3, 3)
             start = (axes @ first[..., None])[..., 0]  # the first normal in the frame
             seen, known = pixel_inputs(pixels, axes, start, scale, residual)
-            spread = _COVARIANCE * turn(pixels.covariances, axes)
+            told = None if pixels.covariances is None else _COVARIANCE * turn(pixels.covariances, axes)
         tokens = self.seen(seen) + self.known(known)[:, None]  # (N, Q, C)
-        if self.about is not None:
-            tokens = tokens + self.about(spread)
+        if self.about is not None and told is not None:
+            tokens = tokens + self.about(told)
         alone = len(self.exchange) - len(self.attend)  # layers without attention
         for number, layer in enumerate(self.exchange):
             tokens = layer(tokens)
@@ -281,9 +293,9 @@ class FrameNet(FusionNetwork):
         return FusedMap(places[:, :3], places[:, 3:], inside[:, None].float(), sights)
 
 
-def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """Return directions (1, Q, 3), the errors to expect of them and nearness (1, Q), as exact as images are kept, and
-    covariances (1, Q, 6).
+    covariances (1, Q, 6) where these are told.
     """
     directions = torch.cat([part.directions for part in parts if part.directions is not None], dim=1)
     errors = [part.light_errors for part in parts if part.light_errors is not None]
@@ -291,9 +303,9 @@ def _all_lights(parts: list[Observations]) -> tuple[Tensor, Tensor, Tensor, Tens
     near = [part.nearness for part in parts if part.nearness is not None]
     nearness = torch.cat(near, dim=1) if near else torch.zeros_like(expected)
     about = [pack(part.covariance) for part in parts if part.covariance is not None]
-    covariances = torch.cat(about, dim=1) if about else directions.new_zeros(*expected.shape, 6)
+    covariances = torch.cat(about, dim=1).float() if about else None
     kept = parts[0].images.dtype
-    return directions.to(kept).float(), expected.to(kept).float(), nearness.float(), covariances.float()
+    return directions.to(kept).float(), expected.to(kept).float(), nearness.float(), covariances
 
 
 def _diagonals(inside: Tensor, every: int) -> Tensor:
@@ -309,9 +321,9 @@ def object_pixels(seen: Observations) -> tuple[Tensor, Pixels]:
     values = seen.images.permute(0, 3, 4, 1, 2)[inside]  # (N, Q, 3)
     which = torch.arange(len(inside), device=inside.device).repeat_interleave(inside.flatten(1).sum(1))
     errors = torch.zeros_like(seen.directions[..., 0]) if seen.light_errors is None else seen.light_errors
-    about = seen.directions.new_zeros(*errors.shape, 6) if seen.covariance is None else pack(seen.covariance)
-    lights = (each[which].to(values.dtype) for each in (seen.directions, errors, about))
-    pixels = Pixels(values, *lights)
+    directions, own_errors = (each[which].to(values.dtype) for each in (seen.directions, errors))
+    told = None if seen.covariance is None else pack(seen.covariance)[which].to(values.dtype)
+    pixels = Pixels(values, directions, own_errors, told)
     if seen.placement is None:
         return inside, pixels
     own = Placement(*(each.permute(0, 2, 3, 1)[inside] for each in seen.placement))
@@ -326,7 +338,7 @@ def see_lamps(pixels: Pixels, nearness: Tensor, own: Placement) -> Pixels:
         squared = off.square().sum(dim=-1).clamp(min=_NEAREST)
         turns = turn_to_sight(own.sights.float())
         towards = (off / squared.sqrt()[..., None]) @ turns.transpose(1, 2)
-        covariances = turn(pixels.covariances.float(), turns)
+        covariances = None if pixels.covariances is None else turn(pixels.covariances.float(), turns)
     return Pixels(pixels.values * squared[..., None], towards, pixels.errors, covariances)
 
 

@@ -14,7 +14,7 @@ class KeptWeights:
         network: The network, with its initial weights.
         ema: Decay of the average over steps; 0 for no average.
         start_share: Share of the initial weights in the kept ones.
-        added: Names of weights that nothing was taken for: they are kept as trained.
+        added: Names of weights that the start lacks: they are kept as trained.
     """
 
     def __init__(self, network: nn.Module, ema: float, start_share: float, added: frozenset[str] = frozenset()) -> None:

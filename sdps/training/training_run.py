@@ -184,7 +184,7 @@ class TrainingRun:
         return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
     def _divergence(self, what: str) -> InputError:
-        """Return the error for a run whose numbers are no longer finite; it says which checkpoint is left."""
+        """Return the error for a run whose loss or weights are NaN or infinite; it names the last good checkpoint."""
         path = self.folder / CHECKPOINT
         kept = "nothing was saved before"
         if self.saved is not None:

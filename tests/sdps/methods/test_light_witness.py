@@ -33,7 +33,7 @@ RING /= np.linalg.norm(RING, axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.1, 0.3, 0.9])
-def test_light_from_many_sides_is_no_lamp(tmp_path: Path, spread: float) -> None:
+def test_light_from_many_sides_is_not_a_lamp(tmp_path: Path, spread: float) -> None:
     images, mask = shade(RING, 1.0)
     find = pretrained.finder(write_weights(tmp_path, spread))
     assert measure_spread(images, mask, find) == pytest.approx(spread, abs=2e-3)
