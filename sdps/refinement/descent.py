@@ -14,7 +14,7 @@ from sdps.refinement.image_model import DATA_FLOOR, Model, State, build_model
 from sdps.refinement.modes import evaluate_modes, fit_modes
 from sdps.refinement.reflectance import evaluate_factor, measure_angles
 from sdps.refinement.shape.priors import Neighbours, find_neighbours, measure_curl, measure_drift, measure_roughness
-from sdps.refinement.sites import Sites
+from sdps.refinement.sites import Sites, keep_in_sight
 
 RATES = {
     "normals": 0.01,
@@ -140,7 +140,8 @@ def solve(
     state = State(**{name: part.clone().requires_grad_(name in moving) for name, part in state._asdict().items()})
     adam = torch.optim.Adam([{"params": [getattr(state, name)], "base": RATES[name]} for name in sorted(moving)])
     start = build_model(State(*(part.detach() for part in state)))
-    held = weights.dark * _measure_faintness(problem.images) + weights.rim * _find_rim(start.normals)  # (P,)
+    rim = _find_rim(start.see(problem.sites).normals)
+    held = weights.dark * _measure_faintness(problem.images) + weights.rim * rim  # (P,)
     for number in range(iterations):
         part = number / max(iterations - 1, 1)
         for group in adam.param_groups:
@@ -156,7 +157,7 @@ def solve(
         loss = loss + _hold_lamps(state, start.directions, free, weights, part)
         loss.backward()
         adam.step()
-        _project(state, free)
+        _project(state, free, problem.sites)
         if not math.isfinite(float(loss.detach())):
             raise InputError("refinement: the images contain NaN or infinity; leave those out")
         on_step()
@@ -206,7 +207,7 @@ def _measure_faintness(images: Tensor) -> Tensor:  # (P,)
 
 
 def _find_rim(normals: Tensor) -> Tensor:  # (P,)
-    """Return 1 where normals (P, 3) are square to the view, to 0 from 60 degrees off it inwards."""
+    """Return 1 where normals (P, 3), as pixels see them, are square to the view, to 0 from 60 degrees off it on."""
     return (1.0 - normals[:, 2] / _RIM).clamp_min(0.0)
 
 
@@ -239,12 +240,12 @@ def _interpolate(weight: tuple[float, float], part: float) -> float:
 
 
 @torch.no_grad()
-def _project(state: State, free: frozenset[str]) -> None:
+def _project(state: State, free: frozenset[str], sites: Sites | None) -> None:
     """Keep vectors at length 1, with normals and lights on the camera's side, and lamps out of the object."""
     if "log_nearness" in free:
         state.log_nearness.clamp_(*_NEARNESS)
-    for name in ("normals", "directions"):
+    for name, sights in (("normals", sites and sites.sights), ("directions", None)):
         if name in free:
             vectors = getattr(state, name)
-            vectors[:, 2].clamp_min_(1e-3)
+            keep_in_sight(vectors, sights)
             vectors /= vectors.norm(dim=1, keepdim=True)

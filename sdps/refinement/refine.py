@@ -24,7 +24,7 @@ from sdps.refinement.image_model import Model, Refined, State, build_model
 from sdps.refinement.problems import build_problem, check_start, estimate_log_albedo, gather_pixels
 from sdps.refinement.reflectance import LOBES, MODES, SHAPES
 from sdps.refinement.shape.transport import trace
-from sdps.refinement.sites import Grid, Sites
+from sdps.refinement.sites import Grid, Sites, keep_in_sight
 
 _OF_PIXELS = frozenset({"normals", "log_albedo", "log_strength"})
 _SHARPEST, _BROADEST = 300.0, 10.0
@@ -179,7 +179,7 @@ def build_start(
         log_nearness=torch.tensor(np.log(first) if nearness is None else 0.0, dtype=torch.float32),
         uneven=torch.from_numpy(rho.astype(np.float32)).log(),
     )
-    state.normals[:, 2].clamp_min_(1e-3)
+    keep_in_sight(state.normals, problem.sites and problem.sites.sights)
     return state._replace(log_albedo=estimate_log_albedo(problem, state))
 
 

@@ -10,10 +10,14 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from sdps.core.first_normals import turn_to_sight
 from sdps.core.geometry import Camera, Capture, reach
 from sdps.core.integration import integrate
+
+_LEAST = 1e-3
+"""Cosine to the line of sight that normals keep, at least."""
 
 
 class Sites(NamedTuple):
@@ -110,6 +114,18 @@ def select_grid(mask: np.ndarray, stride: int) -> np.ndarray:
     grid = np.zeros_like(mask)
     grid[::stride, ::stride] = mask[::stride, ::stride]
     return grid
+
+
+def keep_in_sight(vectors: Tensor, sights: Tensor | None) -> None:
+    """Move vectors (P, 3), about unit, that look away from the camera along their lines of sight (P, 3) until they are
+    seen edge-on; `sights` None: these are z.
+    """
+    if sights is None:
+        vectors[:, 2].clamp_min_(_LEAST)
+        return
+    towards = functional.normalize(sights, dim=1)
+    cosines = (vectors * towards).sum(dim=1, keepdim=True)
+    vectors += (_LEAST - cosines).clamp_min_(0.0) * towards
 
 
 def see(normals: Tensor, directions: Tensor, nearness: Tensor, sites: Sites | None) -> Seen:

@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 import torch
 
+from render.shared.imaging.vectors import unit
+from sdps.core.first_normals import turn_to_sight
 from sdps.core.geometry import ORTHOGRAPHIC, Camera, Capture, Rig, reach
 from sdps.core.metrics import angle_degrees
+from sdps.refinement.descent import Problem, Weights, solve
 from sdps.refinement.image_model import Refined
-from sdps.refinement.refine import RefineConfig, refine
+from sdps.refinement.refine import RefineConfig, build_start, refine
 from sdps.refinement.shape.priors import find_neighbours, measure_curl
-from sdps.refinement.sites import Grid
+from sdps.refinement.sites import Grid, Sites
 
 QUICK = RefineConfig(coarse_pixels=700, iterations=500, iterations_before=250, fine_iterations=0)
 
@@ -34,15 +37,11 @@ def photograph(
     normals: np.ndarray, mask: np.ndarray, heights: np.ndarray, nearness: np.ndarray, camera: Camera = ORTHOGRAPHIC
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return images (L, H, W, 3) of a matte object under lamps seen from its middle, and their directions."""
-    rng = np.random.default_rng(3)
-    count = len(nearness)
-    around, up = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.5, 1.0, count)
-    out = np.sqrt(1 - up**2)
-    lights = np.stack([out * np.cos(around), out * np.sin(around), up], axis=-1)
+    lights = hemisphere(len(nearness), 0.5, np.random.default_rng(3))
     places = Capture.of(mask, camera).places(heights)[mask]
     ways, falloff = reach(places, lights, nearness)
     shade = np.maximum((ways * normals[mask][:, None]).sum(-1), 0.0) * falloff
-    images = np.zeros((count, *mask.shape, 3), np.float32)
+    images = np.zeros((len(nearness), *mask.shape, 3), np.float32)
     images[:, mask] = shade.T[..., None] * [0.7, 0.5, 0.3]
     return images, lights
 
@@ -128,6 +127,32 @@ def test_what_a_pinhole_sees_of_a_surface_has_no_curl() -> None:
     sights = torch.from_numpy(camera.sights(mask.shape)[mask].astype(np.float32))
     # The measure is a thousandth where there is none.
     assert float(measure_curl(inside, near, sights)) < 0.0011 and float(measure_curl(inside, near)) > 0.002
+
+
+def test_what_is_turned_as_a_whole_is_refined_alike() -> None:
+    """Also near the rim, where normals that the camera sees may point away from its axis."""
+    rng, mask = np.random.default_rng(2), np.ones((6, 6), bool)
+    normals, lights = hemisphere(36, 0.15, rng), hemisphere(12, 0.5, rng)
+    shade = np.maximum(unit(normals + rng.normal(0.0, 0.1, normals.shape)) @ lights.T, 0.02)  # not of the start
+    images = torch.from_numpy(shade[:, None] * np.ones((1, 3, 1))).float()
+    weights, found = Weights(curl=(1e-9, 1e-9)), []
+    sights = torch.tensor([[1.2, 0.3, 1.0]]).expand(36, 3)
+    sites = Sites(torch.zeros(36, 3), sights, turn_to_sight(sights))
+    for place, turn in ((None, np.eye(3)), (sites, sites.turns[0].numpy().astype(float))):
+        problem = Problem(mask, images, torch.ones(36, 12), sites=place)
+        state = build_start(problem, normals @ turn, lights @ turn, np.ones((12, 3)), first=0.0)
+        moved = solve(problem, state, free=frozenset({"normals"}), iterations=800, boost=1.0, weights=weights)
+        found.append((moved.normals.numpy() @ turn.T, (normals @ turn)[:, 2]))
+    assert found[1][1].min() < -0.3
+    assert angle_degrees(found[0][0], normals).max() > 5.0
+    assert angle_degrees(found[1][0], found[0][0]).max() < 3.0  # 1.1; 29 where z is taken for the line of sight
+
+
+def hemisphere(count: int, lowest: float, rng: np.random.Generator) -> np.ndarray:
+    """Return unit vectors (N, 3) at least so far up."""
+    around, up = rng.uniform(0, 2 * np.pi, count), rng.uniform(lowest, 1.0, count)
+    out = np.sqrt(1 - up**2)
+    return np.stack([out * np.cos(around), out * np.sin(around), up], axis=-1)
 
 
 def test_the_grid_lies_where_the_whole_picture_does() -> None:
