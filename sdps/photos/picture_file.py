@@ -12,6 +12,7 @@ import numpy as np
 from render.shared.decoding import decoding
 from render.shared.errors import InputError
 from render.shared.files import read_bytes
+from render.shared.imaging.reducing import smaller_shape
 from sdps.photos.pictures.decoding.decoders import DECODERS
 from sdps.photos.pictures.lens import NO_LENS, Lens
 from sdps.photos.pictures.picture_kinds import NAMED, SUFFIXES, Coding, foreign_kind, name_kind, picture_kind
@@ -86,13 +87,14 @@ def orient_pixels(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return np.flip(pixels, flips) if flips else pixels
 
 
-def turn_pixels(picture: Picture, orientation: int, full: tuple[int, int]) -> np.ndarray:
-    """Return a picture's pixels with sides `full` (H, W), turned as the orientation tag of all asks.
+def turn_pixels(picture: Picture, orientation: int, shape: tuple[int, int], scale: float = 1.0) -> np.ndarray:
+    """Return a picture's pixels, whose sides times `scale` are to be `shape` (H, W), turned as the tag of all asks.
 
     One that has other sides then, as if it had been turned before it was saved, is turned by its own tag.
     """
     pixels = orient_pixels(picture.pixels, orientation)
-    return pixels if pixels.shape[:2] == full else orient_pixels(picture.pixels, picture.orientation)
+    fits = smaller_shape(pixels.shape[:2], scale) == shape
+    return pixels if fits else orient_pixels(picture.pixels, picture.orientation)
 
 
 @contextmanager

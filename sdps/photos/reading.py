@@ -20,7 +20,7 @@ from sdps.photos.analysis.balls.ball_scene import FoundBall, Scene, cover_balls,
 from sdps.photos.faults import Faults
 from sdps.photos.light_files.light_choice import KnownLights, known_lights
 from sdps.photos.light_files.light_distance import LightDistance, Yardstick, find_nearness, read_distance
-from sdps.photos.picture_file import decode, orient_pixels
+from sdps.photos.picture_file import decode, turn_pixels
 from sdps.photos.pictures.ambient import Background
 from sdps.photos.pictures.lens import NOT_KNOWN, Wanted, read_wanted
 from sdps.photos.pictures.listing import Listing, list_pictures
@@ -114,9 +114,7 @@ class Photographs:
         saturation = self.saturation
         for image, number in zip(images, numbers, strict=True):
             picture = decode(self.folder / self.files[number])
-            pixels = orient_pixels(picture.pixels, self.orientation)
-            if smaller_shape(pixels.shape[:2], self.scale) != self.shape:  # see turn_pixels
-                pixels = orient_pixels(picture.pixels, picture.orientation)
+            pixels = turn_pixels(picture, self.orientation, self.shape, self.scale)
             if smaller_shape(pixels.shape[:2], self.scale) != self.shape or picture.coding != self.coding:
                 raise InputError(f"{self.folder / self.files[number]}: changed while it was in use; start again")
             if self.scale == 1.0:
