@@ -1,0 +1,80 @@
+"""What wrong lights cost a normal network: it is told the found ones, and truer and truer ones.
+
+    python -m lab.studies.told_lights DATA --preset anylight --run frames-any
+    python -m lab.studies.told_lights DATA --preset anylight --run frames-any --models OUT
+
+Scenes of the split `val`, with the lights, the draws and the images that the run is validated on.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from lab.studies.seen_and_unseen import build_stage
+from pipelines.shared.text_tables import render_text
+from render.shared.seeds import spread_evenly
+from sdps.core.precision import arithmetic
+from sdps.data.dataset import Batch, SampleKey, SampleOptions, SceneDataset, collate
+from sdps.models.base import Lights
+from sdps.training.stages import NormalStage, normal_error, placed, true_lights
+
+
+def tell(found: Lights, batch: Batch) -> dict[str, Lights]:
+    """Return what the network is told of the lights, from those found to the true ones."""
+    true = true_lights(batch)
+    bend = torch.linalg.lstsq(found.directions.float(), true.directions).solution  # (B, 3, 3)
+    bent = functional.normalize(found.directions.float() @ bend, dim=-1)
+    return {
+        "found": found,
+        "found, moved by the best linear map": found._replace(directions=bent),
+        "true directions": found._replace(directions=true.directions),
+        "and intensities": found._replace(directions=true.directions, intensities=true.intensities),
+        "and nearness and covariance": true._replace(expected_error=found.expected_error),
+        "and that they are exact": true,
+    }
+
+
+def measure(stage: NormalStage, data: Path, count: int, options: SampleOptions) -> dict[str, float]:
+    """Return the mean errors of so many scenes, in degrees, by what is told of the lights."""
+    scenes, errors = SceneDataset(data, "val", options, cache=False, skip_missing=True), []
+    half = arithmetic(stage.config.precision, torch.device("cpu"))
+    for index in spread_evenly(range(len(scenes)), count):
+        batch = collate([scenes.sample(SampleKey(index, 0, index))])
+        assert isinstance(batch, Batch)  # `sample` raises
+        with torch.no_grad(), half.autocast():
+            found, row = stage.lights(batch), {}
+            assert found is not None  # the network is given lights
+            for name, lights in tell(found, batch).items():
+                seen = stage.network.observe(batch.images, batch.mask, lights, placement=placed(batch))
+                row[name] = normal_error(stage.network(seen), batch)
+        errors.append(row)
+    return {name: float(np.mean([row[name] for row in errors])) for name in errors[0]}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--preset", default="anylight")
+    parser.add_argument("--run", default="frames-any")
+    parser.add_argument("--models", type=Path, default=None, help="folder of trained runs (default: shipped weights)")
+    parser.add_argument("--scenes", type=int, default=48)
+    args = parser.parse_args(arguments)
+    stage = build_stage(args.preset, args.run, args.models)
+    assert isinstance(stage, NormalStage)
+    stage.network.eval()
+    columns = {suffix.strip("_") or "all": measure(stage, args.data, args.scenes, options)
+               for suffix, options in stage.validations().items()}  # fmt: skip
+    told = next(iter(columns.values()))
+    lines = [[name, *(f"{column[name]:.2f}" for column in columns.values())] for name in told]
+    sys.stdout.write(render_text("Mean error, degrees", ["told", *columns], lines))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
