@@ -52,15 +52,20 @@ def measure(stage: Stage, data: Path, split: str, count: int, options: SampleOpt
     return np.array(errors)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+def read_arguments(arguments: Sequence[str] | None, about: str | None, scenes: int) -> argparse.Namespace:
+    """Return the arguments of a study of a run that is about this (its docstring) and takes so many scenes."""
+    parser = argparse.ArgumentParser(description=about.splitlines()[0] if about else None)
     parser.add_argument("data", type=Path)
     parser.add_argument("--preset", default="anylight")
     parser.add_argument("--run", default="frames-any")
     parser.add_argument("--models", type=Path, default=None, help="folder of trained runs (default: shipped weights)")
-    parser.add_argument("--scenes", type=int, default=40)
-    args = parser.parse_args(arguments)
+    parser.add_argument("--scenes", type=int, default=scenes)
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, and print the table."""
+    args = read_arguments(arguments, __doc__, 40)
     stage, lines = build_stage(args.preset, args.run, args.models), []
     stage.network.eval()
     for split, (suffix, options) in product(("train", "val"), stage.validations().items()):

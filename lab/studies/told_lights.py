@@ -6,7 +6,6 @@
 Scenes of the split `val`, with the lights, the draws and the images that the run is validated on.
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from lab.studies.seen_and_unseen import build_stage
+from lab.studies.seen_and_unseen import build_stage, read_arguments
 from pipelines.shared.text_tables import render_text
 from render.shared.seeds import spread_evenly
 from sdps.core.precision import arithmetic
@@ -58,13 +57,7 @@ def measure(stage: NormalStage, data: Path, count: int, options: SampleOptions) 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--preset", default="anylight")
-    parser.add_argument("--run", default="frames-any")
-    parser.add_argument("--models", type=Path, default=None, help="folder of trained runs (default: shipped weights)")
-    parser.add_argument("--scenes", type=int, default=48)
-    args = parser.parse_args(arguments)
+    args = read_arguments(arguments, __doc__, 48)
     stage = build_stage(args.preset, args.run, args.models)
     assert isinstance(stage, NormalStage)
     stage.network.eval()
