@@ -8,7 +8,7 @@ Scenes of splits `train` and `val` of the data folder that the run learned from,
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -40,16 +40,17 @@ def build_stage(preset: str, run: str, models: Path | None, **options: Any) -> S
     return stage
 
 
+def read_scenes(data: Path, split: str, count: int, options: SampleOptions) -> Iterator[Batch]:
+    """Yield a batch of each of so many scenes of a split, evenly spread."""
+    scenes = SceneDataset(data, split, options, cache=False, skip_missing=True)
+    for index in spread_evenly(range(len(scenes)), count):
+        yield cast(Batch, collate([scenes.sample(SampleKey(index, 0, index))]))  # `sample` raises
+
+
 def measure(stage: Stage, data: Path, split: str, count: int, options: SampleOptions) -> np.ndarray:
     """Return the errors of so many scenes (N,), in degrees."""
-    scenes, errors = SceneDataset(data, split, options, cache=False, skip_missing=True), []
-    half = arithmetic(stage.config.precision, torch.device("cpu"))
-    for index in spread_evenly(range(len(scenes)), count):
-        batch = collate([scenes.sample(SampleKey(index, 0, index))])
-        assert isinstance(batch, Batch)  # `sample` raises
-        with torch.no_grad(), half.autocast():
-            errors.append(stage.metrics(batch)[stage.goal])
-    return np.array(errors)
+    with torch.no_grad(), arithmetic(stage.config.precision, torch.device("cpu")).autocast():
+        return np.array([stage.metrics(batch)[stage.goal] for batch in read_scenes(data, split, count, options)])
 
 
 def read_arguments(arguments: Sequence[str] | None, about: str | None, scenes: int) -> argparse.Namespace:

@@ -14,11 +14,10 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from lab.studies.seen_and_unseen import build_stage, read_arguments
+from lab.studies.seen_and_unseen import build_stage, read_arguments, read_scenes
 from pipelines.shared.text_tables import render_text
-from render.shared.seeds import spread_evenly
 from sdps.core.precision import arithmetic
-from sdps.data.dataset import Batch, SampleKey, SampleOptions, SceneDataset, collate
+from sdps.data.dataset import Batch, SampleOptions
 from sdps.models.base import Lights
 from sdps.training.stages import NormalStage, normal_error, placed, true_lights
 
@@ -40,19 +39,15 @@ def tell(found: Lights, batch: Batch) -> dict[str, Lights]:
 
 def measure(stage: NormalStage, data: Path, count: int, options: SampleOptions) -> dict[str, float]:
     """Return the mean errors of so many scenes, in degrees, by what is told of the lights."""
-    scenes, errors = SceneDataset(data, "val", options, cache=False, skip_missing=True), []
-    half = arithmetic(stage.config.precision, torch.device("cpu"))
-    for index in spread_evenly(range(len(scenes)), count):
-        batch = collate([scenes.sample(SampleKey(index, 0, index))])
-        assert isinstance(batch, Batch)  # `sample` raises
-        with torch.no_grad(), half.autocast():
-            found, row = stage.lights(batch), {}
+    errors: dict[str, list[float]] = {}
+    with torch.no_grad(), arithmetic(stage.config.precision, torch.device("cpu")).autocast():
+        for batch in read_scenes(data, "val", count, options):
+            found = stage.lights(batch)
             assert found is not None  # the network is given lights
             for name, lights in tell(found, batch).items():
                 seen = stage.network.observe(batch.images, batch.mask, lights, placement=placed(batch))
-                row[name] = normal_error(stage.network(seen), batch)
-        errors.append(row)
-    return {name: float(np.mean([row[name] for row in errors])) for name in errors[0]}
+                errors.setdefault(name, []).append(normal_error(stage.network(seen), batch))
+    return {name: float(np.mean(values)) for name, values in errors.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -244,8 +244,8 @@ def _project(state: State, free: frozenset[str], sites: Sites | None) -> None:
     """Keep vectors at length 1, with normals and lights on the camera's side, and lamps out of the object."""
     if "log_nearness" in free:
         state.log_nearness.clamp_(*_NEARNESS)
-    for name, sights in (("normals", sites and sites.sights), ("directions", None)):
+    for name, own in (("normals", sites), ("directions", None)):
         if name in free:
             vectors = getattr(state, name)
-            keep_in_sight(vectors, sights)
+            keep_in_sight(vectors, own)
             vectors /= vectors.norm(dim=1, keepdim=True)

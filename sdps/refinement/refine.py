@@ -179,7 +179,7 @@ def build_start(
         log_nearness=torch.tensor(np.log(first) if nearness is None else 0.0, dtype=torch.float32),
         uneven=torch.from_numpy(rho.astype(np.float32)).log(),
     )
-    keep_in_sight(state.normals, problem.sites and problem.sites.sights)
+    keep_in_sight(state.normals, problem.sites)
     return state._replace(log_albedo=estimate_log_albedo(problem, state))
 
 

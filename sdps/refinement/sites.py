@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from sdps.core.first_normals import turn_to_sight
 from sdps.core.geometry import Camera, Capture, reach
@@ -116,14 +115,14 @@ def select_grid(mask: np.ndarray, stride: int) -> np.ndarray:
     return grid
 
 
-def keep_in_sight(vectors: Tensor, sights: Tensor | None) -> None:
-    """Move vectors (P, 3), about unit, that look away from the camera along their lines of sight (P, 3) until they are
-    seen edge-on; `sights` None: these are z.
+def keep_in_sight(vectors: Tensor, sites: Sites | None) -> None:
+    """Move vectors (P, 3), about unit, that look away from the camera along their lines of sight until they are seen
+    edge-on.
     """
-    if sights is None:
+    if sites is None:
         vectors[:, 2].clamp_min_(_LEAST)
         return
-    towards = functional.normalize(sights, dim=1)
+    towards = sites.turns[:, 2]  # what is turned to z: the unit line of sight
     cosines = (vectors * towards).sum(dim=1, keepdim=True)
     vectors += (_LEAST - cosines).clamp_min_(0.0) * towards
 

@@ -140,7 +140,7 @@ def test_what_is_turned_as_a_whole_is_refined_alike() -> None:
     sites = Sites(torch.zeros(36, 3), sights, turn_to_sight(sights))
     for place, turn in ((None, np.eye(3)), (sites, sites.turns[0].numpy().astype(float))):
         problem = Problem(mask, images, torch.ones(36, 12), sites=place)
-        state = build_start(problem, normals @ turn, lights @ turn, np.ones((12, 3)), first=0.0)
+        state = build_start(problem, normals @ turn, lights @ turn, np.ones((12, 3)), np.zeros(12))
         moved = solve(problem, state, free=frozenset({"normals"}), iterations=800, boost=1.0, weights=weights)
         found.append((moved.normals.numpy() @ turn.T, (normals @ turn)[:, 2]))
     assert found[1][1].min() < -0.3
