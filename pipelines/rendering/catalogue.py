@@ -71,33 +71,44 @@ def presets_main(_: argparse.Namespace) -> int:
 
 def models_main(args: argparse.Namespace) -> int:
     """List the learned models, with parameter counts, roles and what they are trained on."""
+    from sdps.methods.pretrained import count_shipped
     from sdps.models.registry import COMBINATIONS, MODELS
 
     models = {name: item for name, item in MODELS.items() if args.role in (None, item.role)}
     if args.json:
         listed = [
-            {"name": name, "role": item.role, "parameters": item.parameters, "paper": item.paper,
-             "lights": item.lights, "summary": item.summary, "reconstruction": item.reconstruction,
-             "recipe": dict(item.recipe)}
+            {"name": name, "role": item.role, "parameters": item.parameters, "shipped_parameters": count_shipped(name),
+             "paper": item.paper, "lights": item.lights, "summary": item.summary,
+             "reconstruction": item.reconstruction, "recipe": dict(item.recipe)}
             for name, item in models.items()
         ]  # fmt: skip
         sys.stdout.write(json.dumps(listed, indent=2) + "\n")
         return 0
     rows = [
-        [name, f"{item.parameters:,}", item.role, item.paper or "-", item.lights or "-", item.summary]
+        [name, f"{item.parameters:,}", _count_shipped(name), item.role, item.paper or "-", item.lights or "-",
+         item.summary]
         for name, item in models.items()
-    ]
-    header = ["model", "parameters", "role", "paper", "trained on lights of", "what it is"]
-    sys.stdout.write(render_text("Models", header, rows, left={0, 2, 3, 4, 5}))
+    ]  # fmt: skip
+    header = ["model", "parameters", "as shipped", "role", "paper", "trained on lights of", "what it is"]
+    sys.stdout.write(render_text("Models", header, rows, left={0, 3, 4, 5, 6}))
     if args.role is None:
         rows = [
-            [name, f"{pair.parameters():,}", " + ".join(pair.members()), pair.paper or "-", pair.summary]
+            [name, f"{pair.parameters():,}", _count_shipped(*pair.members()), " + ".join(pair.members()),
+             pair.paper or "-", pair.summary]
             for name, pair in COMBINATIONS.items()
-        ]
-        header = ["combination", "parameters", "models", "paper", "what it is"]
-        sys.stdout.write("\n" + render_text("Combinations", header, rows, left={0, 2, 3, 4}))
+        ]  # fmt: skip
+        header = ["combination", "parameters", "as shipped", "models", "paper", "what it is"]
+        sys.stdout.write("\n" + render_text("Combinations", header, rows, left={0, 3, 4, 5}))
         sys.stdout.write("\nAny lighting model works with any normal model: --lighting NAME --normals NAME.\n")
     return 0
+
+
+def _count_shipped(*names: str) -> str:
+    """Return how many parameters the shipped weights of models have together, or a dash."""
+    from sdps.methods.pretrained import count_shipped
+
+    counts = [count_shipped(name) for name in names]
+    return "-" if None in counts else f"{sum(filter(None, counts)):,}"
 
 
 def materials_main(args: argparse.Namespace) -> int:

@@ -1,10 +1,13 @@
 """Where trained weights lie: in the folder of the runs that made them, or shipped with the package."""
 
+import math
 from collections.abc import Iterable
 from functools import partial
 from glob import escape
 from importlib import resources
 from pathlib import Path
+
+from safetensors import safe_open
 
 from render.shared.errors import InputError, unknown
 from sdps.classical.registry import METHODS
@@ -29,6 +32,17 @@ def shipped_folder() -> Path:
 def list_shipped() -> list[str]:
     """Return the names of the shipped weights."""
     return sorted(path.stem for path in shipped_folder().glob(f"[!.]*{_SUFFIX}"))  # no file being written
+
+
+def count_shipped(name: str) -> int | None:
+    """Return how many numbers the shipped weights of a model have; None where there are none.
+
+    Options may make a network larger than the model's own defaults (`ModelEntry.parameters`).
+    """
+    if name not in list_shipped():
+        return None
+    with safe_open(locate(name), "numpy") as weights:
+        return sum(math.prod(weights.get_slice(key).get_shape()) for key in weights.keys())  # noqa: SIM118
 
 
 def terms(files: Iterable[Path]) -> str:

@@ -1,4 +1,6 @@
-"""What the list of materials says of files, and the file names made of material names."""
+"""What the lists of models and materials say, and the file names made of material names."""
+
+import json
 
 import numpy as np
 import pytest
@@ -8,6 +10,9 @@ from pipelines.cli import main
 from pipelines.shared.scenes import slug
 from render.materials import merl
 from render.materials.textures.textured import KINDS
+from sdps.methods import pretrained
+from sdps.models.blocks import parameter_count
+from sdps.models.checkpoint import load_weights
 
 
 @pytest.fixture
@@ -34,6 +39,19 @@ def test_the_list_has_one_procedural_material_of_each_kind(capsys, tmp_path):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split(str(tmp_path))[1].split() == ["texture-maps", "maps"]
     assert lines[1].split("nylon")[1].split() == ["procedural-wood", "2", "materials"]
+
+
+def test_the_list_of_models_counts_shipped_weights_which_may_be_larger(capsys):
+    """`sdps-frames` was listed as 5.4 M parameters, those of the models' defaults, and answers with 9.2 M."""
+    assert main(["list", "models", "--json"]) == 0
+    counts = {item["name"]: item["shipped_parameters"] for item in json.loads(capsys.readouterr().out)}
+    for name in ("lcnet", "frames"):
+        assert counts[name] == parameter_count(load_weights(pretrained.locate(name)).network)
+    assert counts["nenet-reg"] is None
+    assert main(["list", "models"]) == 0
+    rows = {line.split()[0]: line.split()[1:3] for line in capsys.readouterr().out.splitlines() if line}
+    assert rows["sdps-frames"] == ["5,392,616", f"{counts['lightset'] + counts['frames']:,}"]
+    assert rows["sdps-reg"][1] == "-"
 
 
 @pytest.mark.parametrize(
