@@ -56,6 +56,8 @@ _MAP = 32
 """Channels of the fused map, without the normals."""
 _STRIP = 2**13
 """Pixels times lights that are worked on at once in inference."""
+_ROUND = 256
+"""Pixels are learned from in multiples of so many: on CPUs torch prepares its kernels anew for every size."""
 
 
 class Pixels(NamedTuple):
@@ -69,6 +71,13 @@ class Pixels(NamedTuple):
     def select(self, which: Tensor | slice) -> "Pixels":
         """Return some pixels, in float32."""
         return Pixels(*(None if part is None else part[which].float() for part in self))  # type: ignore[arg-type]
+
+    def round_up(self, multiple: int) -> "Pixels":
+        """Return the pixels and, up to a multiple of a number, copies of the first."""
+        lacking = -len(self.values) % multiple
+        filled = (part if part is None else torch.cat([part, part[:1].expand(lacking, *part.shape[1:])])
+                  for part in self)  # fmt: skip
+        return Pixels(*filled) if lacking else self  # type: ignore[arg-type]
 
 
 class FusedMap(NamedTuple):
@@ -181,7 +190,7 @@ class FrameNet(FusionNetwork):
         if not torch.is_grad_enabled():
             found = self._look(pixels)
         elif self.learn_every == 1:
-            found = self._per_pixel(pixels.select(slice(None)))
+            found = self._answer(pixels.select(slice(None)), _ROUND)
         else:
             found = self._learn_from_some(pixels, _diagonals(inside, self.learn_every))
         return self._to_map(found, inside, seen.placement)
@@ -248,7 +257,7 @@ class FrameNet(FusionNetwork):
     def _learn_from_some(self, pixels: Pixels, learned: Tensor) -> Tensor:
         """Return `_per_pixel`, with gradients of the pixels of `learned` (N,) bool alone."""
         some, others = learned.nonzero()[:, 0], (~learned).nonzero()[:, 0]
-        found = self._per_pixel(pixels.select(some))
+        found = self._answer(pixels.select(some), _ROUND)
         with torch.no_grad():
             looked = self._look(pixels.select(others))
         whole = found.new_zeros(len(learned), found.shape[1])
@@ -257,8 +266,14 @@ class FrameNet(FusionNetwork):
     def _look(self, pixels: Pixels) -> Tensor:
         """Return `_per_pixel`, a few pixels at a time."""
         count = max(1, _STRIP // pixels.values.shape[1])
+        multiple = min(count, _ROUND)
+        count -= count % multiple
         parts = range(0, max(1, len(pixels.values)), count)
-        return torch.cat([self._per_pixel(pixels.select(slice(start, start + count))) for start in parts])
+        return torch.cat([self._answer(pixels.select(slice(start, start + count)), multiple) for start in parts])
+
+    def _answer(self, pixels: Pixels, multiple: int) -> Tensor:
+        """Return `_per_pixel`, worked out of a number of pixels that is a multiple."""
+        return self._per_pixel(pixels.round_up(multiple))[: len(pixels.values)]
 
     def _per_pixel(self, pixels: Pixels) -> Tensor:
         """Return normals and features of pixels, (N, 3 + 32)."""

@@ -191,6 +191,26 @@ def test_layers_before_the_fusion_learn_from_every_third_diagonal_and_see_all(tr
         FrameNet(learn_every=0)
 
 
+def test_sizes_that_pixels_are_worked_on_in_recur(trained, monkeypatch):
+    """On CPUs torch prepares its kernels anew for every size, which took half of a step of single scenes."""
+    sizes, alone = [], FrameNet._per_pixel
+
+    def count(self: FrameNet, pixels: Pixels) -> torch.Tensor:
+        sizes.append(len(pixels.values))
+        return alone(self, pixels)
+
+    monkeypatch.setattr(FrameNet, "_per_pixel", count)
+    seen, some = observations(9), FrameNet(width=16, blocks=2, learn_every=3).eval()
+    trained.encode(seen)
+    some.encode(seen)
+    assert sizes == [256, 256, 256]  # of some 50 pixels; some are learned from, the others seen
+    monkeypatch.setattr("sdps.models.frames._STRIP", 64)
+    sizes.clear()
+    with torch.no_grad():
+        trained.encode(seen)
+    assert set(sizes) == {7} and len(sizes) > 1
+
+
 def test_neither_order_nor_chunks_of_images_matter(trained, monkeypatch):
     monkeypatch.setattr("sdps.models.frames._STRIP", 64)
     seen, order = observations(9), torch.randperm(9)
