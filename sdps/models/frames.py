@@ -57,7 +57,7 @@ _MAP = 32
 _STRIP = 2**13
 """Pixels times lights that are worked on at once in inference."""
 _ROUND = 256
-"""Pixels are learned from in multiples of so many: on CPUs torch prepares its kernels anew for every size."""
+"""In training, pixels are padded to a multiple of this: on CPUs torch compiles new kernels for every new size."""
 
 
 class Pixels(NamedTuple):
@@ -73,11 +73,13 @@ class Pixels(NamedTuple):
         return Pixels(*(None if part is None else part[which].float() for part in self))  # type: ignore[arg-type]
 
     def round_up(self, multiple: int) -> "Pixels":
-        """Return the pixels and, up to a multiple of a number, copies of the first."""
+        """Return the pixels, padded with copies of the first to a multiple of a number."""
         lacking = -len(self.values) % multiple
-        filled = (part if part is None else torch.cat([part, part[:1].expand(lacking, *part.shape[1:])])
+        if not lacking:
+            return self
+        padded = (part if part is None else torch.cat([part, part[:1].expand(lacking, *part.shape[1:])])
                   for part in self)  # fmt: skip
-        return Pixels(*filled) if lacking else self  # type: ignore[arg-type]
+        return Pixels(*padded)  # type: ignore[arg-type]
 
 
 class FusedMap(NamedTuple):
@@ -272,7 +274,7 @@ class FrameNet(FusionNetwork):
         return torch.cat([self._answer(pixels.select(slice(start, start + count)), multiple) for start in parts])
 
     def _answer(self, pixels: Pixels, multiple: int) -> Tensor:
-        """Return `_per_pixel`, worked out of a number of pixels that is a multiple."""
+        """Return `_per_pixel` of pixels that are padded to a multiple for it."""
         return self._per_pixel(pixels.round_up(multiple))[: len(pixels.values)]
 
     def _per_pixel(self, pixels: Pixels) -> Tensor:

@@ -192,7 +192,7 @@ def test_layers_before_the_fusion_learn_from_every_third_diagonal_and_see_all(tr
 
 
 def test_sizes_that_pixels_are_worked_on_in_recur(trained, monkeypatch):
-    """On CPUs torch prepares its kernels anew for every size, which took half of a step of single scenes."""
+    """On CPUs torch compiles new kernels for every new size; that was half the time of a training step on one scene."""
     sizes, alone = [], FrameNet._per_pixel
 
     def count(self: FrameNet, pixels: Pixels) -> torch.Tensor:
